@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
+
+
+def test_rows_depend_on_seed_and_index_alone():
+    together = row_normals(row_seeds(3, 100), 4)
+    apart = row_normals(row_seeds(3, 40, first=60), 4)
+    assert torch.equal(together[60:], apart)
+    assert not torch.equal(together, row_normals(row_seeds(4, 100), 4))
+
+
+def test_row_seeds_do_not_collide_or_go_negative():
+    seeds = row_seeds(0, 100_000)
+    assert len(seeds.unique()) == 100_000
+    assert (seeds >= 0).all()
+
+
+def test_row_normals_are_standard_normal_and_uncorrelated():
+    draws = row_normals(row_seeds(1, 20_000), 5).numpy()
+    assert stats.kstest(draws.ravel(), "norm").pvalue > 1e-3
+    correlation = np.corrcoef(draws.T)[np.triu_indices(5, 1)]
+    assert np.abs(correlation).max() < 4 / np.sqrt(20_000)
+    # and along rows, whose seeds are neighbors
+    assert abs(np.corrcoef(draws[1:, 0], draws[:-1, 0])[0, 1]) < 4 / np.sqrt(20_000)
+
+
+def test_fork_seeds_inside_and_restores_outside():
+    torch.manual_seed(5)
+    np.random.seed(5)
+    expected = torch.rand(1), np.random.rand()
+    torch.manual_seed(5)
+    np.random.seed(5)
+    with forked_generators(1, "key"):
+        first = torch.rand(3), np.random.rand(3)
+    with forked_generators(1, "key"):
+        second = torch.rand(3), np.random.rand(3)
+    assert torch.equal(first[0], second[0])
+    assert (first[1] == second[1]).all()
+    assert (torch.rand(1), np.random.rand()) == expected
+
+
+def test_fork_restores_after_an_error():
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+
+    def fails():
+        with forked_generators(1):
+            torch.rand(3)
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fails()
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_keys_give_other_seeds():
+    seeds = {derive_seed(0, k, i) for k in ("a", "b") for i in range(100)}
+    assert len(seeds) == 200
+
+
+def test_negative_seed_is_an_error():
+    with pytest.raises(ValueError, match="expected a seed >= 0; got -1"):
+        derive_seed(-1)
