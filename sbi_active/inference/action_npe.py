@@ -1,0 +1,411 @@
+"""Action-extended NPE: sbi's NPE_C with an action in the condition."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from sbi.inference import NPE_C
+from sbi.inference.trainers._contracts import (
+    LossArgs,
+    StartIndexContext,
+    TrainConfig,
+)
+from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
+from sbi.neural_nets.estimators.base import (
+    ConditionalDensityEstimator,
+    ConditionalEstimatorBuilder,
+)
+from sbi.sbi_types import Tracker
+from sbi.utils.sbiutils import mask_sims_from_prior
+from torch import Tensor
+from torch.distributions import Distribution
+from torch.utils.data import DataLoader
+from typing_extensions import Self
+
+from sbi_active.inference.belief import require_support
+from sbi_active.inference.condition import pack
+from sbi_active.inference.mixture_density import MixtureDensity, MixtureDensityNetwork
+from sbi_active.inference.posterior import ActionPosterior
+from sbi_active.inference.rounds import check_proposal, round_rows
+from sbi_active.inference.tracking import SilentTracker
+from sbi_active.inference.training import (
+    TrainingBudget,
+    single_thread,
+    train_mixture_density,
+)
+
+__all__ = ["ActionNPE"]
+
+_NPE_DEFAULTS = {
+    name: parameter.default
+    for name, parameter in inspect.signature(NPE_C.train).parameters.items()
+    if parameter.default is not inspect.Parameter.empty
+}
+_NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
+
+
+class ActionNPE(NPE_C):
+    r"""Action-extended neural posterior estimation, section 4.2 of the paper.
+
+    Without ``action=`` it is sbi's :class:`~sbi.inference.NPE_C`. With it, rows belong
+    to the round of a belief, and the network is trained from scratch on this round's
+    rows by plain maximum likelihood,
+
+    .. math::
+        \min_\phi - \sum_n \log q_\phi(\theta_n | x_n, \xi_n) \qquad \text{(Eq. 9)}.
+
+    Args:
+        prior: The prior over parameters.
+        density_estimator: An sbi string or builder, or :class:`MixtureDensity`. None is
+            sbi's default ("maf") without actions and ``MixtureDensity()`` with them.
+        device: As in sbi.
+        logging_level: As in sbi.
+        summary_writer: As in sbi (deprecated there).
+        tracker: As in sbi; None tracks nothing.
+        show_progress_bars: As in sbi.
+
+    References:
+        Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331.
+    """
+
+    def __init__(
+        self,
+        prior: Distribution | None = None,
+        density_estimator: Literal["nsf", "maf", "mdn", "made"]
+        | ConditionalEstimatorBuilder[ConditionalDensityEstimator]
+        | None = None,
+        device: str = "cpu",
+        logging_level: int | str = "WARNING",
+        summary_writer: Any = None,
+        tracker: Tracker | None = None,
+        show_progress_bars: bool = True,
+    ) -> None:
+        super().__init__(
+            prior=prior,
+            density_estimator="maf" if density_estimator is None else density_estimator,
+            device=device,
+            logging_level=logging_level,
+            summary_writer=summary_writer,
+            tracker=tracker,
+            show_progress_bars=show_progress_bars,
+        )
+        self._action_estimator = (
+            MixtureDensity() if density_estimator is None else self._build_neural_net
+        )
+        self._belief: Distribution | None = None
+        self._round_belief: Distribution | None = None
+        self._action_dim: int | None = None
+        self._outcome_shape: torch.Size | None = None
+        self._trained_round: int | None = None
+
+    @property
+    def belief(self) -> Distribution | None:
+        """The current belief over parameters; the prior before any trial."""
+        return self._prior if self._belief is None else self._belief
+
+    @property
+    def has_actions(self) -> bool:
+        """Whether the rounds so far have actions."""
+        return self._action_dim is not None
+
+    def append_simulations(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        proposal: Any = None,
+        exclude_invalid_x: bool | None = None,
+        data_device: str | None = None,
+        *,
+        action: Tensor | None = None,
+        belief: Distribution | None = None,
+    ) -> Self:
+        r"""Store simulations for training.
+
+        Without ``action`` this is sbi's method. With it, the rows belong to the round
+        of ``belief``; the same belief appended again continues that round.
+
+        Args:
+            theta: Parameters, shape (n, theta_dim), drawn from the belief.
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
+            proposal: Without actions as in sbi. With them, None, the belief itself or
+                sbi's ``RestrictedPrior`` of it.
+            exclude_invalid_x: With actions, None keeps invalid rows as information for
+                :class:`MixtureDensity` and drops them for sbi's networks, which cannot
+                take them; True drops them.
+            data_device: Where to keep the rows.
+            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            belief: The distribution of theta in this round; None is the current one.
+
+        Returns:
+            The trainer, so that calls chain.
+
+        Raises:
+            ValueError: If rounds with and without action mix, shapes do not fit, theta
+                leaves the prior's support, or no row is valid.
+        """
+        if action is None:
+            if self.has_actions or belief is not None:
+                raise ValueError(
+                    "expected action=, since "
+                    + (
+                        "belief= was given"
+                        if not self.has_actions
+                        else "earlier rounds of this trainer have actions"
+                    )
+                    + "; got none; do pass the action of each row, or start a new "
+                    "trainer for rounds without actions"
+                )
+            return super().append_simulations(
+                theta, x, proposal, exclude_invalid_x, data_device
+            )
+        if self._data_round_index and not self.has_actions:
+            raise ValueError(
+                "expected rounds without action, since earlier rounds of this trainer "
+                "have none; got action=; do start a new ASBI(prior) for rounds with "
+                "actions"
+            )
+        return self._append_round(
+            theta, x, action, belief, proposal, exclude_invalid_x, data_device
+        )
+
+    def _append_round(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        action: Tensor,
+        belief: Distribution | None,
+        proposal: Any,
+        exclude_invalid_x: bool | None,
+        data_device: str | None,
+    ) -> Self:
+        belief = self.belief if belief is None else belief
+        check_proposal(proposal, belief)
+        keeps_invalid = isinstance(self._action_estimator, MixtureDensity)
+        rows = round_rows(
+            theta,
+            x,
+            action,
+            prior=require_support(self._prior),
+            x_shape=self._outcome_shape,
+            action_dim=self._action_dim,
+            exclude_invalid=(
+                not keeps_invalid if exclude_invalid_x is None else exclude_invalid_x
+            ),
+        )
+        self._action_dim = rows.action.shape[1]
+        self._outcome_shape = rows.x.shape[1:]
+        current = max(self._data_round_index, default=-1)
+        if belief is not self._round_belief:
+            self._round_belief = belief
+            current += 1
+        self._belief = belief
+        self._trained_round = None
+        device = self._device if data_device is None else data_device
+        self._theta_roundwise.append(rows.theta.to(device))
+        self._x_roundwise.append(pack(rows.x, rows.action).to(device))
+        self._prior_masks.append(mask_sims_from_prior(current, len(rows.theta)))
+        self._proposal_roundwise.append(None)
+        self._data_round_index.append(current)
+        return self
+
+    def train(
+        self,
+        num_atoms: int | None = None,
+        training_batch_size: int | None = None,
+        learning_rate: float | None = None,
+        validation_fraction: float | None = None,
+        stop_after_epochs: int | None = None,
+        max_num_epochs: int | None = None,
+        clip_max_norm: float | None = _NPE_DEFAULTS["clip_max_norm"],
+        calibration_kernel: Callable | None = None,
+        resume_training: bool = False,
+        force_first_round_loss: bool = False,
+        discard_prior_samples: bool = False,
+        use_combined_loss: bool = False,
+        retrain_from_scratch: bool = False,
+        show_train_summary: bool = False,
+        dataloader_kwargs: dict | None = None,
+    ) -> ConditionalDensityEstimator:
+        """Train the density estimator.
+
+        Without actions, and for a network of sbi's with actions, the arguments are
+        those of sbi's ``NPE_C.train`` and None is its default. For
+        :class:`MixtureDensity`, None is what its settings say: ``training_batch_size``
+        and ``learning_rate`` override them, ``max_num_epochs`` caps the number of
+        iterations, and ``stop_after_epochs`` adds a patience on held-out rows. With
+        actions the network is rebuilt at each call, unless ``resume_training``.
+
+        Returns:
+            The trained estimator; with actions its condition is packed (x, action).
+
+        Raises:
+            RuntimeError: If there are no simulations.
+            ValueError: If an argument has no meaning in a round with actions.
+        """
+        given = {
+            name: value
+            for name, value in locals().items()
+            if name in _NPE_DEFAULTS and (value is not None or name == "clip_max_norm")
+        }
+        arguments: dict[str, Any] = {**_NPE_DEFAULTS, **given}
+        if not self.has_actions:
+            return super().train(**arguments)
+        if resume_training and self._trained_round != max(self._data_round_index):
+            raise ValueError(
+                "expected resume_training after train() on the same rows; got rows "
+                "appended since; do train() without resume_training"
+            )
+        for name in _NO_MEANING_WITH_ACTION:
+            if arguments[name] != _NPE_DEFAULTS[name]:
+                raise ValueError(
+                    f"expected {name} to be left out in a round with actions, which is "
+                    f"trained by maximum likelihood; got {arguments[name]}; do drop it"
+                )
+        settings = self._action_estimator
+        if isinstance(settings, MixtureDensity):
+            defaults = {
+                "training_batch_size": settings.batch_size,
+                "learning_rate": settings.learning_rate,
+            }
+            arguments = {**arguments, **defaults, **given}
+            self._epoch_limit = given.get("max_num_epochs")
+            self._patience = given.get("stop_after_epochs")
+        for name in ("num_atoms", "use_combined_loss"):
+            del arguments[name]
+        arguments["force_first_round_loss"] = True
+        arguments["retrain_from_scratch"] = not resume_training
+        self._kernel = calibration_kernel
+        # NPE_C.train would choose a multi-round loss here; its parent's train is plain
+        # maximum likelihood on the rows that _get_start_index names.
+        network = PosteriorEstimatorTrainer.train(self, **arguments)
+        self._trained_round = self._round
+        return network
+
+    def _get_start_index(self, context: StartIndexContext) -> int:
+        if not self.has_actions:
+            return super()._get_start_index(context)
+        self._round = max(self._data_round_index)
+        return self._round  # this round's rows only
+
+    def _initialize_neural_network(
+        self, retrain_from_scratch: bool, start_idx: int
+    ) -> None:
+        if self.has_actions:
+            self._build_neural_net = self._action_estimator
+        super()._initialize_neural_network(retrain_from_scratch, start_idx)
+
+    def _run_training_loop(
+        self,
+        train_loader: DataLoader,
+        val_loader: DataLoader,
+        train_config: TrainConfig,
+        loss_args: LossArgs | None = None,
+        summarization_kwargs: dict[str, Any] | None = None,
+    ) -> ConditionalDensityEstimator:
+        """Train; for :class:`MixtureDensity` with actions, by the lean loop."""
+        network, settings = self._neural_net, self._action_estimator
+        if not (
+            self.has_actions
+            and isinstance(network, MixtureDensityNetwork)
+            and isinstance(settings, MixtureDensity)
+        ):
+            return super()._run_training_loop(
+                train_loader, val_loader, train_config, loss_args, summarization_kwargs
+            )
+        network.to(self._device)
+        if not train_config.resume_training:
+            self.optimizer = torch.optim.Adam(
+                network.parameters(), lr=train_config.learning_rate, fused=True
+            )
+        theta, condition, _ = self.get_simulations(self._round)
+        num_iterations = settings.num_iterations
+        if self._epoch_limit is not None:
+            steps = max(len(self.train_indices) // train_config.training_batch_size, 1)
+            num_iterations = min(num_iterations, steps * self._epoch_limit)
+        with single_thread():
+            record = train_mixture_density(
+                network,
+                self.optimizer,
+                theta.to(self._device),
+                condition.to(self._device),
+                train_rows=self.train_indices,
+                held_out_rows=self.val_indices,
+                budget=TrainingBudget(
+                    num_iterations=num_iterations,
+                    batch_size=train_config.training_batch_size,
+                    clip_max_norm=train_config.clip_max_norm,
+                    anneal=settings.anneal,
+                    patience=self._patience,
+                ),
+                calibration_kernel=self._kernel,
+            )
+        self._best_val_loss = min(record.validation_loss)
+        self._summary["training_loss"] += record.training_loss
+        self._summary["validation_loss"] += record.validation_loss
+        self._summary["epoch_durations_sec"] += record.seconds
+        self._summary["epochs_trained"].append(len(record.seconds))
+        self._summary["best_validation_loss"].append(self._best_val_loss)
+        self._summarize(round_=self._round)
+        if train_config.show_train_summary:
+            print(self._describe_round(self._round, self._summary))
+        return network
+
+    def build_posterior(
+        self,
+        density_estimator: ConditionalDensityEstimator | None = None,
+        prior: Distribution | None = None,
+        sample_with: Literal[
+            "mcmc", "rejection", "vi", "importance", "direct"
+        ] = "direct",
+        mcmc_method: Literal[
+            "slice_np",
+            "slice_np_vectorized",
+            "hmc_pyro",
+            "nuts_pyro",
+            "slice_pymc",
+            "hmc_pymc",
+            "nuts_pymc",
+        ] = "slice_np_vectorized",
+        vi_method: Literal["rKL", "fKL", "IW", "alpha"] = "rKL",
+        direct_sampling_parameters: dict[str, Any] | None = None,
+        mcmc_parameters: dict[str, Any] | None = None,
+        vi_parameters: dict[str, Any] | None = None,
+        rejection_sampling_parameters: dict[str, Any] | None = None,
+        importance_sampling_parameters: dict[str, Any] | None = None,
+        posterior_parameters: Any = None,
+    ) -> Any:
+        """Return the posterior: sbi's own without actions, else an ActionPosterior.
+
+        The arguments are those of sbi's ``NPE_C.build_posterior``; with actions,
+        ``prior=None`` is the belief of this round.
+
+        Returns:
+            sbi's ``NeuralPosterior``, or an :class:`~sbi_active.ActionPosterior`.
+
+        Raises:
+            RuntimeError: If rows of an action round came in after the last ``train``.
+        """
+        arguments = {
+            name: value
+            for name, value in locals().items()
+            if name not in ("self", "__class__")
+        }
+        if not self.has_actions:
+            return super().build_posterior(**arguments)
+        if density_estimator is None and self._trained_round is None:
+            raise RuntimeError(
+                "expected a network trained on this round's simulations; got new rows "
+                "since the last train(); do call train() first"
+            )
+        if prior is None:
+            arguments["prior"] = self._round_belief
+        packed = super().build_posterior(**arguments)
+        assert self._action_dim is not None
+        assert self._outcome_shape is not None
+        return ActionPosterior(packed, self._outcome_shape, self._action_dim)
+
+    def _default_tracker(self) -> Tracker:
+        return SilentTracker()

@@ -1,0 +1,230 @@
+"""The belief: what is known about the parameters after the trials so far."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
+from sbi.utils.sbiutils import within_support
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.seeding import forked_generators
+
+__all__ = ["Belief", "ChainedBelief", "information_gained", "require_support"]
+
+
+class Belief(Distribution, ABC):
+    r"""Distribution over the parameters after zero or more trials.
+
+    A torch distribution in float32 with an empty batch shape, the support of the
+    original prior and a normalized ``log_prob``, so that it can be the prior of the
+    next round, and of anything else that takes a prior.
+
+    Args:
+        prior: The original prior, which gives the support.
+
+    Attributes:
+        prior: The original prior.
+        label: How the belief was made, for reports.
+        diagnostics: Figures about its quality, by name.
+    """
+
+    arg_constraints = {}  # pyright: ignore
+    label: str = "belief"
+
+    def __init__(self, prior: Distribution) -> None:
+        dim = prior.sample((1,)).shape[-1]
+        super().__init__(torch.Size(), torch.Size([dim]), validate_args=False)
+        self.prior = prior
+        self.diagnostics: dict[str, Any] = {}
+
+    @abstractmethod
+    def _sample(self, num_samples: int) -> Tensor:
+        """Return draws, shape (n, theta_dim), from torch's global generator."""
+
+    @abstractmethod
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        """Return the normalized log density inside the support, (n, d) -> (n,)."""
+
+    @property
+    def support(self) -> Any:
+        return self.prior.support
+
+    def sample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
+        """Return draws, shape (*sample_shape, theta_dim), float32."""
+        shape = torch.Size(sample_shape)
+        with torch.no_grad():
+            return self._sample(shape.numel()).float().reshape(*shape, -1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log density; -inf outside the support.
+
+        Args:
+            value: Shape (..., theta_dim).
+
+        Returns:
+            Shape (...), float32.
+        """
+        theta = torch.as_tensor(value, dtype=torch.float32)
+        rows = theta.reshape(-1, theta.shape[-1])
+        inside = within_support(self.prior, rows)
+        log_prob = torch.where(inside, self._log_prob(rows).float(), -torch.inf)
+        return log_prob.reshape(theta.shape[:-1])
+
+    @cached_property
+    def _moments(self) -> tuple[Tensor, Tensor]:
+        with forked_generators(0):  # the same belief, the same moments
+            draws = self.sample((20_000,)).double()
+        return draws.mean(0).float(), draws.var(0).float()
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean over 20,000 draws, shape (theta_dim,)."""
+        return self._moments[0]
+
+    @property
+    def variance(self) -> Tensor:
+        """Variance over 20,000 draws, shape (theta_dim,)."""
+        return self._moments[1]
+
+    def __repr__(self) -> str:
+        mean, sd = self.mean.tolist(), self.variance.sqrt().tolist()
+        cells = [f"{m:.3g} +- {s:.2g}" for m, s in zip(mean, sd, strict=True)]
+        return f"{type(self).__name__}({self.label}: {', '.join(cells)})"
+
+
+class ChainedBelief(Belief):
+    r"""Step 3 of the paper: the amortized posterior at the observed trial.
+
+    .. math::
+        b(\theta) = q(\theta | x_o, \xi^*)\, 1[\theta \in \mathrm{supp}\, p] / Z,
+
+    where q was trained under the belief before the trial, so errors of earlier rounds
+    stay in it: hence "chained approximation".
+
+    Args:
+        estimator: The trained q over packed conditions.
+        condition: The observed (x_o, action), shape (1, condition_dim).
+        prior: The original prior.
+        previous: The belief before the trial.
+        num_samples: Draws behind the normalizer Z.
+    """
+
+    label = "chained approximation"
+
+    def __init__(
+        self,
+        estimator: ConditionalDensityEstimator,
+        condition: Tensor,
+        prior: Distribution,
+        previous: Distribution,
+        *,
+        num_samples: int = 20_000,
+    ) -> None:
+        super().__init__(prior)
+        self._estimator = estimator.eval()
+        self._condition = condition
+        with torch.no_grad():
+            draws = estimator.sample(torch.Size([num_samples]), condition)[:, 0]
+            inside = within_support(prior, draws)
+        acceptance = float(inside.double().mean())
+        self.diagnostics["mass_inside_prior"] = acceptance
+        self._particles: Tensor | None = None
+        if acceptance >= MINIMAL_ACCEPTANCE:
+            self._log_normalizer = torch.tensor(acceptance).log()
+        else:
+            self._resample(previous, num_samples)
+            warnings.warn(
+                f"only {acceptance:.2%} of the network's posterior lies within the "
+                "prior's support: the observation is unlike those simulated, or the "
+                "truth lies outside the prior. The belief is resampled from the one "
+                "before and is coarse.",
+                stacklevel=4,
+            )
+
+    def _resample(self, previous: Distribution, num_samples: int) -> None:
+        """Represent the belief by weighted draws of the one before."""
+        draws = previous.sample((num_samples,))
+        log_q = self._log_density(draws)
+        log_weight = log_q - previous.log_prob(draws)
+        self._log_normalizer = (
+            torch.logsumexp(log_weight, 0) - torch.tensor(float(num_samples)).log()
+        )
+        index = torch.multinomial(log_weight.softmax(0), num_samples, replacement=True)
+        self._particles = draws[index]
+
+    def _sample(self, num_samples: int) -> Tensor:
+        if self._particles is not None:
+            return self._particles[torch.randint(len(self._particles), (num_samples,))]
+        kept: list[Tensor] = []
+        missing = num_samples
+        acceptance = self.diagnostics["mass_inside_prior"]
+        while missing > 0:
+            size = min(int(1.1 * missing / acceptance) + 20, 1_000_000)
+            draws = self._estimator.sample(torch.Size([size]), self._condition)[:, 0]
+            draws = draws[within_support(self.prior, draws)]
+            kept.append(draws[:missing])
+            missing -= len(kept[-1])
+        return torch.cat(kept)
+
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        return self._log_density(theta) - self._log_normalizer
+
+    def _log_density(self, theta: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self._estimator.log_prob(theta[:, None], self._condition)[:, 0]
+
+
+#: Below this share of q inside the support, rejection is too wasteful.
+MINIMAL_ACCEPTANCE = 1e-3
+
+
+def information_gained(
+    belief: Distribution, previous: Distribution, *, num_samples: int = 5_000, seed: int
+) -> float:
+    r"""Return the realized information gain of a trial in nats.
+
+    .. math::
+        \mathrm{KL}(b \,\|\, p) \approx \frac{1}{n} \sum_i \log b(\theta_i)
+        - \log p(\theta_i), \qquad \theta_i \sim b.
+
+    Args:
+        belief: After the trial.
+        previous: Before it.
+        num_samples: Draws n.
+        seed: Of the draws.
+    """
+    with forked_generators(seed):
+        theta = belief.sample((num_samples,))
+    gain = belief.log_prob(theta).double() - previous.log_prob(theta).double()
+    return float(gain.mean())
+
+
+def require_support(prior: Distribution | None) -> Distribution:
+    """Return the prior, or raise where it has no support to keep a belief in.
+
+    Raises:
+        ValueError: If there is no prior, or its ``support`` is not implemented.
+    """
+    if prior is None:
+        raise ValueError(
+            "expected a prior, since a belief starts from it; got None; do pass one "
+            "at construction, ASBI(prior)"
+        )
+    try:
+        support = prior.support
+    except (NotImplementedError, AttributeError):
+        support = None
+    if support is None:
+        raise ValueError(
+            "expected a prior with a support, which every belief keeps; got "
+            f"{type(prior).__name__} without one; do use sbi.utils.BoxUniform, a torch "
+            "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
+        )
+    return prior

@@ -1,0 +1,301 @@
+"""Rounds with actions: Algorithm 1."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from sbi.diagnostics import run_sbc
+from sbi.inference import DirectPosterior
+from sbi.neural_nets import posterior_nn
+from sbi.neural_nets.estimators import MixtureDensityEstimator
+from sbi.utils import BoxUniform, RestrictedPrior, get_density_thresholder
+from torch.distributions import Distribution
+
+from sbi_active import ASBI, ActionEmbedding, ActionPosterior, Belief, MixtureDensity
+from sbi_active.inference import MixtureDensityNetwork
+from tests.linear_gaussian import DIM, PRIOR, moments, simulator
+
+SMALL = MixtureDensity(hidden_features=(32, 32), num_components=2, num_iterations=600)
+BOX = BoxUniform(-2 * torch.ones(DIM), 2 * torch.ones(DIM))
+
+
+def rows(n=1_000, prior=PRIOR):
+    theta, action = prior.sample((n,)), 3 * torch.rand(n, 1)
+    return theta, simulator(theta, action), action
+
+
+def trained(density_estimator=SMALL, prior=PRIOR, n=1_000, **train):
+    theta, x, action = rows(n, prior)
+    inference = ASBI(prior, density_estimator, show_progress_bars=False)
+    inference.append_simulations(theta, x, action=action).train(**train)
+    return inference
+
+
+def test_the_posterior_meets_the_closed_form_at_every_action():
+    settings = MixtureDensity(hidden_features=(64, 64), num_iterations=1_500)
+    posterior = trained(settings, n=8_000).build_posterior()
+    theta, x, action = rows(4_000)
+    mean, variance = moments(x, action)
+    exact = torch.distributions.Normal(mean, variance.sqrt()).log_prob(theta).sum(1)
+    gap = exact - posterior.log_posterior(theta, x, action)
+    assert float(gap.mean()) < 0.08  # KL to the exact posterior, nats
+    low = action[:, 0] < 1.5
+    assert float(gap[low].mean()) < 0.1
+    assert float(gap[~low].mean()) < 0.1
+    # negative control: the posterior with the actions mixed up is far off
+    wrong = posterior.log_posterior(theta, x, action[torch.randperm(len(action))])
+    assert float((exact - wrong).mean()) > 0.3
+
+
+def test_two_rounds_chain_to_the_exact_posterior():
+    settings = MixtureDensity(hidden_features=(64, 64), num_iterations=1_500)
+    inference, belief = ASBI(PRIOR, settings, show_progress_bars=False), PRIOR
+    trials = [(2.0, torch.tensor([1.0, -1.5])), (1.0, torch.tensor([0.2, 0.1]))]
+    for action, x_o in trials:
+        theta = belief.sample((6_000,))
+        xi = 3 * torch.rand(len(theta), 1)
+        inference.append_simulations(
+            theta, simulator(theta, xi), action=xi, belief=belief
+        ).train()
+        belief = inference.update(x_o, action=torch.tensor([action]))
+    assert belief.label == "chained approximation"
+    precision = 1 + sum(a**2 for a, _ in trials)
+    mean = sum(a * x for a, x in trials) / precision
+    assert len(inference.trials) == 2
+    # Errors of a network of this size, a tenth of the posterior's sd of .41
+    assert torch.allclose(belief.mean, mean, atol=0.08)
+    assert torch.allclose(
+        belief.variance.sqrt(), precision**-0.5 * torch.ones(2), atol=0.05
+    )
+
+
+def test_each_round_has_a_new_network_and_its_own_rows():
+    inference = trained()
+    first = inference._neural_net
+    belief = inference.update(torch.zeros(2), action=torch.tensor([1.0]))
+    theta, x, action = rows(500, belief)
+    inference.append_simulations(theta, x, action=action, belief=belief)
+    inference.append_simulations(theta, x, action=action, belief=belief)
+    assert inference._data_round_index == [0, 1, 1]
+    inference.train()
+    assert inference._neural_net is not first
+    assert len(inference.train_indices) + len(inference.val_indices) == 1_000
+    scale = inference._neural_net.theta_scale
+    assert (scale < 0.9 * first.theta_scale).all()  # scales are re-estimated
+
+
+def test_the_default_is_the_lean_network_and_strings_are_honored():
+    assert isinstance(
+        trained(None, max_num_epochs=1)._neural_net, MixtureDensityNetwork
+    )
+    with pytest.warns(UserWarning, match="Maximum number of epochs"):
+        inference = trained("mdn", max_num_epochs=1)
+    assert isinstance(inference._neural_net, MixtureDensityEstimator)
+    build = posterior_nn("maf", num_transforms=1)
+    with pytest.warns(UserWarning, match="Maximum number of epochs"):
+        inference = trained(build, max_num_epochs=1)
+    assert len(inference.update(torch.zeros(2), action=torch.ones(1)).sample((4,))) == 4
+
+
+@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
+@pytest.mark.parametrize("estimator", [SMALL, "mdn"])
+def test_budget_and_summary(estimator):
+    inference = trained(estimator, max_num_epochs=3)
+    summary = inference.summary
+    epochs = summary["epochs_trained"][-1]
+    assert epochs in (3, 4)  # sbi's loop runs one epoch more than it says
+    assert len(summary["validation_loss"]) == epochs
+    before = copy.deepcopy(inference._neural_net.state_dict())
+    inference.train(max_num_epochs=5, resume_training=True)
+    assert len(summary["validation_loss"]) > epochs
+    after = inference._neural_net.state_dict()
+    assert any(not torch.equal(before[name], after[name]) for name in before)
+
+
+def test_same_torch_seed_same_network():
+    nets = []
+    for _ in range(2):
+        torch.manual_seed(7)
+        nets.append(trained()._neural_net.state_dict())
+    assert all(torch.equal(nets[0][name], nets[1][name]) for name in nets[0])
+
+
+def test_a_calibration_kernel_weighs_rows():
+    """Rows with x < 0 get no weight: the network is fitted to the others alone."""
+    theta, x, action = rows(2_000)
+    theta[x[:, 0] < 0] += 100.0
+    inference = ASBI(PRIOR, SMALL)
+    inference.append_simulations(theta, x, action=action)
+    inference.train(calibration_kernel=lambda c: (c[:, 0] >= 0).float())
+    posterior = inference.build_posterior()
+    keep = x[:, 0] >= 0
+    inside = posterior.log_posterior(theta[keep], x[keep], action[keep]).mean()
+    assert float(inside) > -4
+
+
+def test_invalid_rows_are_kept_by_ours_and_dropped_for_sbi_s():
+    theta, x, action = rows(1_500)
+    x[theta[:, 0] > 1] = torch.nan
+    inference = ASBI(PRIOR, SMALL)
+    inference.append_simulations(theta, x, action=action).train()
+    assert len(inference.get_simulations()[0]) == 1_500
+    belief = inference.update(torch.full((2,), torch.nan), action=torch.ones(1))
+    assert float(belief.mean[0]) > 0.8  # E[theta_1 | theta_1 > 1] = 1.53
+    inference = ASBI(PRIOR, "mdn", show_progress_bars=False)
+    with pytest.warns(UserWarning, match="simulations without a measurement"):
+        inference.append_simulations(theta, x, action=action)
+    assert len(inference.get_simulations()[0]) == int((theta[:, 0] <= 1).sum())
+    with pytest.warns(UserWarning, match="Maximum number of epochs"):
+        inference.train(max_num_epochs=1)
+    with pytest.raises(ValueError, match="expected an outcome with a measurement"):
+        inference.update(torch.full((2,), torch.nan), action=torch.ones(1))
+
+
+def test_images_pass_through_an_embedding():
+    theta = BOX.sample((400,))
+    action = torch.rand(400, 2)
+    image = theta.sum(1)[:, None, None, None] * torch.ones(1, 6, 6)
+    image = image + 0.1 * torch.randn(400, 1, 6, 6)
+    cnn = torch.nn.Sequential(
+        torch.nn.Conv2d(1, 2, 3), torch.nn.ReLU(), torch.nn.Flatten(),
+        torch.nn.Linear(32, 4),
+    )  # fmt: skip
+    embedding = ActionEmbedding(cnn, (1, 6, 6), 2)
+    for estimator in (
+        posterior_nn("mdn", embedding_net=embedding),
+        MixtureDensity(embedding_net=embedding, num_iterations=50),
+    ):
+        inference = ASBI(BOX, estimator, show_progress_bars=False)
+        inference.append_simulations(theta, image, action=action)
+        inference.train(max_num_epochs=2)
+        posterior = inference.build_posterior()
+        draws = posterior.sample((3,), x=image[0], action=action[0])
+        assert draws.shape == (3, 2)
+        assert posterior.at(action[0]).sample((3,), x=image[:1]).shape == (3, 2)
+
+
+def test_belief_is_a_distribution():
+    inference = trained(prior=BOX)
+    belief = inference.update(torch.tensor([1.5, -1.5]), action=torch.tensor([1.0]))
+    assert isinstance(belief, Distribution)
+    assert isinstance(belief, Belief)
+    assert belief.batch_shape == ()
+    assert belief.event_shape == (2,)
+    assert belief.sample().shape == (2,)
+    assert belief.sample((3, 4)).shape == (3, 4, 2)
+    assert belief.sample((3,)).dtype == torch.float32
+    assert belief.log_prob(torch.rand(3, 4, 2, dtype=torch.float64)).shape == (3, 4)
+    assert belief.log_prob(torch.tensor([2.1, 0.0])) == -torch.inf
+    assert (belief.sample((2_000,)).abs() <= 2).all()
+    # normalized over the support: the mean of density times volume under uniform draws
+    density = belief.log_prob(BOX.sample((100_000,))).double().exp() * 16
+    error = density.std() / 100_000**0.5
+    assert abs(density.mean() - 1) < 4 * error + 0.02  # .02: the normalizer's own error
+    again = pickle.loads(pickle.dumps(belief))
+    theta = belief.sample((5,))
+    assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
+
+
+def test_belief_works_as_a_prior_of_sbi():
+    belief = trained(prior=BOX).update(torch.ones(2), action=torch.ones(1))
+    theta = belief.sample((300,))
+    inference = ASBI(belief, "mdn", show_progress_bars=False)
+    inference.append_simulations(theta, simulator(theta, torch.ones(300, 1)))
+    with pytest.warns(UserWarning, match="Maximum number of epochs"):
+        inference.train(max_num_epochs=1)
+    assert inference.build_posterior().sample((2,), x=torch.ones(1, 2)).shape == (2, 2)
+
+
+def test_a_belief_far_outside_the_prior_is_coarse_and_says_so():
+    inference = trained(prior=BOX)
+    with pytest.warns(UserWarning, match="lies within the prior's support"):
+        belief = inference.update(torch.tensor([60.0, 60.0]), action=torch.ones(1))
+    draws = belief.sample((1_000,))
+    assert (draws.abs() <= 2).all()
+    assert belief.log_prob(draws).isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_action_posterior_offers_what_sbi_s_do():
+    posterior = trained(prior=BOX).build_posterior()
+    assert isinstance(posterior, ActionPosterior)
+    x, action = torch.tensor([0.5, 0.5]), torch.tensor([2.0])
+    theta = posterior.sample((100,), x=x, action=action)
+    assert theta.shape == (100, 2)
+    assert posterior.sample((), x=x, action=action).shape == (2,)
+    assert posterior.log_prob(theta, x=x, action=action).shape == (100,)
+    xs, actions = torch.rand(3, 2), torch.rand(3, 1)
+    assert posterior.sample_batched((5,), x=xs, action=actions).shape == (5, 3, 2)
+    batched = posterior.log_prob_batched(theta[:30].reshape(10, 3, 2), xs, actions)
+    assert batched.shape == (10, 3)
+    best = posterior.map(x=x, action=action, num_iter=20, num_to_optimize=5)
+    peak = posterior.log_prob(best.reshape(1, 2), x=x, action=action)
+    assert peak >= posterior.log_prob(theta, x=x, action=action).median()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_at_and_packed_are_sbi_s_posteriors():
+    posterior = trained(prior=BOX).build_posterior()
+    action, x = torch.tensor([2.0]), torch.tensor([[0.5, 0.5]])
+    at = posterior.at(action)
+    assert type(at) is DirectPosterior
+    theta = BOX.sample((20,))
+    packed = posterior.packed().log_prob(
+        theta, x=torch.cat([x, action[None]], 1), norm_posterior=False
+    )
+    assert torch.allclose(at.log_prob(theta, x=x, norm_posterior=False), packed)
+    direct = posterior.log_prob(theta, x, action, norm_posterior=False)
+    assert torch.allclose(direct, packed)
+    prior_theta = BOX.sample((20,))
+    xs = simulator(prior_theta, action.expand(20, 1))
+    ranks, _ = run_sbc(prior_theta, xs, at, num_posterior_samples=20)
+    assert ranks.shape == (20, 2)
+
+
+def test_mcmc_on_an_action_posterior():
+    inference = trained(prior=BOX)
+    posterior = inference.build_posterior(sample_with="rejection")
+    draws = posterior.sample((50,), x=torch.zeros(2), action=torch.ones(1))
+    assert draws.shape == (50, 2)
+    with pytest.raises(ValueError, match="expected a posterior with a density"):
+        posterior.log_prob(draws, x=torch.zeros(2), action=torch.ones(1))
+
+
+def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
+    theta, x, action = rows(200, BOX)
+    inference = trained(prior=BOX)
+    packed = inference.build_posterior().packed()
+    packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
+    restricted = RestrictedPrior(BOX, get_density_thresholder(packed))
+    inference.append_simulations(theta, x, proposal=restricted, action=action)
+    with pytest.raises(ValueError, match="expected proposal to be the belief"):
+        inference.append_simulations(theta, x, proposal=packed, action=action)
+
+
+def test_an_action_off_the_grid_is_used_as_executed():
+    inference = trained()
+    beliefs = []
+    for action in (0.123, 2.9):
+        inference = trained()
+        beliefs.append(inference.update(torch.ones(2), action=torch.tensor([action])))
+    assert beliefs[0].variance[0] > 2 * beliefs[1].variance[0]
+
+
+def test_no_folder_appears():
+    # conftest checks for sbi-logs after every test; here a tracker of the user's works
+    seen = []
+
+    class Tracker:
+        log_dir = None
+
+        def log_metric(self, name, value, step=None):
+            seen.append(name)
+
+        def flush(self):
+            pass
+
+    theta, x, action = rows(300)
+    inference = ASBI(PRIOR, SMALL, tracker=Tracker())
+    inference.append_simulations(theta, x, action=action).train(max_num_epochs=1)
+    assert {"validation_loss", "training_loss", "epochs_trained"} <= {*seen}

@@ -1,0 +1,165 @@
+import pickle
+
+import pytest
+import torch
+
+from sbi_active.inference import MixtureDensity
+from sbi_active.inference.training import TrainingBudget, train_mixture_density
+
+
+def network(dim=3, condition_dim=4, n=200, **settings):
+    theta = torch.randn(n, dim) * torch.tensor([0.01, 1.0, 100.0])[:dim] + 5
+    net = MixtureDensity(hidden_features=(16,), **settings)(
+        theta, torch.randn(n, condition_dim)
+    )
+    for p in net.parameters():  # far from the start, so that nothing is trivial
+        torch.nn.init.normal_(p, 0.0, 0.3)
+    return net, theta
+
+
+def test_samples_have_the_density():
+    """E_q[r / q] = 1 for any density r that q covers."""
+    net, _ = network(dim=2)
+    condition = torch.randn(1, 4)
+    draws = net.sample(torch.Size([50_000]), condition)
+    log_q = net.log_prob(draws, condition)[:, 0]
+    mean, cov = draws[:, 0].mean(0), torch.cov(draws[:, 0].T)
+    narrow = torch.distributions.MultivariateNormal(mean, 0.3 * cov)
+    ratio = (narrow.log_prob(draws[:, 0]) - log_q).exp()
+    error = ratio.std() / 50_000**0.5
+    assert error < 0.05
+    assert abs(ratio.mean() - 1) < 4 * error
+
+
+def test_one_dimensional_density_integrates_to_one():
+    net, _ = network(dim=1)
+    grid = torch.linspace(4, 6, 200_001)[:, None, None]
+    density = net.log_prob(grid, torch.randn(1, 4)).exp().detach()
+    assert float(torch.trapezoid(density[:, 0], grid[:, 0, 0])) == pytest.approx(
+        1.0, abs=1e-3
+    )
+
+
+def test_shapes_follow_sbi():
+    net, theta = network()
+    condition = torch.randn(7, 4)
+    assert net.sample(torch.Size([5, 2]), condition).shape == (5, 2, 7, 3)
+    assert net.log_prob(theta[:7], condition).shape == (1, 7)
+    assert net.log_prob(theta[:14].reshape(2, 7, 3), condition).shape == (2, 7)
+    assert net.loss(theta[:7], condition).shape == (7,)
+    pairs = torch.randn(2, 7, 4)
+    both = net.log_prob(theta[:14].reshape(2, 7, 3), pairs)
+    assert torch.allclose(both[1], net.log_prob(theta[7:14], pairs[1])[0], atol=1e-5)
+    with pytest.raises(ValueError, match="condition"):
+        net.log_prob(theta[:7], torch.randn(7, 5))
+
+
+def test_rows_are_independent_of_their_order():
+    net, theta = network()
+    condition = torch.randn(20, 4)
+    order = torch.randperm(20)
+    log_q = net.log_prob(theta[:20], condition)[0]
+    assert torch.allclose(
+        log_q[order], net.log_prob(theta[order], condition[order])[0], atol=1e-5
+    )
+
+
+def test_gradients_match_finite_differences():
+    net, theta = network(dim=2)
+    net = net.double()
+    condition = torch.randn(3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda c: net.log_prob(theta[:3].double(), c), (condition,)
+    )
+
+
+def test_standardization_makes_the_start_blind_to_units():
+    """Scaled theta and condition: the same loss up to the log of the scale."""
+    theta, condition = torch.randn(500, 2), torch.randn(500, 3)
+    losses = []
+    for scale in (1.0, 1e4):
+        torch.manual_seed(1)
+        net = MixtureDensity(hidden_features=(16,))(theta * scale, condition * scale)
+        losses.append(net.loss(theta * scale, condition * scale).mean())
+    shift = 2 * torch.log(torch.tensor(1e4))
+    assert float(losses[1] - losses[0]) == pytest.approx(float(shift), abs=1e-3)
+
+
+def test_missing_outcomes_are_something_to_condition_on():
+    """x is missing exactly where theta > 0: the mask alone must tell that."""
+    theta = torch.randn(2_000, 1)
+    x = torch.where(theta > 0, torch.nan, torch.randn(2_000, 1))
+    condition = torch.cat([x, x, torch.rand(2_000, 1)], 1)
+    net = MixtureDensity(hidden_features=(32,))(theta, condition)
+    assert net.knows_invalid
+    assert net._masked_columns == [0]  # the columns go missing together: one mask
+    train_mixture_density(
+        net,
+        torch.optim.Adam(net.parameters(), lr=5e-3),
+        theta,
+        condition,
+        train_rows=torch.arange(2_000),
+        held_out_rows=torch.arange(0),
+        budget=TrainingBudget(num_iterations=300, batch_size=100),
+    )
+    # Half of the draws if it could not tell; Gaussians leak some over the hard edge.
+    draws = net.sample(torch.Size([1_000]), torch.tensor([[torch.nan, torch.nan, 0.5]]))
+    assert (draws > 0).float().mean() > 0.85
+    draws = net.sample(torch.Size([1_000]), torch.tensor([[0.3, 0.3, 0.5]]))
+    assert (draws < 0).float().mean() > 0.85
+
+
+def test_a_constant_column_does_no_harm():
+    theta, condition = torch.randn(100, 1), torch.full((100, 2), 7.0)
+    net = MixtureDensity(hidden_features=(8,))(theta, condition)
+    assert net.log_prob(theta, condition).isfinite().all()
+
+
+def test_pickle_keeps_the_density():
+    net, theta = network()
+    condition = torch.randn(5, 4)
+    again = pickle.loads(pickle.dumps(net))
+    assert torch.equal(
+        net.log_prob(theta[:5], condition), again.log_prob(theta[:5], condition)
+    )
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"num_components": 0}, {"hidden_features": (0,)}, {"learning_rate": 0.0}],
+)
+def test_settings_validate_themselves(settings):
+    with pytest.raises(ValueError, match=f"expected {next(iter(settings))}"):
+        MixtureDensity(**settings)
+
+
+def test_patience_returns_the_best_weights():
+    theta, condition = torch.randn(60, 1), torch.randn(60, 2)  # nothing to learn
+    net = MixtureDensity(hidden_features=(64,))(theta, condition)
+    record = train_mixture_density(
+        net,
+        torch.optim.Adam(net.parameters(), lr=1e-2),
+        theta,
+        condition,
+        train_rows=torch.arange(40),
+        held_out_rows=torch.arange(40, 60),
+        budget=TrainingBudget(num_iterations=2_000, batch_size=20, patience=5),
+    )
+    assert len(record.seconds) < 1_000
+    held_out = float(net.loss(theta[40:], condition[40:]).mean())
+    assert held_out == pytest.approx(min(record.validation_loss), abs=1e-5)
+
+
+def test_a_loss_that_is_not_finite_is_told():
+    theta, condition = torch.randn(60, 1), torch.randn(60, 2)
+    net = MixtureDensity(hidden_features=(8,))(theta, condition)
+    with pytest.raises(RuntimeError, match="expected a finite loss"):
+        train_mixture_density(
+            net,
+            torch.optim.Adam(net.parameters(), lr=1e-3),
+            theta * torch.nan,
+            condition,
+            train_rows=torch.arange(40),
+            held_out_rows=torch.arange(40, 60),
+            budget=TrainingBudget(num_iterations=10, batch_size=20),
+        )
