@@ -1,0 +1,125 @@
+"""Action spaces: what the robot may do in the next trial."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.seeding import forked_generators
+
+__all__ = ["ActionSpace", "DiscreteActions"]
+
+
+class ActionSpace(ABC):
+    """A set of actions that can be sampled and tested for membership.
+
+    Attributes:
+        names: One an entry of the action.
+        units: One an entry of the action; empty where unknown.
+    """
+
+    names: list[str]
+    units: list[str]
+
+    @property
+    @abstractmethod
+    def action_dim(self) -> int:
+        """Numbers in an action."""
+
+    @abstractmethod
+    def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
+        """Return uniform draws.
+
+        Args:
+            sample_shape: Any shape, as in torch's distributions.
+            seed: None uses torch's global generator.
+
+        Returns:
+            Shape (*sample_shape, action_dim).
+        """
+
+    @abstractmethod
+    def contains(self, action: Tensor) -> Tensor:
+        """Return which actions belong to the space.
+
+        Args:
+            action: Shape (..., action_dim).
+
+        Returns:
+            Shape (...), bool.
+        """
+
+    def _label(self, names: Sequence[str] | None, units: Sequence[str] | None) -> None:
+        dim = self.action_dim
+        default = ["action"] if dim == 1 else [f"action_{i + 1}" for i in range(dim)]
+        self.names = default if names is None else [*names]
+        self.units = [""] * dim if units is None else [*units]
+        if len(self.names) != dim or len(self.units) != dim:
+            raise ValueError(
+                f"expected {dim} names and units, one an entry of the action; got "
+                f"{self.names} and {self.units}; do give one each"
+            )
+
+
+class DiscreteActions(ActionSpace):
+    r"""A finite set of actions :math:`\mathcal{D} = \{\xi_1, \ldots, \xi_a\}`.
+
+    Args:
+        values: Shape (a,) for scalar actions, or (a, action_dim).
+        names: One an entry of the action.
+        units: One an entry of the action.
+
+    Raises:
+        ValueError: If the set is empty, not finite, or has another shape.
+
+    Example:
+        >>> actions = DiscreteActions(torch.arange(-5, 5.5, 0.5))
+        >>> actions.values.shape, actions.action_dim
+        (torch.Size([21, 1]), 1)
+    """
+
+    def __init__(
+        self,
+        values: Tensor | np.ndarray | Sequence[float] | Sequence[Sequence[float]],
+        *,
+        names: Sequence[str] | None = None,
+        units: Sequence[str] | None = None,
+    ) -> None:
+        tensor = torch.as_tensor(values, dtype=torch.float32)
+        if tensor.ndim == 1:
+            tensor = tensor[:, None]
+        if tensor.ndim != 2 or tensor.numel() == 0:
+            raise ValueError(
+                "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "
+                f"{tuple(torch.as_tensor(values).shape)}; do give one row an action"
+            )
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(
+                f"expected finite actions; got {tensor.tolist()}; do remove NaN and inf"
+            )
+        self.values = tensor
+        self._label(names, units)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __repr__(self) -> str:
+        return f"DiscreteActions({len(self)} x {', '.join(self.names)})"
+
+    @property
+    def action_dim(self) -> int:
+        return self.values.shape[1]
+
+    def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
+        with forked_generators(seed):
+            index = torch.randint(len(self), torch.Size(sample_shape))
+        return self.values[index]
+
+    def contains(self, action: Tensor) -> Tensor:
+        action = torch.as_tensor(action, dtype=torch.float32)
+        near = torch.isclose(action[..., None, :], self.values, rtol=1e-5, atol=1e-7)
+        return near.all(-1).any(-1)

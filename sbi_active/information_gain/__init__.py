@@ -1,0 +1,9 @@
+"""Estimators of the expected information gain, one a file."""
+
+from sbi_active.information_gain.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+)
+from sbi_active.information_gain.posterior import PosteriorGain
+
+__all__ = ["CandidateSimulations", "InformationGainEstimator", "PosteriorGain"]
