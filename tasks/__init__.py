@@ -1,0 +1,35 @@
+"""Tasks: a simulator, a prior, actions and a real system, ready to use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from sbi_active.tasks.base import Task
+from sbi_active.tasks.numerical import NumericalTask
+
+__all__ = ["TASKS", "Task", "get_task"]
+
+TASKS: dict[str, Callable[..., Task]] = {"numerical": NumericalTask}
+
+
+def get_task(name: str, **options: Any) -> Task:
+    """Return a task by name.
+
+    Args:
+        name: One of ``TASKS``.
+        options: Of the task, for example ``variant="sinh"``.
+
+    Raises:
+        ValueError: If there is no such task; the text lists the valid names.
+
+    Example:
+        >>> get_task("numerical").parameter_names
+        ['theta_1', 'theta_2']
+    """
+    if name not in TASKS:
+        raise ValueError(
+            f"expected a task among {', '.join(map(repr, TASKS))}; got {name!r}; do "
+            "choose one of these"
+        )
+    return TASKS[name](**options)
