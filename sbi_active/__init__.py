@@ -1,0 +1,61 @@
+"""Active simulation-based inference: tune a black-box simulator from few real trials.
+
+Choose the action whose outcome tells most about the simulator's parameters, update a
+neural posterior with the measurement, and go on. An extension of sbi.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.campaign import Campaign, CampaignOptions, Trial
+from sbi_active.designer import Design, InformationGainDesigner, RandomDesigner
+from sbi_active.inference import (
+    ASBI,
+    ActionEmbedding,
+    ActionPosterior,
+    Belief,
+    MixtureDensity,
+)
+from sbi_active.simulation import (
+    GaussianNoise,
+    Simulations,
+    SimulatorModel,
+    simulate,
+)
+
+if TYPE_CHECKING:
+    from sbi_active.export import to_inference_data
+
+__version__ = version("sbi-active")
+
+__all__ = [
+    "ASBI",
+    "ActionEmbedding",
+    "ActionPosterior",
+    "ActionSpace",
+    "Belief",
+    "Campaign",
+    "CampaignOptions",
+    "Design",
+    "DiscreteActions",
+    "GaussianNoise",
+    "InformationGainDesigner",
+    "MixtureDensity",
+    "RandomDesigner",
+    "Simulations",
+    "SimulatorModel",
+    "Trial",
+    "simulate",
+    "to_inference_data",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "to_inference_data":  # ArviZ takes seconds to import
+        from sbi_active.export import to_inference_data
+
+        return to_inference_data
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

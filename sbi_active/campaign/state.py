@@ -1,0 +1,85 @@
+"""The state of a campaign: plain data, from which everything else follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from torch import Tensor
+
+from sbi_active.designer import Design
+
+__all__ = ["CampaignOptions", "CampaignState", "Status", "Trial"]
+
+Status = Literal["pending", "ok", "invalid", "missing"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignOptions:
+    """Sizes and estimators of a campaign.
+
+    Attributes:
+        num_simulations: Rows a round to train on.
+        num_samples: Simulations a candidate action for the expected information gain,
+            half to choose and half to report.
+        density_estimator: As in :class:`~sbi_active.ASBI`.
+    """
+
+    num_simulations: int = 5_000
+    num_samples: int = 1_000
+    density_estimator: Any = None
+
+    def __post_init__(self) -> None:
+        if self.num_simulations < 100:
+            raise ValueError(
+                f"expected num_simulations >= 100; got {self.num_simulations}; do use "
+                "about 5000 a round"
+            )
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial on the real system.
+
+    Attributes:
+        index: Position in the campaign, from 0.
+        action: The action asked for and, once told, the one executed, (action_dim,).
+        x: The outcome, shape x_shape; None while pending or missing.
+        status: "pending"; "ok"; "invalid" where the trial ran and gave no measurement,
+            which is information; "missing" where a fault unrelated to the parameters
+            hit it, which is ignored.
+        design: The design behind the action; None where the trial was not asked for.
+        information_gained: Realized, KL(belief after || before) in nats.
+        seconds: Wall time by stage.
+        cpu_seconds: CPU time by stage.
+        num_simulations: Simulations spent on this trial.
+    """
+
+    index: int
+    action: Tensor
+    x: Tensor | None = None
+    status: Status = "pending"
+    design: Design | None = None
+    information_gained: float | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    num_simulations: int = 0
+
+
+@dataclass
+class CampaignState:
+    """All that a campaign is: with the simulator, the rest can be computed again.
+
+    Attributes:
+        method: Name of the method.
+        seed: Of everything random.
+        options: Sizes and estimators.
+        trials: In the order in which they were asked for or told.
+        processed: Indices of trials that the belief contains, in order of use.
+    """
+
+    method: str
+    seed: int
+    options: CampaignOptions
+    trials: list[Trial] = field(default_factory=list)
+    processed: list[int] = field(default_factory=list)
