@@ -1,0 +1,124 @@
+import arviz as az
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    SimulatorModel,
+    to_inference_data,
+)
+
+matplotlib.use("Agg")
+PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
+OPTIONS = CampaignOptions(
+    num_simulations=300,
+    num_samples=40,
+    density_estimator=MixtureDensity(hidden_features=(8,), num_iterations=50),
+)
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    model = SimulatorModel(
+        lambda theta, action: theta * action,
+        noise=GaussianNoise(0.2),
+        parameter_names=["mass", "friction"],
+        channel_names=["x", "y"],
+    )
+    actions = DiscreteActions([1.0, 2.0], names=["push"])
+    c = Campaign(model, PRIOR, actions, method="nsbi", options=OPTIONS)
+    for _ in range(3):
+        c.ask()
+        c.tell([0.5, 0.4])
+    c.ask()
+    c.tell(status="missing")
+    c.update()
+    return c
+
+
+def test_a_campaign_has_the_groups_and_coordinates(campaign):
+    data = to_inference_data(campaign, num_samples=100)
+    expected = {
+        *("posterior", "prior", "posterior_predictive", "observed_data"),
+        *("constant_data", "sample_stats", "log_likelihood"),
+    }
+    assert {*data.groups()} == expected
+    assert data.posterior.theta.dims == ("chain", "draw", "parameter")
+    assert [*data.posterior.parameter.values] == ["mass", "friction"]
+    assert data.posterior_predictive.x.shape == (1, 100, 3, 2)
+    assert data.posterior_predictive.x.dims[2:] == ("round", "channel")
+    assert data.observed_data.x.shape == (3, 2)
+    assert [*data.observed_data["round"].values] == [1, 2, 3]
+    assert data.constant_data.action.dims == ("round", "action_entry")
+    assert [*data.constant_data.action_entry.values] == ["push"]
+    assert data.log_likelihood.x.shape == (1, 100, 3)
+
+
+def test_the_log_likelihood_belongs_to_the_draws(campaign):
+    data = to_inference_data(campaign, num_samples=10)
+    theta = torch.tensor(data.posterior.theta.values[0])
+    action = torch.tensor(data.constant_data.action.values)
+    x = torch.tensor(data.observed_data.x.values)
+    for r in range(3):
+        mean = theta * action[r]
+        expected = torch.distributions.Normal(mean, 0.2).log_prob(x[r]).sum(-1)
+        assert data.log_likelihood.x.values[0, :, r] == pytest.approx(
+            expected.numpy(), rel=1e-4
+        )
+
+
+def test_arviz_reads_it(campaign, tmp_path):
+    data = to_inference_data(campaign, num_samples=200)
+    summary = az.summary(data, kind="stats")
+    assert [*summary.index] == ["theta[mass]", "theta[friction]"]
+    mean = campaign.belief.mean.numpy()
+    sd = campaign.belief.variance.sqrt().numpy()
+    # rounding to three digits, and the standard error of 200 draws
+    assert (np.abs(summary["mean"] - mean) < 5 * sd / 200**0.5 + 1e-3).all()
+    az.plot_pair(data, var_names=["theta"])
+    assert np.isfinite(az.loo(data, var_name="x").elpd_loo)
+    path = str(tmp_path / "data.nc")
+    data.to_netcdf(path)
+    assert az.from_netcdf(path).posterior.theta.shape == (1, 200, 2)
+
+
+def test_a_belief_and_a_prior_alone():
+    data = to_inference_data(PRIOR, parameter_names=["a", "b"], num_samples=50)
+    assert {*data.groups()} == {"posterior", "sample_stats"}
+    assert [*data.posterior.parameter.values] == ["a", "b"]
+    with pytest.raises(ValueError, match="expected 2 parameter names"):
+        to_inference_data(PRIOR, parameter_names=["a"])
+
+
+def test_a_belief_brings_its_prior(campaign):
+    data = to_inference_data(campaign.belief, num_samples=50)
+    assert "prior" in data.groups()
+    assert data.prior.theta.values.max() > data.posterior.theta.values.mean()
+
+
+def test_a_plain_function_has_no_log_likelihood():
+    def simulator(theta, action):
+        return theta * action + 0.2 * torch.randn_like(theta)
+
+    c = Campaign(
+        simulator, PRIOR, DiscreteActions([1.0]), method="nsbi", options=OPTIONS
+    )
+    c.ask()
+    c.tell([0.5, 0.4])
+    c.update()
+    data = to_inference_data(c, num_samples=20)
+    assert "log_likelihood" not in data.groups()
+    assert data.posterior_predictive.x.shape == (1, 20, 1, 2)
+    assert [*data.posterior.parameter.values] == ["theta_1", "theta_2"]
+
+
+def test_same_seed_same_draws(campaign):
+    a, b = (to_inference_data(campaign, num_samples=5, seed=1) for _ in range(2))
+    assert (a.posterior.theta.values == b.posterior.theta.values).all()
