@@ -1,0 +1,221 @@
+"""The command line: ``sbi-active run TASK --out DIR``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from sbi_active import __version__
+from sbi_active.campaign import Campaign, CampaignOptions, Trial
+from sbi_active.campaign.campaign import METHODS
+from sbi_active.inference.mixture_density import MixtureDensity
+from sbi_active.plots import as_table, plot_rounds, save
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
+
+__all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments; None takes those of the process.
+
+    Returns:
+        The exit status.
+    """
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    try:
+        return arguments.command(arguments)
+    except (ValueError, OSError) as error:
+        print(f"sbi-active: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sbi-active",
+        description="Tune a black-box simulator from a handful of real trials.",
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = commands.add_parser(
+        "run",
+        help="run a campaign on a task",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    run.set_defaults(command=_run)
+    run.add_argument("task", help=f"one of: {', '.join(TASKS)}")
+    run.add_argument("--method", default="asbi", help=f"one of: {', '.join(METHODS)}")
+    run.add_argument("--rounds", type=int, default=4, help="real trials")
+    run.add_argument("--seed", type=int, default=0)
+    run.add_argument("--out", type=Path, required=True, help="folder for the results")
+    run.add_argument("--variant", help="of the task, where it has variants")
+    run.add_argument(
+        "--simulations", type=int, default=5_000, help="to train on, a round"
+    )
+    run.add_argument(
+        "--samples", type=int, default=1_000, help="for the gain, a candidate action"
+    )
+    run.add_argument(
+        "--iterations", type=int, default=600, help="training steps a round"
+    )
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    options = {} if arguments.variant is None else {"variant": arguments.variant}
+    try:
+        task = get_task(arguments.task, **options)
+    except TypeError as error:
+        raise ValueError(
+            f"expected no --variant for task {arguments.task!r}, which has none; got "
+            f"{arguments.variant!r}; do drop it"
+        ) from error
+    if arguments.rounds < 1:
+        raise ValueError(f"expected --rounds >= 1; got {arguments.rounds}; do use 4")
+    campaign = Campaign(
+        task.simulator,
+        task.prior,
+        task.actions,
+        method=arguments.method,
+        seed=arguments.seed,
+        options=CampaignOptions(
+            num_simulations=arguments.simulations,
+            num_samples=arguments.samples,
+            density_estimator=MixtureDensity(num_iterations=arguments.iterations),
+        ),
+    )
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    beliefs, rounds, exact_gains = [campaign.belief], [], []
+    with tqdm(total=arguments.rounds, desc=arguments.method, unit="round") as bar:
+        for index in range(arguments.rounds):
+            exact_gains.append(_exact_gain(task, campaign))
+            bar.set_postfix_str("designing")
+            trial = campaign.ask()
+            bar.set_postfix_str("measuring")
+            campaign.tell(
+                task.real_system(
+                    trial.action, seed=derive_seed(arguments.seed, "real", index)
+                )
+            )
+            bar.set_postfix_str("updating")
+            beliefs.append(campaign.update())
+            rounds.append(_round_record(task, campaign, exact_gains[-1]))
+            bar.update()
+    wall = time.perf_counter() - start
+    print(_table(rounds))
+    figure_path = arguments.out / "loop.png"
+    with forked_generators(arguments.seed, "figure"):
+        figure = plot_rounds(
+            beliefs,
+            [trial.design for trial in campaign.history if trial.design is not None],
+            parameter_names=task.parameter_names,
+            theta_true=task.theta_true,
+            exact_gains=exact_gains,
+        )
+    save(figure, str(figure_path))
+    _save(arguments, campaign, rounds, wall)
+    mean, sd = campaign.belief.mean, campaign.belief.variance.sqrt()
+    for name, m, s, truth in zip(
+        task.parameter_names, mean, sd, task.theta_true, strict=True
+    ):
+        print(f"{name}: {m:.4g} +- {s:.2g} (truth {truth:g})")
+    print(f"{wall:.1f} s; figure: {figure_path}; results: {arguments.out}")
+    return 0
+
+
+def _exact_gain(task: Task, campaign: Campaign) -> torch.Tensor | None:
+    """Return the exact gain of every candidate in the next round, where known."""
+    reference = _reference(task, campaign.history)
+    if reference is None:
+        return None
+    return reference.expected_information_gain(task.actions.values)
+
+
+def _reference(task: Task, trials: Sequence[Trial]) -> Any:
+    used = [t for t in trials if t.status == "ok" and t.x is not None]
+    dim = task.actions.action_dim
+    if not used:
+        return task.reference(torch.empty(0, dim), torch.empty(0, 1))
+    x = torch.stack([t.x for t in used if t.x is not None])
+    return task.reference(torch.stack([t.action for t in used]), x)
+
+
+def _round_record(
+    task: Task, campaign: Campaign, exact_gain: torch.Tensor | None
+) -> dict[str, Any]:
+    """Return the figures of the last round."""
+    trial = campaign.history[-1]
+    assert trial.design is not None
+    assert trial.x is not None
+    index = trial.design.index
+    log_prob = float(campaign.belief.log_prob(task.theta_true))
+    record = {
+        "round": len(campaign.history),
+        "action": trial.action.tolist(),
+        "x": trial.x.tolist(),
+        "eig": float(trial.design.expected_information_gain[index]),
+        "eig_se": float(trial.design.standard_error[index]),
+        "information_gained": trial.information_gained,
+        "log_prob_true": log_prob,
+        "num_simulations": trial.num_simulations,
+        "seconds": trial.seconds,
+        "cpu_seconds": trial.cpu_seconds,
+    }
+    if exact_gain is not None:
+        exact = _reference(task, campaign.history)
+        record["exact_eig"] = float(exact_gain[index])
+        record["regret"] = float(exact_gain.max() - exact_gain[index])
+        exact_log_prob = float(exact.log_prob(task.theta_true[None])[0])
+        record["exact_log_prob_true"] = exact_log_prob
+        record["gap"] = exact_log_prob - log_prob
+    return record
+
+
+def _table(rounds: Sequence[dict[str, Any]]) -> str:
+    columns = {
+        "round": lambda r: str(r["round"]),
+        "action": lambda r: ", ".join(f"{a:g}" for a in r["action"]),
+        "EIG": lambda r: f"{r['eig']:.2f} +- {r['eig_se']:.2f}",
+        "exact EIG": lambda r: f"{r['exact_eig']:.2f}" if "exact_eig" in r else "-",
+        "gained": lambda r: f"{r['information_gained']:.2f}",
+        "log p(truth)": lambda r: f"{r['log_prob_true']:.2f}",
+        "gap to exact": lambda r: f"{r['gap']:.2f}" if "gap" in r else "-",
+        "time [s]": lambda r: f"{sum(r['seconds'].values()):.1f}",
+    }
+    rows = [[cell(r) for cell in columns.values()] for r in rounds]
+    return as_table(rows, [*columns])
+
+
+def _save(
+    arguments: argparse.Namespace,
+    campaign: Campaign,
+    rounds: Sequence[dict[str, Any]],
+    wall: float,
+) -> None:
+    from sbi_active.export import to_inference_data
+
+    summary = {
+        "task": arguments.task,
+        "variant": arguments.variant,
+        "method": arguments.method,
+        "seed": arguments.seed,
+        "version": __version__,
+        "seconds": wall,
+        "rounds": rounds,
+    }
+    (arguments.out / "result.json").write_text(json.dumps(summary, indent=2) + "\n")
+    data = to_inference_data(campaign, seed=arguments.seed)
+    data.to_netcdf(str(arguments.out / "inference_data.nc"))
