@@ -7,10 +7,14 @@ from typing import Any
 
 from sbi_active.tasks.base import Task
 from sbi_active.tasks.numerical import NumericalTask
+from sbi_active.tasks.oscillator import OscillatorTask
 
 __all__ = ["TASKS", "Task", "get_task"]
 
-TASKS: dict[str, Callable[..., Task]] = {"numerical": NumericalTask}
+TASKS: dict[str, Callable[..., Task]] = {
+    "numerical": NumericalTask,
+    "oscillator": OscillatorTask,
+}
 
 
 def get_task(name: str, **options: Any) -> Task:
