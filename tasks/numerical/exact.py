@@ -143,10 +143,10 @@ class ExactPosterior:
         Returns:
             Log density in nats, shape (n,).
         """
-        x = _as_vector(x, "x")
+        further = _as_vector(x, "x")
         actions = np.append(self.action, as_actions([float(action)]))
-        trials = np.column_stack([np.tile(self.x, (x.size, 1)), x])
-        blocks = np.array_split(trials, 1 + x.size // 1000)
+        trials = np.column_stack([np.tile(self.x, (further.size, 1)), further])
+        blocks = np.array_split(trials, 1 + further.size // 1000)
         evidence = [log_evidence(self._response, actions, block)[0] for block in blocks]
         return torch.from_numpy(np.concatenate(evidence) - self.log_evidence)
 
@@ -246,9 +246,9 @@ def noise_free(
     Returns:
         Outcomes, shape (n, a).
     """
-    theta, action = as_parameters(theta), as_actions(action)
-    g = find_response(variant).curve(theta[:, :1])
-    return torch.from_numpy(g * np.exp(3 - action) + theta[:, 1:] * action)
+    parameters, xi = as_parameters(theta), as_actions(action)
+    g = find_response(variant).curve(parameters[:, :1])
+    return torch.from_numpy(g * np.exp(3 - xi) + parameters[:, 1:] * xi)
 
 
 def find_response(variant: str) -> Response:
@@ -263,23 +263,23 @@ def find_response(variant: str) -> Response:
 
 def as_actions(action: Tensor | ArrayLike) -> Array:
     """Actions of shape (a,) or (a, 1) as a checked array of shape (a,)."""
-    action = _as_vector(action, "action")
-    if (abs(action) > BOUND).any():
+    vector = _as_vector(action, "action")
+    if (abs(vector) > BOUND).any():
         raise ValueError(
-            f"expected actions in [-5, 5]; got {action[abs(action).argmax()]:g}; do "
+            f"expected actions in [-5, 5]; got {vector[abs(vector).argmax()]:g}; do "
             "keep to the range of the task"
         )
-    return action
+    return vector
 
 
 def as_parameters(theta: Tensor | ArrayLike) -> Array:
     """Parameters as a checked array of shape (n, 2)."""
-    theta = as_array(theta)
-    if theta.ndim != 2 or theta.shape[1] != 2:
+    rows = as_array(theta)
+    if rows.ndim != 2 or rows.shape[1] != 2:
         raise ValueError(
-            f"expected theta of shape (n, 2); got {theta.shape}; do pass one row a draw"
+            f"expected theta of shape (n, 2); got {rows.shape}; do pass one row a draw"
         )
-    return theta
+    return rows
 
 
 def as_array(values: Tensor | ArrayLike) -> Array:

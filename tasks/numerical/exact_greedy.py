@@ -87,26 +87,26 @@ def greedy_design(
         >>> campaign.action.flatten()
         tensor([-5.,  5.], dtype=torch.float64)
     """
-    theta_true, actions = _as_truth(theta_true), as_actions(actions)
+    truth, candidates = _as_truth(theta_true), as_actions(actions)
     posterior = ExactPosterior([], [], variant=variant)
     rounds = []
     for r in range(num_rounds):
         rng = np.random.default_rng([seed, r])
         noise = rng.standard_normal()
-        index, gain = greedy_action(posterior, actions, seed=rng)
-        outcome = noise_free(theta_true, actions[[index]], variant=variant).item()
+        index, gain = greedy_action(posterior, candidates, seed=rng)
+        outcome = noise_free(truth, candidates[[index]], variant=variant).item()
         posterior = ExactPosterior(
-            np.append(posterior.action, actions[index]),
+            np.append(posterior.action, candidates[index]),
             np.append(posterior.x, outcome + noise),
             variant=variant,
         )
         error = reproduction_error(
             posterior.sample(10_000, seed=rng),
-            theta_true,
+            truth,
             REPRODUCTION_ACTIONS,
             variant=variant,
         )
-        rounds.append((gain[index], posterior.log_prob(theta_true)[0], error))
+        rounds.append((gain[index], posterior.log_prob(truth)[0], error))
     gains, log_probs, errors = (torch.stack(each) for each in zip(*rounds, strict=True))
     return GreedyDesign(
         action=torch.from_numpy(posterior.action)[:, None],
