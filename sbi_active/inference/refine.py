@@ -1,0 +1,342 @@
+"""Refinement: the posterior of all trials, simulated where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.belief import Belief, require_support
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.histories import Histories
+from sbi_active.inference.population import (
+    GaussianMixture,
+    Particles,
+    Proposal,
+    StudentProposal,
+    population_monte_carlo,
+)
+from sbi_active.inference.regions import (
+    PriorProposal,
+    Region,
+    RegionsProposal,
+    around,
+    cover,
+    whole_space,
+)
+from sbi_active.inference.surrogate import Surrogate
+from sbi_active.inference.trust import Course, Stage, diagnose
+from sbi_active.seeding import derive_seed, forked_generators
+
+__all__ = ["RefinedBelief", "Refinement", "refine"]
+
+Array = NDArray[Any]
+
+MIN_STAGE = 60  # histories below which another stage adds nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """Settings of the refinement.
+
+    Attributes:
+        num_histories: Budget of simulated histories, replicates included; a history is
+            a parameter set at which each executed action is simulated. Fewer are used
+            where the surrogate is good sooner.
+        defensive: Share of the prior in the belief, so that no parameter is ruled out
+            by an error of the surrogate; .01 costs .01 nat.
+        first_share: Share of the budget for the first stage, over the whole prior. It
+            must find every mode; what it spends is lost where the posterior is narrow.
+        stage_share: Share for each later stage.
+        replicate_share: Share of a stage simulated twice, which tells noise from
+            misfit.
+        num_particles: Of the importance sample of the surrogate, which costs no
+            simulations; its effective number bounds the error of the normalizer.
+        max_regions: Ellipsoids at most, but for splits against misfit.
+    """
+
+    num_histories: int = 3_000
+    defensive: float = 0.01
+    first_share: float = 0.25
+    stage_share: float = 0.15
+    replicate_share: float = 0.2
+    num_particles: int = 8_000
+    max_regions: int = 8
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("num_histories", 200, np.inf),
+            ("defensive", 1e-6, 0.5),
+            ("first_share", 0.05, 1.0),
+            ("stage_share", 0.02, 1.0),
+            ("replicate_share", 0.05, 0.5),
+            ("num_particles", 1_000, np.inf),
+            ("max_regions", 1, 32),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(
+                    f"expected {name} in [{low:g}, {high:g}]; got {value}; do choose "
+                    "a value in this range"
+                )
+
+
+class RefinedBelief(Belief):
+    r"""The posterior of all trials given the original prior.
+
+    .. math::
+        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)\, \hat L(\theta)}{Z}
+        + \epsilon\, p(\theta), \qquad \hat L(\theta) \approx
+        \prod_k p(x_k | \theta, \xi_k).
+
+    Args:
+        prior: The original prior p.
+        surrogate: The prior times the learned likelihood :math:`\hat L`.
+        particles: Importance sample of it, which gives Z and the proposal of draws.
+        defensive: The share :math:`\epsilon`.
+    """
+
+    label = "refined"
+
+    def __init__(
+        self,
+        prior: Distribution,
+        surrogate: Surrogate,
+        particles: Particles,
+        *,
+        defensive: float,
+    ) -> None:
+        with forked_generators(0):  # the base class draws once to learn the dimension
+            super().__init__(prior)
+        self._surrogate = surrogate
+        self._defensive = defensive
+        self._proposal = particles.proposal
+        self._log_normalizer = particles.log_normalizer
+        # Draws are kept with probability weight / bound; a bound on all weights that
+        # keeps too few is lowered, at the cost of a thinner tail.
+        largest = float(particles.log_weight.max())
+        self._log_bound = min(largest, self._log_normalizer - np.log(MIN_ACCEPTANCE))
+
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        coordinates = self._surrogate.coordinates
+        z = coordinates.to_z(theta)
+        log_prior = coordinates.log_prior(z) - coordinates.log_jacobian(z)
+        density = np.full(len(z), -np.inf)
+        inside = np.isfinite(log_prior)
+        log_likelihood = self._surrogate.log_likelihood(z[inside])
+        density[inside] = log_prior[inside] + np.logaddexp(
+            np.log1p(-self._defensive) + log_likelihood - self._log_normalizer,
+            np.log(self._defensive),
+        )
+        return torch.from_numpy(density)
+
+    def _sample(self, num_samples: int) -> Tensor:
+        seed = int(torch.randint(2**62, ()))
+        rng = np.random.default_rng(seed)
+        coordinates = self._surrogate.coordinates
+        num_prior = rng.binomial(num_samples, self._defensive)
+        kept = [coordinates.sample_prior(num_prior, rng)]
+        missing = num_samples - num_prior
+        acceptance = np.exp(self._log_normalizer - self._log_bound)
+        while missing > 0:
+            z = self._proposal.sample(int(1.1 * missing / acceptance) + 20, rng)
+            log_weight = self._surrogate.log_joint(z) - self._proposal.log_prob(z)
+            accepted = np.log(rng.random(len(z))) < log_weight - self._log_bound
+            kept.append(z[accepted][:missing])
+            missing -= len(kept[-1])
+        z = rng.permutation(np.concatenate(kept))
+        return coordinates.to_theta(z)
+
+
+#: Least share of draws that sampling keeps.
+MIN_ACCEPTANCE = 0.03
+
+
+def refine(
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    action: Tensor,
+    x: Tensor,
+    *,
+    start: Distribution | None = None,
+    settings: Refinement | None = None,
+    seed: int,
+) -> RefinedBelief:
+    r"""Return the posterior of all trials given the original prior.
+
+    Stage by stage, over the whole prior and then in ellipsoids around what is still
+    plausible: simulate every executed action at each parameter set, regress the
+    outcomes on the parameters (:mod:`~sbi_active.inference.surrogate`), sample prior
+    times surrogate likelihood without simulations
+    (:func:`~sbi_active.inference.population.population_monte_carlo`), and put new
+    ellipsoids around the sample. It ends when the residuals are pure noise and a stage
+    changes nothing, or when the budget is spent.
+
+    Args:
+        simulator: ``simulator(theta, action)``; not kept in the result.
+        prior: The original prior, with a support.
+        action: Executed actions, shape (t, action_dim).
+        x: Their observed outcomes, shape (t, *x_shape), all finite.
+        start: Where else to look first, for example a chained belief. It adds
+            simulations and no weight, so it cannot bias.
+        settings: Budget and shares; None is ``Refinement()``.
+        seed: Of everything random here.
+
+    Returns:
+        The belief; ``belief.diagnostics`` says how far to trust it.
+
+    Raises:
+        ValueError: If shapes do not fit, x is not finite, there is no trial, the
+            simulator is deterministic or almost never gives a measurement.
+
+    References:
+        Wood, Nature 2010; Price et al., J. Comp. Graph. Stat. 2018 (synthetic
+        likelihood); Cappe et al., J. Comp. Graph. Stat. 2004 (population Monte Carlo).
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
+        >>> def simulator(theta, action):
+        ...     return theta * action + 0.1 * torch.randn_like(theta)
+        >>> action, x = torch.tensor([[1.0], [2.0]]), torch.tensor([[0.3], [0.6]])
+        >>> belief = refine(simulator, prior, action, x, seed=0)
+        >>> bool((belief.mean - 0.3).abs() < 0.05)
+        True
+    """
+    prior = require_support(prior)
+    settings = Refinement() if settings is None else settings
+    action, observed = _trials(action, x)
+    # The matrices are small: threads would only wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _refine(simulator, prior, action, observed, start, settings, seed)
+
+
+def _refine(
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    action: Tensor,
+    observed: Array,
+    start: Distribution | None,
+    settings: Refinement,
+    seed: int,
+) -> RefinedBelief:
+    rng = np.random.default_rng(derive_seed(seed, "refine"))
+    coordinates = PriorCoordinates(prior, rng)
+    histories = Histories(simulator, action, observed, coordinates, seed)
+
+    regions = [whole_space(coordinates.dim)]
+    if start is not None:
+        with forked_generators(derive_seed(seed, "start")):
+            draws = coordinates.to_z(start.sample(torch.Size([1_000])).float())
+        regions.append(around(draws[coordinates.inside(draws)]))
+    base: Proposal = PriorProposal(coordinates)
+    first: Proposal | None = None
+    course = Course(budget=settings.num_histories)
+    num_forced = 1
+    while True:
+        stage_size = _stage_size(settings, len(histories), coordinates.dim)
+        _simulate_stage(histories, regions, stage_size, settings, rng)
+        next_size = _stage_size(settings, len(histories), coordinates.dim)
+        is_last = next_size < MIN_STAGE
+        fits = [histories.regress(region) for region in regions]
+        regressions = [fit for fit in fits if fit is not None]
+        if not regressions:
+            raise ValueError(
+                "expected simulations with a measurement; got NaN in "
+                f"{int((~histories.valid).sum())} of {len(histories)} histories; do "
+                "check the simulator at the executed actions, or the prior"
+            )
+        surrogate = Surrogate(coordinates, regressions, not is_last)
+        particles, _ = population_monte_carlo(
+            surrogate.log_joint,
+            base,
+            rng,
+            num_particles=settings.num_particles,
+            first=first,
+            num_components=6 if len(regressions) <= 4 else 10,
+        )
+        stage = Stage.of(surrogate, particles, settings.defensive, rng)
+        course.append(stage)
+        if is_last or course.is_settled:
+            break
+        num_forced = (
+            min(2 * max(num_forced, len(regions)), 32)
+            if (course.is_stuck)
+            else max(1, num_forced // 2)
+        )
+        limit = max(1, int(next_size / (1.2 * (coordinates.dim + 21))))
+        regions = cover(
+            particles,
+            rng,
+            min_regions=min(num_forced, limit),
+            max_regions=min(max(settings.max_regions, num_forced), limit),
+            generous=stage.excess < 3,
+        )
+        base = RegionsProposal(regions)
+        mixture = GaussianMixture.fit(particles.resample(800, rng), 6, rng)
+        first = StudentProposal(mixture, base)
+
+    diagnostics = diagnose(
+        course,
+        num_simulations=len(histories) * len(action),
+        share_invalid=float((~histories.valid).mean()),
+        num_trials=len(action),
+        rng=rng,
+    )
+    # The residuals have served the diagnostics and would only weigh on the pickle.
+    empty = np.zeros((0, observed.size))
+    slim = [replace(r, residual=empty, standardized=empty) for r in regressions]
+    surrogate = Surrogate(coordinates, slim)
+    belief = RefinedBelief(prior, surrogate, particles, defensive=settings.defensive)
+    belief.diagnostics = diagnostics
+    return belief
+
+
+def _stage_size(settings: Refinement, used: int, dim: int) -> int:
+    share = settings.first_share if used == 0 else settings.stage_share
+    size = max(int(share * settings.num_histories), MIN_STAGE)
+    left = settings.num_histories - used
+    # A remainder too small for a stage of its own goes to the one before.
+    return left if left < size + MIN_STAGE else size
+
+
+def _simulate_stage(
+    histories: Histories,
+    regions: list[Region],
+    size: int,
+    settings: Refinement,
+    rng: np.random.Generator,
+) -> None:
+    num_replicates = max(int(settings.replicate_share * size), 12)
+    num_places = size - num_replicates
+    counts = np.diff(np.linspace(0, num_places, len(regions) + 1).astype(int))
+    places = [
+        region.sample_inside(int(count), histories.coordinates, rng)
+        for region, count in zip(regions, counts, strict=True)
+    ]
+    z = rng.permutation(np.concatenate(places))
+    histories.add(z, min(num_replicates, len(z)))
+
+
+def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Array]:
+    action, x = torch.as_tensor(action), torch.as_tensor(x)
+    if action.ndim != 2 or x.ndim < 1 or len(action) != len(x) or len(action) == 0:
+        raise ValueError(
+            "expected action (t, action_dim) and x (t, *x_shape) with as many trials, "
+            f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; do stack "
+            "the trials along axis 0"
+        )
+    observed = x.double().cpu().numpy().reshape(-1)
+    if not np.isfinite(observed).all():
+        raise ValueError(
+            f"expected finite x; got {int((~np.isfinite(observed)).sum())} NaN or "
+            "infinite values; do leave out trials without a measurement"
+        )
+    return action.float().cpu(), observed

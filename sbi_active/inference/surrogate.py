@@ -1,0 +1,361 @@
+r"""A likelihood learned by regression of outcomes on parameters, region by region.
+
+In a region the stacked outcomes of all trials are modeled as
+
+.. math::
+    x \mid \theta \sim \mathcal N\big(B^\top f(u),\; (1 + h(u))\, S\big), \qquad
+    h(u) = f(u)^\top (F^\top F)^{-1} f(u),
+
+with f a basis in the region's own coordinates u, S the covariance of the residuals,
+which holds the noise and what the basis misses, and h the leverage, by which the
+likelihood widens where simulations are few. Regressing x on theta asks nothing of
+where the simulations lie, so there is no proposal to correct for.
+
+References:
+    Wood, Nature 2010 (synthetic likelihood); Schafer & Strimmer, Stat. Appl. Genet.
+    Mol. Biol. 2005 (shrinkage); Hartlap et al., A&A 2007 (inverse of a covariance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.regions import Region, nearest_region
+
+__all__ = ["LocalRegression", "NoiseEstimate", "Surrogate", "estimate_noise"]
+
+Array = NDArray[Any]
+
+CAUTION = 2.0  # at least, under misfit
+MISFIT = 1.12  # residual over noise variance above which the basis misses something
+GAIN = 0.005  # nats an outcome that a larger basis must save
+MAX_WAVES = 120  # random Fourier features
+WAVE_LENGTHS = (1.0, 0.5, 0.25)  # in half-widths of the region
+FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Monomials up to a degree, and random cosines.
+
+    Attributes:
+        degree: Of the monomials.
+        frequency: Shape (d, w), w = 0 for none.
+        phase: Shape (w,).
+    """
+
+    degree: int
+    frequency: Array
+    phase: Array
+
+    @staticmethod
+    def polynomial(degree: int, dim: int) -> Basis:
+        """Return a basis without cosines."""
+        return Basis(degree, np.zeros((dim, 0)), np.zeros(0))
+
+    @staticmethod
+    def waves(length: float, dim: int, num: int) -> Basis:
+        """Return quadratics and cosines (Rahimi & Recht, NeurIPS 2007)."""
+        rng = np.random.default_rng(7)  # any fixed directions will do
+        frequency = rng.standard_normal((dim, num)) / length
+        return Basis(2, frequency, rng.uniform(0, 2 * np.pi, num))
+
+    def __call__(self, u: Array) -> Array:
+        """Return features, shape (n, p), of coordinates, shape (n, d)."""
+        monomials = [np.ones(len(u))]
+        last = [(0, monomials[0])]
+        for _ in range(self.degree):
+            last = [
+                (j, column * u[:, j])
+                for first, column in last
+                for j in range(first, u.shape[1])
+            ]
+            monomials += [column for _, column in last]
+        features = np.stack(monomials, 1)
+        if self.phase.size == 0:
+            return features
+        return np.concatenate([features, np.cos(u @ self.frequency + self.phase)], 1)
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """Noise from pairs of outcomes at the same parameters.
+
+    Attributes:
+        variance: Of each outcome, shape (q,).
+        num_pairs: How many pairs it rests on.
+    """
+
+    variance: Array
+    num_pairs: int
+
+
+def estimate_noise(first: Array, second: Array, scale: Array) -> NoiseEstimate:
+    """Return the noise of pairs of outcomes, each of shape (r, q).
+
+    Args:
+        first: Outcomes.
+        second: Outcomes at the same parameters.
+        scale: Largest size of each outcome, shape (q,), whose rounding is a floor.
+    """
+    variance = 0.5 * ((first - second) ** 2).mean(0)
+    return NoiseEstimate(variance + (FLOAT32 * scale) ** 2 + 1e-300, len(first))
+
+
+@dataclass(frozen=True)
+class LocalRegression:
+    r"""Regression of the outcomes, less the observed ones, in one region.
+
+    Attributes:
+        region: Where it holds.
+        basis: f.
+        coefficient: :math:`B L^{-\top}`, outcomes whitened by S = L L^T, shape (p, q).
+        root: :math:`R^{-1}` of F = Q R, so that h = |f R^{-1}|^2, shape (p, p).
+        log_volume: log det L.
+        precision: Factor that makes the inverse of the sample covariance unbiased.
+        log_valid: Log share of simulations in the region with a measurement.
+        roughness: Share of the variance of some outcome that a cubic misses.
+        ratio: Residual over noise variance, mean over outcomes.
+        excess: The same with chance removed: above 1 means misfit.
+        residual: Whitened residuals, shape (n, q).
+        standardized: Residuals over their deviations, not rotated, shape (n, q).
+        whitening: :math:`L^{-1}`, shape (q, q).
+    """
+
+    region: Region
+    basis: Basis
+    coefficient: Array
+    root: Array
+    log_volume: float
+    precision: float
+    log_valid: float
+    roughness: float
+    ratio: float
+    excess: float
+    residual: Array
+    standardized: Array
+    whitening: Array
+
+    @property
+    def has_misfit(self) -> bool:
+        """Whether the residuals are larger than the noise."""
+        return self.excess > MISFIT
+
+    @staticmethod
+    def fit(
+        region: Region,
+        z: Array,
+        x: Array,
+        *,
+        noise: NoiseEstimate,
+        num_trials: int,
+        log_valid: float,
+    ) -> LocalRegression | None:
+        """Fit the basis with the smallest generalized cross-validation score.
+
+        Args:
+            region: Where the simulations lie.
+            z: Their coordinates, shape (n, d).
+            x: Their outcomes less the observed ones, shape (n, q).
+            noise: Noise in the region.
+            num_trials: Trials stacked in q.
+            log_valid: Log share with a measurement.
+
+        Returns:
+            The regression; None where simulations are too few.
+        """
+        n, q = x.shape
+        u = region.scaled(z)
+        scale = np.sqrt(noise.variance)
+        best: tuple[float, Basis, Array, Array, Array] | None = None
+        roughness = 0.0
+        for basis in _candidates(u.shape[1], n):
+            is_wave = basis.phase.size > 0
+            if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
+                break  # a cubic will do, or another stage makes it do
+            features = basis(u)
+            p = features.shape[1]
+            if n < p + max(20, p // 2):
+                continue
+            ridge = np.diag(np.full(p, 1e-4 if is_wave else 1e-9))
+            orthogonal, triangular = np.linalg.qr(np.concatenate([features, ridge]))
+            root = np.linalg.inv(triangular)
+            coefficient = root @ (orthogonal[:n].T @ x)
+            residual = x - features @ coefficient
+            variance = ((residual / scale) ** 2).sum(0) / (n - p) + 1e-12
+            score = np.log(variance).sum() + q * np.log(n / (n - p))
+            if not is_wave:
+                missed = (residual**2).sum(0) / (n - p) - noise.variance
+                roughness = float((missed / x.var(0).clip(noise.variance)).max())
+            if best is None or score < best[0] - GAIN * q:
+                best = (score, basis, root, residual, coefficient)
+        if best is None:
+            return None
+        _, basis, root, residual, coefficient = best
+        freedom = n - len(root)
+        ratio = (residual**2).sum(0) / freedom / noise.variance
+        excess = _excess(ratio, freedom, noise.num_pairs)
+        covariance, precision = _covariance(
+            residual, freedom, noise.variance, num_trials, excess <= MISFIT
+        )
+        factor = np.linalg.cholesky(covariance)
+        inverse = np.linalg.inv(factor)
+        return LocalRegression(
+            region=region,
+            basis=basis,
+            coefficient=coefficient @ inverse.T,
+            root=root,
+            log_volume=float(np.log(np.diag(factor)).sum()),
+            precision=precision,
+            log_valid=log_valid,
+            roughness=roughness,
+            ratio=float(ratio.mean()),
+            excess=excess,
+            residual=residual @ inverse.T,
+            standardized=residual / np.sqrt(np.diag(covariance)),
+            whitening=inverse,
+        )
+
+    def whitened(self, z: Array) -> tuple[Array, Array]:
+        """Return the whitened prediction less the observation, and 1 + h.
+
+        Args:
+            z: Shape (n, d).
+
+        Returns:
+            Shapes (n, q) and (n,).
+        """
+        features = self.basis(self.region.scaled(z))
+        leverage = ((features @ self.root) ** 2).sum(1)
+        return features @ self.coefficient, 1 + leverage
+
+    @property
+    def caution(self) -> float:
+        """Factor of the variance that keeps what the misfit would wrongly exclude.
+
+        Misfit is no noise: it is the same at each visit, and where the posterior lies
+        it may be as large as anywhere in the region. So the largest residual shall
+        count as an ordinary one.
+        """
+        if not self.has_misfit:
+            return 1.0
+        n, q = self.residual.shape
+        square = (self.residual**2).sum(1) * n / (n - len(self.root))
+        return float(max(CAUTION, square.max() / chi2.ppf(0.9, q)))
+
+    def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
+        """Return the log likelihood of the observation, shape (n,).
+
+        Args:
+            z: Shape (n, d).
+            caution: Factor of the variance.
+        """
+        error, widening = self.whitened(z)
+        q = error.shape[1]
+        square = (error**2).sum(1) * self.precision / (widening * caution)
+        log_volume = self.log_volume + 0.5 * q * np.log(2 * np.pi * widening * caution)
+        return self.log_valid - 0.5 * square - log_volume
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """Prior times learned likelihood of all trials, each place in its nearest region.
+
+    Attributes:
+        coordinates: Of the prior.
+        regressions: One a region.
+        is_cautious: Whether regions with misfit are taken with their caution, to find
+            where to simulate next and not what to believe.
+    """
+
+    coordinates: PriorCoordinates
+    regressions: list[LocalRegression]
+    is_cautious: bool = False
+
+    def log_likelihood(self, z: Array) -> Array:
+        """Return the log likelihood, shape (n,); -inf outside all regions."""
+        label = self.assign(z)
+        log_likelihood = np.full(len(z), -np.inf)
+        for k, regression in enumerate(self.regressions):
+            rows = np.flatnonzero(label == k)
+            if len(rows):
+                caution = regression.caution if self.is_cautious else 1.0
+                log_likelihood[rows] = regression.log_likelihood(z[rows], caution)
+        return log_likelihood
+
+    def log_joint(self, z: Array) -> Array:
+        """Return log prior plus log likelihood in the coordinates z, shape (n,)."""
+        log_joint = self.coordinates.log_prior(z)
+        rows = np.flatnonzero(np.isfinite(log_joint))
+        log_joint[rows] += self.log_likelihood(z[rows])
+        return log_joint
+
+    def assign(self, z: Array) -> NDArray[np.intp]:
+        """Return the region of each place, shape (n,); -1 where there is none."""
+        return nearest_region([r.region for r in self.regressions], z)
+
+
+def _candidates(dim: int, num_rows: int) -> list[Basis]:
+    polynomials = [Basis.polynomial(degree, dim) for degree in (1, 2, 3)]
+    num_waves = min(MAX_WAVES, num_rows // 4)
+    return polynomials + [Basis.waves(s, dim, num_waves) for s in WAVE_LENGTHS]
+
+
+def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
+    variance = (residual**2).sum(0) / (len(residual) - len(root))
+    return float((variance / noise.variance).max())
+
+
+def _excess(ratio: Array, freedom: int, num_pairs: int) -> float:
+    """Return the misfit, residual over noise variance, with chance removed.
+
+    The mean over outcomes is sharp where all are missed a little, the maximum where
+    one is missed; each less what chance alone reaches.
+    """
+    q = len(ratio)
+    deviation = np.sqrt(2 / freedom + 2 / max(num_pairs, 1))
+    mean = ratio.mean() - 3 * deviation / np.sqrt(q)
+    largest = ratio.max() / (1 + (2 + 0.3 * np.log(q)) * deviation)
+    return float(max(mean, largest))
+
+
+def _covariance(
+    residual: Array,
+    freedom: int,
+    noise_variance: Array,
+    num_trials: int,
+    independent: bool,
+) -> tuple[Array, float]:
+    r"""Return the residuals' covariance, shrunk, and the factor of its inverse.
+
+    Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`,
+    apart within a trial and across trials. Noise does not correlate across trials,
+    which are independent given theta; misfit does.
+    """
+    q = residual.shape[1]
+    deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise_variance)
+    standardized = residual / deviation
+    correlation = standardized.T @ standardized / freedom
+    within = np.kron(np.eye(num_trials), np.ones((q // num_trials,) * 2)) > 0
+    diagonal = np.eye(q, dtype=bool)
+    across = 1.0 if independent else _shrinkage(correlation[~within], freedom)
+    shrunk = _shrinkage(correlation[within & ~diagonal], freedom)
+    correlation = np.where(within, correlation, (1 - across) * correlation)
+    correlation = np.where(diagonal, 1.0, (1 - shrunk) * correlation)
+    size = q if across < 1 else q // num_trials
+    free = 1 + (size - 1) * (1 - shrunk) ** 2
+    precision = max((freedom - free - 1) / freedom, 0.2)
+    return correlation * np.outer(deviation, deviation), precision
+
+
+def _shrinkage(correlation: Array, freedom: int) -> float:
+    if correlation.size == 0:
+        return 1.0
+    variance = (1 - correlation**2) ** 2 / freedom
+    return float(min(1.0, variance.sum() / max((correlation**2).sum(), 1e-300)))

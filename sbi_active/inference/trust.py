@@ -1,0 +1,349 @@
+"""How far a refined belief can be trusted, from the stages that led to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.inference.population import Particles
+from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
+
+__all__ = ["Course", "Stage", "diagnose"]
+
+Array = NDArray[Any]
+
+SETTLED = 0.03  # nats a dimension that the last stage may have changed
+LIVE = 0.01  # mass below which a region is left out of the checks
+MAX_DIM = 6
+MIN_EFFECTIVE = 0.05  # share of the particles
+ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
+HARD_NOISE = 0.03  # nats a number that a Gaussian loses on the noise
+SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
+UNSETTLED = 0.1  # nats a dimension
+CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
+EDGE = 0.5  # mass within 1 % of the prior's edge that calls for a warning
+RARE = 1e-3  # tail probability of the observation that calls for a warning
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: surrogate, its sample and its normalized log density.
+
+    Attributes:
+        surrogate: Fitted at this stage.
+        particles: Importance sample of it.
+        defensive: Share of the prior in the density.
+        draws: Equally weighted particles, shape (n, d).
+        excess: Worst misfit of a region with mass.
+        mass: Of each region, shape (k,).
+        entropy: Of the density, in nats.
+    """
+
+    surrogate: Surrogate
+    particles: Particles
+    defensive: float
+    draws: Array
+    excess: float
+    mass: Array
+    entropy: float
+
+    @staticmethod
+    def of(
+        surrogate: Surrogate,
+        particles: Particles,
+        defensive: float,
+        rng: np.random.Generator,
+    ) -> Stage:
+        """Return the stage of a fitted surrogate and its sample."""
+        draws = particles.resample(1_000, rng)
+        label = surrogate.assign(draws)
+        mass = np.bincount(label[label >= 0], minlength=len(surrogate.regressions))
+        mass = mass / max(mass.sum(), 1)
+        live = [
+            fit.excess
+            for fit, share in zip(surrogate.regressions, mass, strict=True)
+            if share > LIVE
+        ]
+        stage = Stage(
+            surrogate, particles, defensive, draws, max(live, default=np.inf), mass, 0.0
+        )
+        entropy = -float(stage.log_prob(draws).mean())
+        object.__setattr__(stage, "entropy", entropy)
+        return stage
+
+    def log_prob(self, z: Array) -> Array:
+        """Return the log density of the belief at this stage, shape (n,)."""
+        log_prior = self.surrogate.coordinates.log_prior(z)
+        log_likelihood = self.surrogate.log_likelihood(z)
+        return log_prior + np.logaddexp(
+            np.log1p(-self.defensive) + log_likelihood - self.particles.log_normalizer,
+            np.log(self.defensive),
+        )
+
+
+@dataclass
+class Course:
+    """The stages so far and whether to go on."""
+
+    budget: int
+    stages: list[Stage] = field(default_factory=list)
+    divergence: float = np.inf
+    shrinkage: float = np.inf
+
+    def append(self, stage: Stage) -> None:
+        """Record a stage; its particles and residuals replace the last stage's."""
+        if self.stages:
+            last = self.stages[-1]
+            change = stage.log_prob(stage.draws) - last.log_prob(stage.draws)
+            self.divergence = float(change.mean())
+            self.shrinkage = last.entropy - stage.entropy
+        self.stages.append(stage)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether residuals are noise and the last stage changed nothing."""
+        stage = self.stages[-1]
+        d = stage.draws.shape[1]
+        return (
+            stage.excess <= MISFIT
+            and self.divergence < SETTLED * d
+            and self.shrinkage < 0.1 * d
+        )
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether misfit remains though the last stage learned nothing."""
+        stage = self.stages[-1]
+        return stage.excess > MISFIT and self.divergence < 0.3 and self.shrinkage < 0.3
+
+
+def diagnose(
+    course: Course,
+    *,
+    num_simulations: int,
+    share_invalid: float,
+    num_trials: int,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Return figures about the last stage, its assumptions and warnings in words.
+
+    Args:
+        course: All stages.
+        num_simulations: Rows simulated.
+        share_invalid: Share of histories without a measurement in some trial.
+        num_trials: Trials t.
+        rng: Source of randomness.
+
+    Returns:
+        Numbers, strings, lists and dicts of them only, so that JSON can hold it.
+        ``assumptions`` maps each to ``{"holds": bool, "figure": float}``;
+        ``trustworthy`` is whether there are no ``warnings``.
+    """
+    last = course.stages[-1]
+    fits = last.surrogate.regressions
+    live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
+    dim = last.draws.shape[1]
+    tail, joint = _tail_probability(last, num_trials, rng)
+    edge = np.abs(last.draws[:, last.surrogate.coordinates.bounded]) > 0.98
+    edge_mass = float(edge.any(1).mean())
+    effective = min(
+        stage.particles.effective_sample_size / len(stage.particles.z)
+        for stage in course.stages
+    )
+    roughness = course.stages[0].surrogate.regressions[0].roughness
+    negentropy, is_gaussian = _noise_shape(live, rng)
+    correlation, is_independent = _trial_correlation(live, num_trials)
+    valid = float(np.exp(min((fit.log_valid for fit in live), default=0.0)))
+    ratio = max((fit.ratio for fit in live), default=np.inf)
+
+    assumptions: dict[str, tuple[bool, float, str]] = {
+        "gaussian_noise": (
+            is_gaussian,
+            negentropy,
+            "the noise is not Gaussian (it differs by {:.2g} nats a number), and the "
+            "belief, which takes it for Gaussian, may be too wide or too narrow; do "
+            "check against a belief of a trained network",
+        ),
+        "few_modes": (
+            effective >= MIN_EFFECTIVE,
+            effective,
+            "at some stage only {:.1%} of the particles counted, as with many narrow "
+            "modes, and a mode may be lost; do raise num_histories and first_share",
+        ),
+        "smooth_response": (
+            roughness <= ROUGH,
+            roughness,
+            "over the prior the outcomes have more turns than a cubic, which misses "
+            "{:.0%} of their variance, so that four or more narrow modes are possible "
+            "and one may be lost; do check against another seed or a narrower prior",
+        ),
+        "no_misfit": (
+            last.excess <= SERIOUS_MISFIT,
+            ratio,
+            "the residuals of the surrogate have {:.2g} times the variance of the "
+            "noise, so that the belief is too wide; do raise num_histories",
+        ),
+        "settled": (
+            len(course.stages) > 1 and course.divergence <= UNSETTLED * dim,
+            course.divergence if len(course.stages) > 1 else -1.0,
+            "the last stage still changed the belief, by {:.2g} nats; do raise "
+            "num_histories",
+        ),
+        "independent_trials": (
+            is_independent,
+            correlation,
+            "simulated trials correlate at the same parameters ({:.2f}), yet the "
+            "likelihood is a product over trials; do check how the simulator seeds "
+            "its noise",
+        ),
+        "few_parameters": (
+            dim <= MAX_DIM,
+            float(dim),
+            "there are {:.0f} parameters, and local polynomials are known to serve up "
+            "to 6; do check against a belief of a trained network",
+        ),
+        "mostly_valid": (
+            valid > 0.8,
+            valid,
+            "only {:.0%} of the simulations near the belief have a measurement, and "
+            "the edge of the region where they do is coarse; do raise num_histories",
+        ),
+    }
+    warnings = [
+        text.format(figure) for ok, figure, text in assumptions.values() if not ok
+    ]
+    if joint < RARE or min(tail) < RARE / num_trials:
+        warnings.append(
+            f"the observations are unlike anything simulated (tail probability "
+            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
+            "excludes the truth, or a measurement is wrong"
+        )
+    if edge_mass > EDGE:
+        warnings.append(
+            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
+            "prior may exclude the truth"
+        )
+    return {
+        "num_simulations": num_simulations,
+        "num_stages": len(course.stages),
+        "effective_sample_size": float(last.particles.effective_sample_size),
+        "residual_to_noise": float(ratio),
+        "num_regions": len(fits),
+        "region_mass": [float(mass) for mass in last.mass],
+        "prior_edge_mass": edge_mass,
+        "tail_probability": joint,
+        "tail_probability_of_trial": tail,
+        "surrogate_kl_last_stage": (
+            course.divergence if len(course.stages) > 1 else -1.0
+        ),
+        "share_invalid": share_invalid,
+        "assumptions": {
+            name: {"holds": bool(ok), "figure": float(figure)}
+            for name, (ok, figure, _) in assumptions.items()
+        },
+        "trustworthy": not warnings,
+        "warnings": warnings,
+    }
+
+
+def _tail_probability(
+    stage: Stage, num_trials: int, rng: np.random.Generator, num_pairs: int = 50
+) -> tuple[list[float], float]:
+    r"""Return how often a simulation misses its prediction by more than reality does.
+
+    .. math::
+        P\big(D(x, \theta) \ge D(x_o, \theta)\big), \quad \theta \sim b,\;
+        x \sim p(x | \theta), \quad D = |L^{-1} (x - B^\top f)|^2,
+
+    a trial and for all trials, with residuals of the simulations as x.
+
+    References:
+        Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
+    """
+    label = stage.surrogate.assign(stage.draws)
+    exceeded, count = np.zeros(num_trials + 1), 0
+    for k, fit in enumerate(stage.surrogate.regressions):
+        z = stage.draws[label == k]
+        if len(z) == 0:
+            continue
+        error, widening = fit.whitened(z)
+        n, q = fit.residual.shape
+        observed = _squares(error, num_trials) / widening[:, None]
+        rows = rng.integers(n, size=(len(z), num_pairs))
+        inflation = n / (n - len(fit.root))  # residuals are smaller than the noise
+        simulated = inflation * _squares(fit.residual, num_trials)[rows]
+        exceeded += (simulated >= observed[:, None]).sum((0, 1))
+        count += rows.size
+    tail = (exceeded + 1) / (count + 1)
+    return [float(p) for p in tail[:-1]], float(tail[-1])
+
+
+def _squares(whitened: Array, num_trials: int) -> Array:
+    """Return squared lengths of each trial's part and of all, shape (n, t + 1)."""
+    parts = (whitened.reshape(len(whitened), num_trials, -1) ** 2).sum(-1)
+    return np.concatenate([parts, parts.sum(1, keepdims=True)], 1)
+
+
+def _noise_shape(
+    fits: list[LocalRegression], rng: np.random.Generator
+) -> tuple[float, bool]:
+    r"""Return the negentropy of the residuals, nats a number, and whether it is chance.
+
+    .. math::
+        J = H[\mathcal N(0, s^2)] - H[e],
+
+    with H from the spacings of the sorted residuals, calibrated on Gaussian numbers,
+    for each outcome and for all together: .18 for uniform noise, .42 for exponential.
+
+    References:
+        Vasicek, J. R. Stat. Soc. B 1976.
+    """
+    if not fits:
+        return np.inf, False
+    residual = np.concatenate([fit.standardized for fit in fits])
+    residual = residual[:, residual.var(0) > 1e-6]  # a constant outcome has no noise
+    if residual.size == 0:
+        return 0.0, True
+    columns = [*residual.T, residual.ravel()]
+    excess, clear = [], []
+    for size, members in (
+        (len(residual), columns[:-1]),
+        (residual.size, columns[-1:]),
+    ):
+        chance = [_negentropy(rng.standard_normal(size)) for _ in range(20)]
+        mean, deviation = np.mean(chance), np.std(chance)
+        for member in members:
+            excess.append(_negentropy(member) - mean)
+            clear.append(excess[-1] > HARD_NOISE + 4 * deviation)
+    return float(max(*excess, 0.0)), not any(clear)
+
+
+def _negentropy(values: Array) -> float:
+    n = len(values)
+    m = max(1, int(n**0.5 / 2))
+    ordered = np.sort(values)
+    spacing = ordered[2 * m :] - ordered[: -2 * m]
+    entropy = np.log(spacing * n / (2 * m) + 1e-300).mean()
+    return float(0.5 * np.log(2 * np.pi * np.e * values.var()) - entropy)
+
+
+def _trial_correlation(
+    fits: list[LocalRegression], num_trials: int
+) -> tuple[float, bool]:
+    """Return the correlation of residuals across trials beyond chance."""
+    if num_trials == 1 or not fits:
+        return 0.0, True
+    excess, count = 0.0, 0
+    for fit in fits:
+        n, q = fit.standardized.shape
+        freedom = n - len(fit.root)
+        correlation = fit.standardized.T @ fit.standardized / freedom
+        apart = np.kron(np.eye(num_trials), np.ones((q // num_trials,) * 2)) == 0
+        excess += (correlation[apart] ** 2 - 1 / freedom).sum()
+        count += int(apart.sum())
+    correlation = max(excess / count, 0.0) ** 0.5
+    has_misfit = any(fit.has_misfit for fit in fits)  # which correlates as well
+    return float(correlation), correlation < CORRELATED or has_misfit

@@ -1,0 +1,391 @@
+"""Refined beliefs against closed forms, oracles and worlds that must be flagged."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from collections.abc import Callable
+
+import pytest
+import torch
+from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils.sbiutils import within_support
+from torch import Tensor
+from torch.distributions import (
+    Gamma,
+    Independent,
+    LogNormal,
+    MultivariateNormal,
+    Uniform,
+)
+
+from sbi_active.inference.refine import RefinedBelief, Refinement, refine
+from sbi_active.seeding import forked_generators
+from sbi_active.tasks.numerical.exact import ExactPosterior
+
+BOX = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
+CURVES: dict[str, Callable[[Tensor], Tensor]] = {
+    "linear": lambda t: t,
+    "sinh": lambda t: 5 * torch.sinh(t / 2.5) / math.sinh(2),
+    "square": lambda t: t**2 / 2.5 - 5,
+    "sine": lambda t: 5 * torch.sin(1.5 * t),
+}
+
+
+def numerical(variant: str = "linear", noise: str = "gaussian"):
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        mean = CURVES[variant](theta[:, :1]) * torch.exp(3 - action)
+        mean = mean + theta[:, 1:] * action
+        if noise == "uniform":
+            return mean + math.sqrt(12) * (torch.rand_like(mean) - 0.5)
+        return mean + torch.randn_like(mean)
+
+    return simulator
+
+
+def observe(simulator, theta: Tensor, action: Tensor, seed: int) -> Tensor:
+    with forked_generators(seed):
+        return simulator(theta.double().expand(len(action), -1), action.double())
+
+
+def draws(belief: RefinedBelief, num: int, seed: int = 0) -> Tensor:
+    with forked_generators(seed):
+        return belief.sample((num,))
+
+
+def scored(variant: str, actions: list[float], num_histories: int, seed: int):
+    """Return (gap at the truth, KL(exact, belief), the belief) of one campaign."""
+    with forked_generators(seed, "truth"):
+        theta = BOX.sample((1,))
+    simulator = numerical(variant)
+    action = torch.tensor(actions)[:, None]
+    x = observe(simulator, theta, action, seed)
+    settings = Refinement(num_histories=num_histories)
+    belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
+    exact = ExactPosterior(action.double(), x, variant=variant)
+    gap = float(exact.log_prob(theta)[0] - belief.log_prob(theta)[0])
+    sample = exact.sample(1_000, seed=seed)
+    log_ratio = exact.log_prob(sample) - belief.log_prob(sample).double()
+    return gap, float(log_ratio.mean()), belief
+
+
+@pytest.fixture(scope="module")
+def linear() -> tuple[RefinedBelief, Tensor, Tensor]:
+    action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
+    simulator = numerical()
+    x = observe(simulator, torch.tensor([[-3.0, 1.0]]), action, 0)
+    return refine(simulator, BOX, action, x, seed=0), action, x
+
+
+def test_linear_gaussian_closed_form():
+    # x = A(xi) theta + e, theta ~ N(0, I): a Gaussian posterior, x of shape (2, 2).
+    weight = torch.tensor([[1.0, 0.5, 0.0], [0.0, 1.0, 0.5], [0.3, 0, 1], [1, -1, 0.2]])
+    sd = 0.3
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        x = action[:, :1] * (theta @ weight.T) + sd * torch.randn(len(theta), 4)
+        return x.reshape(-1, 2, 2)
+
+    prior = MultivariateNormal(torch.zeros(3), torch.eye(3))
+    action = torch.tensor([[0.5], [1.0], [2.0]])
+    truth = torch.tensor([[0.5, -1.0, 0.3]])
+    with forked_generators(1):
+        x = simulator(truth.expand(3, -1), action)
+    belief = refine(simulator, prior, action, x, seed=1)
+
+    design = torch.cat([a * weight for a in action[:, 0]]).double()
+    precision = torch.eye(3).double() + design.T @ design / sd**2
+    covariance = torch.linalg.inv(precision)
+    mean = covariance @ design.T @ x.reshape(-1).double() / sd**2
+    exact = MultivariateNormal(mean, covariance)
+    sample = draws(belief, 20_000).double()
+    # The last regression rests on at least 400 histories with 4 coefficients: the mean
+    # is off by about sqrt(4 / 400) = .1 deviations, and 1 % of draws are the prior's.
+    error = (sample.median(0).values - mean) / covariance.diagonal().sqrt()
+    assert error.abs().max() < 4 * 0.1
+    kept = sample[exact.log_prob(sample) > exact.log_prob(mean[None]) - 12]
+    ratio = torch.cov(kept.T).diagonal() / covariance.diagonal()
+    assert (ratio.log().abs() < 4 * math.sqrt(2 / 400)).all()
+    theta = exact.sample(torch.Size([2_000]))
+    log_ratio = exact.log_prob(theta) - belief.log_prob(theta).double()
+    assert abs(float(log_ratio.mean())) < 0.1
+    assert belief.diagnostics["trustworthy"], belief.diagnostics["warnings"]
+
+
+@pytest.mark.parametrize("num_histories", [500, 3_000])
+@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
+def test_close_to_the_exact_posterior(variant: str, num_histories: int):
+    runs = [
+        scored(variant, [-5.0, 5.0, -5.0, 5.0], num_histories, seed)
+        for seed in range(3)
+    ]
+    divergence = torch.tensor([run[1] for run in runs])
+    # Medians of 20 trials: .02-.03 with 3,000 histories, .03-.05 with 500.
+    assert divergence.median() < (0.1 if num_histories == 3_000 else 0.15)
+    assert divergence.max() < 0.4
+    if variant == "square":
+        for _, _, belief in runs:
+            left = float((draws(belief, 4_000)[:, 0] < 0).float().mean())
+            assert 0.25 < left < 0.75
+
+
+@pytest.mark.parametrize("action", [-5.0, 0.0, 3.0])
+@pytest.mark.parametrize("variant", ["linear", "square"])
+def test_a_single_trial_leaves_a_ridge_across_the_box(variant: str, action: float):
+    gap, divergence, belief = scored(variant, [action], 3_000, seed=2)
+    assert abs(gap) < 1.0
+    assert -0.02 < divergence < 0.1
+    assert belief.diagnostics["trustworthy"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_trials", [1, 2, 4])
+@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
+def test_random_actions_and_truths(variant: str, num_trials: int):
+    gaps, divergences = [], []
+    for seed in range(20):
+        with forked_generators(seed, "actions"):
+            actions = (torch.randint(-10, 11, (num_trials,)) / 2).tolist()
+        gap, divergence, _ = scored(variant, actions, 3_000, seed)
+        gaps.append(gap)
+        divergences.append(divergence)
+    assert abs(torch.tensor(gaps).mean()) < 0.1
+    assert torch.tensor(gaps).quantile(0.95) < 1.0
+    assert torch.tensor(divergences).median() < 0.05
+
+
+def test_density_is_normalized(linear):
+    belief, _, _ = linear
+    sample = draws(belief, 20_000)
+    # Importance sampling from a Gaussian somewhat wider than the belief's core.
+    center, spread = sample.median(0).values.double(), sample.double()
+    core = spread[((spread - center).abs() < 2).all(1)]
+    wide = MultivariateNormal(center, 2.0 * torch.cov(core.T))
+    with forked_generators(0):
+        theta = wide.sample(torch.Size([50_000]))
+    theta32 = theta.float()
+    weight = (belief.log_prob(theta32).double() - wide.log_prob(theta32.double())).exp()
+    error = float(weight.std()) / math.sqrt(len(weight))
+    # The defensive .01 lies almost wholly outside the core.
+    assert abs(float(weight.mean()) - 0.99) < 4 * error + 0.02
+
+
+def test_draws_follow_the_density(linear):
+    belief, action, x = linear
+    exact = ExactPosterior(action.double(), x)
+    sample, reference = draws(belief, 8_000).double(), exact.sample(8_000, seed=0)
+    level = reference.quantile(0.3, dim=0)
+    share = (sample < level).double().mean(0)
+    assert (share - 0.3).abs().max() < 4 * math.sqrt(0.21 / 8_000) + 0.05
+    assert len(sample.unique(dim=0)) > 0.95 * len(sample)  # fresh, not resampled
+
+
+def test_defensive_share_of_the_prior(linear):
+    belief, _, _ = linear
+    far = torch.tensor([[4.0, -4.0]])
+    expected = math.log(0.01) + float(BOX.log_prob(far))
+    assert float(belief.log_prob(far)) == pytest.approx(expected, abs=1e-4)
+    assert float(belief.log_prob(torch.tensor([[6.0, 0.0]]))) == -math.inf
+
+
+def test_same_seed_same_belief(linear):
+    belief, action, x = linear
+    torch.rand(7)  # the global state must not matter
+    again = refine(numerical(), BOX, action, x, seed=0)
+    theta = draws(belief, 200)
+    assert torch.equal(belief.log_prob(theta), again.log_prob(theta))
+    assert torch.equal(theta, draws(again, 200))
+    assert belief.diagnostics == again.diagnostics
+
+
+def test_global_generator_is_left_alone():
+    action, x = torch.tensor([[1.0]]), torch.tensor([[2.0]])
+    state = torch.get_rng_state()
+    refine(numerical(), BOX, action, x, settings=Refinement(num_histories=200), seed=0)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_pickles_without_the_simulator(linear):
+    belief, _, _ = linear
+    data = pickle.dumps(belief)
+    assert len(data) < 200_000
+    copy = pickle.loads(data)
+    theta = draws(belief, 100)
+    assert torch.equal(belief.log_prob(theta), copy.log_prob(theta))
+    assert torch.equal(draws(copy, 100), theta)
+
+
+def test_order_of_trials_does_not_matter(linear):
+    belief, action, x = linear
+    order = torch.tensor([3, 1, 0, 2])
+    other = refine(numerical(), BOX, action[order], x[order], seed=5)
+    theta = ExactPosterior(action.double(), x).sample(2_000, seed=0)
+    difference = (belief.log_prob(theta) - other.log_prob(theta)).double()
+    # Two beliefs, each within a KL of some .03 of the same posterior.
+    assert abs(float(difference.mean())) < 0.1
+
+
+@pytest.mark.parametrize("num_histories", [200, 500, 1_111])
+def test_budget_is_respected(num_histories: int):
+    rows = 0
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        nonlocal rows
+        rows += len(theta)
+        return numerical("sinh")(theta, action)
+
+    action, x = torch.tensor([[-5.0], [5.0]]), torch.tensor([[1_000.0], [3.0]])
+    settings = Refinement(num_histories=num_histories)
+    belief = refine(simulator, BOX, action, x, settings=settings, seed=0)
+    assert rows <= 2 * num_histories
+    assert belief.diagnostics["num_simulations"] == rows
+
+
+def test_start_is_a_hint_without_weight(linear):
+    belief, action, x = linear
+    wrong = MultivariateNormal(torch.tensor([2.0, -2.0]), 0.01 * torch.eye(2))
+    other = refine(numerical(), BOX, action, x, start=wrong, seed=0)
+    theta = ExactPosterior(action.double(), x).sample(2_000, seed=0)
+    difference = (belief.log_prob(theta) - other.log_prob(theta)).double()
+    assert abs(float(difference.mean())) < 0.1
+
+
+@pytest.mark.parametrize("noise", ["gaussian", "uniform"])
+def test_hard_edged_noise_is_flagged(noise: str):
+    action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
+    for seed in range(3):
+        simulator = numerical(noise=noise)
+        x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, seed)
+        diagnostics = refine(simulator, BOX, action, x, seed=seed).diagnostics
+        holds = diagnostics["assumptions"]["gaussian_noise"]["holds"]
+        assert holds == (noise == "gaussian")
+        assert diagnostics["trustworthy"] == (noise == "gaussian")
+
+
+@pytest.mark.parametrize("num_seeds", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_four_sharp_modes_are_flagged(num_seeds: int):
+    action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
+    simulator = numerical("sine")
+    for seed in range(num_seeds):
+        with forked_generators(seed, "truth"):
+            theta = BOX.sample((1,))
+        x = observe(simulator, theta, action, seed)
+        settings = Refinement(num_histories=1_000)
+        belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
+        assert not belief.diagnostics["trustworthy"]
+        assert not belief.diagnostics["assumptions"]["smooth_response"]["holds"]
+
+
+def test_impossible_observation_is_flagged(linear):
+    assert 0.01 < linear[0].diagnostics["tail_probability"] <= 1
+    action = torch.tensor([[0.0], [0.0], [5.0]])
+    x = torch.tensor([[50.0], [-50.0], [200.0]])  # the same action, 100 sigma apart
+    diagnostics = refine(numerical(), BOX, action, x, seed=0).diagnostics
+    assert diagnostics["tail_probability"] < 1e-3
+    assert any("unlike anything simulated" in text for text in diagnostics["warnings"])
+
+
+def test_diagnostics_are_plain(linear):
+    diagnostics = linear[0].diagnostics
+    assert json.loads(json.dumps(diagnostics)) == diagnostics
+    assert diagnostics["trustworthy"]
+    assert not diagnostics["warnings"]
+    assert 0.5 < diagnostics["residual_to_noise"] < 1.5
+    assert diagnostics["effective_sample_size"] > 1_000
+    assert sum(diagnostics["region_mass"]) == pytest.approx(1, abs=1e-6)
+    assert len(diagnostics["tail_probability_of_trial"]) == 4
+    assert {
+        "num_stages",
+        "num_regions",
+        "prior_edge_mass",
+        "surrogate_kl_last_stage",
+    } <= set(diagnostics)
+
+
+def test_priors_with_one_bound_or_mixed_parts():
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return theta * action + 0.05 * torch.randn_like(theta)
+
+    truth = torch.tensor([[0.8, 2.0]])
+    action = torch.ones(2, 1)
+    with forked_generators(0):
+        x = simulator(truth.expand(2, -1), action)
+    for prior in (
+        Independent(LogNormal(torch.zeros(2), 1.0), 1),
+        MultipleIndependent(
+            [Uniform(torch.zeros(1), torch.ones(1)), Gamma(2 * torch.ones(1), 1.0)]
+        ),
+    ):
+        belief = refine(simulator, prior, action, x, seed=0)
+        sample = draws(belief, 4_000)
+        assert bool(within_support(prior, sample).all())
+        # Deviation .05 / sqrt(2) = .035 for each; the prior is flat at that scale.
+        center = sample.median(0).values
+        assert (center - x.mean(0)).abs().max() < 0.02
+        # At the peak of a Gaussian of that deviation, in two dimensions.
+        peak = -math.log(2 * math.pi * 0.05**2 / 2)
+        assert float(belief.log_prob(center[None])[0]) == pytest.approx(peak, abs=0.2)
+
+
+def test_invalid_simulations_are_counted():
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        x = numerical()(theta, action)
+        return torch.where(theta[:, :1] > 0, x, torch.nan)
+
+    action = torch.tensor([[0.0], [5.0]])
+    x = observe(numerical(), torch.tensor([[2.0, 1.0]]), action, 0)
+    belief = refine(simulator, BOX, action, x, seed=0)
+    assert 0.1 < belief.diagnostics["share_invalid"] < 0.5
+    assert abs(float(draws(belief, 2_000)[:, 0].median()) - 2.0) < 0.2
+    with pytest.raises(ValueError, match="with a measurement"):
+        refine(lambda t, a: torch.full((len(t), 1), torch.nan), BOX, action, x, seed=0)
+
+
+def test_a_constant_channel_does_no_harm():
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return torch.cat([numerical()(theta, action), torch.full_like(action, 3.0)], 1)
+
+    action = torch.tensor([[-5.0], [5.0]])
+    x = observe(simulator, torch.tensor([[-3.0, 1.0]]), action, 0)
+    belief = refine(simulator, BOX, action, x, seed=0)
+    exact = ExactPosterior(action.double(), x[:, :1])
+    theta = exact.sample(1_000, seed=0)
+    log_ratio = exact.log_prob(theta) - belief.log_prob(theta).double()
+    assert float(log_ratio.mean()) < 0.1
+    assert belief.diagnostics["trustworthy"], belief.diagnostics["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("action", "x", "match"),
+    [
+        (torch.zeros(2), torch.zeros(2, 1), r"expected action \(t, action_dim\)"),
+        (torch.zeros(2, 1), torch.zeros(3, 1), "as many trials"),
+        (torch.zeros(0, 1), torch.zeros(0, 1), "at least one"),
+        (torch.zeros(1, 1), torch.tensor([[torch.nan]]), "expected finite x"),
+        (torch.zeros(1, 1), torch.zeros(1, 3), "expected simulated x of shape"),
+    ],
+)
+def test_bad_trials_are_refused(action: Tensor, x: Tensor, match: str):
+    with pytest.raises(ValueError, match=match):
+        refine(numerical(), BOX, action, x, seed=0)
+
+
+def test_deterministic_simulator_is_refused():
+    with pytest.raises(ValueError, match="expected a simulator with noise"):
+        refine(
+            lambda theta, action: theta[:, :1] * action,
+            BOX,
+            torch.ones(1, 1),
+            torch.ones(1, 1),
+            seed=0,
+        )
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"num_histories": 50}, {"defensive": 0.0}, {"replicate_share": 0.9}],
+)
+def test_settings_validate_themselves(option: dict):
+    with pytest.raises(ValueError, match=f"expected {next(iter(option))} in"):
+        Refinement(**option)

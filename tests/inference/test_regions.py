@@ -1,0 +1,107 @@
+"""Regions and coordinates."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform, MultipleIndependent
+from torch.distributions import (
+    Gamma,
+    Independent,
+    LogNormal,
+    MultivariateNormal,
+    Uniform,
+)
+
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.population import Particles
+from sbi_active.inference.regions import (
+    PriorProposal,
+    Region,
+    RegionsProposal,
+    cover,
+    nearest_region,
+    whole_space,
+)
+
+PRIORS = {
+    "box": BoxUniform(torch.tensor([-5.0, 0.0]), torch.tensor([5.0, 1e-3])),
+    "gaussian": MultivariateNormal(torch.tensor([1.0, 100.0]), 4 * torch.eye(2)),
+    "log_normal": Independent(LogNormal(torch.tensor([0.0, -5.0]), 1.0), 1),
+    "mixed": MultipleIndependent(
+        [Gamma(torch.ones(1), 1.0), Uniform(torch.zeros(1), torch.ones(1))]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_coordinates_go_there_and_back(name: str):
+    rng = np.random.default_rng(0)
+    coordinates = PriorCoordinates(PRIORS[name], rng)
+    torch.manual_seed(0)
+    theta = PRIORS[name].sample((1_000,))
+    z = coordinates.to_z(theta)
+    torch.testing.assert_close(coordinates.to_theta(z), theta, rtol=1e-5, atol=1e-7)
+    # Of unit size: a box is [-1, 1], anything else has 2.5 deviations in it.
+    assert (abs(z) < 1.2).mean() > 0.95
+    assert coordinates.inside(z).mean() > 0.99  # but for rounding at the edge
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_prior_is_normalized_in_coordinates(name: str):
+    coordinates = PriorCoordinates(PRIORS[name], np.random.default_rng(0))
+    axis = np.linspace(-4, 4, 801) + 1e-4
+    grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    total = np.exp(coordinates.log_prior(grid)).sum() * (axis[1] - axis[0]) ** 2
+    assert total == pytest.approx(1, abs=0.02)  # rim of a box: one cell in 200
+
+
+def test_region_contains_its_draws_and_is_normalized():
+    rng = np.random.default_rng(0)
+    region = Region(np.array([0.2, 0.0]), np.array([[0.3, 0.0], [0.1, 0.05]]), 2.0)
+    draws = region.sample_uniform(10_000, rng)
+    assert region.distance(draws).max() <= 1 + 1e-9
+    area = math.pi * 2.0**2 * 0.3 * 0.05
+    assert region.log_volume == pytest.approx(math.log(area))
+    other = Region(np.array([0.0, 0.0]), 0.3 * np.eye(2), 1.0)
+    proposal = RegionsProposal([region, other])
+    square = rng.uniform(-1, 1, (200_000, 2))
+    density = 4 * np.exp(proposal.log_prob(square))
+    error = density.std() / np.sqrt(len(square))
+    assert abs(density.mean() - 1) < 4 * error
+
+
+def test_simulations_stay_in_region_and_support():
+    rng = np.random.default_rng(0)
+    coordinates = PriorCoordinates(PRIORS["box"], rng)
+    region = Region(np.array([1.0, 0.0]), 0.3 * np.eye(2), 1.0)  # half is outside
+    z = region.sample_inside(200, coordinates, rng)
+    assert len(z) == 200
+    assert region.distance(z).max() <= 1
+    assert coordinates.inside(z).all()
+
+
+def test_ellipsoids_come_before_the_whole_space():
+    inner = Region(np.zeros(2), 0.1 * np.eye(2), 1.0)
+    z = np.array([[0.0, 0.0], [0.5, 0.5]])
+    assert nearest_region([whole_space(2), inner], z).tolist() == [1, 0]
+    assert nearest_region([inner], z).tolist() == [0, -1]
+
+
+@pytest.mark.parametrize("num_modes", [1, 2, 4])
+def test_cover_holds_each_mode(num_modes: int):
+    rng = np.random.default_rng(0)
+    centers = np.linspace(-0.9, 0.9, num_modes) if num_modes > 1 else np.zeros(1)
+    label = rng.integers(num_modes, size=5_000)
+    z = 0.01 * rng.standard_normal((5_000, 2))
+    z[:, 0] += centers[label]
+    coordinates = PriorCoordinates(PRIORS["box"], rng)
+    particles = Particles(z, np.zeros(len(z)), PriorProposal(coordinates))
+    regions = cover(particles, rng, min_regions=1, max_regions=8, generous=True)
+    assert len(regions) >= num_modes
+    assert (nearest_region(regions, z) >= 0).mean() > 0.999
+    # Between the modes lies nothing: the ellipsoids are much smaller than the box.
+    assert sum(math.exp(region.log_volume) for region in regions) < 0.1
