@@ -18,6 +18,7 @@ from sbi_active.inference import (
     ActionPosterior,
     Belief,
     MixtureDensity,
+    Refinement,
 )
 from sbi_active.simulation import (
     GaussianNoise,
@@ -45,6 +46,7 @@ __all__ = [
     "InformationGainDesigner",
     "MixtureDensity",
     "RandomDesigner",
+    "Refinement",
     "Simulations",
     "SimulatorModel",
     "Trial",

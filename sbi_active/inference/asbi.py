@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any, Literal
 
+import torch
 from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
     ConditionalEstimatorBuilder,
@@ -16,7 +18,9 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.action_npe import ActionNPE
 from sbi_active.inference.belief import Belief, ChainedBelief, require_support
+from sbi_active.inference.comparison import compare
 from sbi_active.inference.condition import action_rows, outcome_rows, pack
+from sbi_active.inference.refine import Refinement, refine
 from sbi_active.inference.rounds import Observation
 
 __all__ = ["ASBI"]
@@ -93,49 +97,135 @@ class ASBI(ActionNPE):
         *,
         action: Tensor,
         simulator: Callable[..., Any] | None = None,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
     ) -> Belief:
         r"""Return the belief after a real trial, and make it the current one.
 
         Without a simulator this is Step 3 of the paper, the network's value at the
         trial: :math:`b(\theta) = q(\theta | x_o, \xi^*)` within the prior's support.
+        With one, the belief is refined: the posterior of all trials so far given the
+        original prior, from simulations where it is plausible
+        (:func:`~sbi_active.inference.refine.refine`). That needs no network; where one
+        was trained in this round, ``belief.diagnostics`` compares the two.
 
         Args:
             x_o: The observed outcome, shape x_shape or (1, *x_shape).
             action: The executed action, shape (action_dim,) or (1, action_dim); it need
                 not be one of the actions that were asked for.
-            simulator: Not used yet.
+            simulator: ``simulator(theta, action)`` to refine with.
+            refinement: Settings of the refinement; None is ``Refinement()``.
+            seed: Of the refinement; None draws one from torch's global generator.
 
         Returns:
-            The belief, labelled "chained approximation".
+            The belief, labelled "refined" or "chained approximation".
 
         Raises:
-            RuntimeError: If no network was trained since the belief last changed.
+            RuntimeError: If there is no simulator and no network was trained since the
+                belief last changed.
             ValueError: If shapes do not fit, or x_o has no measurement and no
                 simulation of this round had none either.
         """
-        if simulator is not None:
-            raise NotImplementedError("refinement")
+        trial = self._observation(x_o, action)
+        finite = bool(trial.x.isfinite().all())
+        needs_network = simulator is None or not finite
+        chained = self._chained(trial, required=needs_network)
+        if simulator is None or not finite:
+            assert chained is not None
+            belief: Belief = chained
+        else:
+            trials = [*self.trials, trial]
+            belief = self._refined(trials, simulator, chained, refinement, seed)
+        self.trials.append(trial)
+        self._belief, self._trained_round = belief, None
+        return belief
+
+    def update_all(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any],
+        *,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the refined belief of these trials alone, computed from scratch.
+
+        Args:
+            trials: They replace the history.
+            simulator: As in :meth:`update`.
+            refinement: As in :meth:`update`.
+            seed: As in :meth:`update`.
+
+        Raises:
+            ValueError: If no trial has a measurement.
+        """
+        belief = self._refined([*trials], simulator, None, refinement, seed)
+        self.trials = [*trials]
+        self._belief, self._trained_round = belief, None
+        return belief
+
+    def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
+        """Return the checked trial."""
+        x = torch.as_tensor(x_o, dtype=torch.float32)
+        shape = self._outcome_shape
+        if shape is None:  # no simulations yet: the first trial says
+            shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
+        rows = outcome_rows(x, shape)
+        if len(rows) != 1:
+            raise ValueError(
+                f"expected one outcome; got {len(rows)} rows; do update with one trial "
+                "at a time"
+            )
+        return Observation(
+            action_rows(action, self._action_dim, num_rows=1)[0], rows[0]
+        )
+
+    def _chained(self, trial: Observation, *, required: bool) -> ChainedBelief | None:
+        """Return the network's value at the trial, None where there is no network."""
         network, previous = self._neural_net, self.belief
         if self._trained_round is None or network is None or previous is None:
+            if not required:
+                return None
             raise RuntimeError(
                 "expected a network trained under the current belief; got none since "
                 "the last update() or append_simulations(); do append simulations of "
                 "the belief with action= and train() first"
             )
+        if required:
+            self._require_known(trial.x, network)
+        condition = pack(trial.x[None], trial.action[None]).to(self._device)
         prior = require_support(self._prior)
-        assert self._outcome_shape is not None
-        x_row = outcome_rows(x_o, self._outcome_shape)
-        row = action_rows(action, self._action_dim, num_rows=1)
-        if len(x_row) != 1:
+        with warnings.catch_warnings():
+            if not required:  # refinement repairs what the network misses
+                warnings.simplefilter("ignore")
+            return ChainedBelief(deepcopy(network), condition, prior, previous)
+
+    def _refined(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any],
+        chained: ChainedBelief | None,
+        refinement: Refinement | None,
+        seed: int | None,
+    ) -> Belief:
+        measured = [t for t in trials if bool(t.x.isfinite().all())]
+        if not measured:
             raise ValueError(
-                f"expected one outcome; got {len(x_row)} rows; do update with one "
-                "trial at a time"
+                f"expected a trial with a measurement; got {len(trials)} without; do "
+                "update with the trained network, which can use invalid outcomes"
             )
-        self._require_known(x_row, network)
-        condition = pack(x_row, row).to(self._device)
-        belief = ChainedBelief(deepcopy(network), condition, prior, previous)
-        self.trials.append(Observation(row[0], x_row[0]))
-        self._belief, self._trained_round = belief, None
+        belief = refine(
+            simulator,
+            require_support(self._prior),
+            torch.stack([t.action for t in measured]),
+            torch.stack([t.x for t in measured]),
+            start=chained,
+            settings=refinement,
+            seed=int(torch.randint(2**62, ())) if seed is None else seed,
+        )
+        belief.diagnostics["trials_left_out"] = len(trials) - len(measured)
+        if chained is not None:
+            compare(belief, chained)
         return belief
 
     @staticmethod

@@ -16,7 +16,13 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 
-__all__ = ["Belief", "ChainedBelief", "information_gained", "require_support"]
+__all__ = [
+    "Belief",
+    "ChainedBelief",
+    "information_gained",
+    "parameter_dim",
+    "require_support",
+]
 
 
 class Belief(Distribution, ABC):
@@ -39,7 +45,7 @@ class Belief(Distribution, ABC):
     label: str = "belief"
 
     def __init__(self, prior: Distribution) -> None:
-        dim = prior.sample((1,)).shape[-1]
+        dim = parameter_dim(prior)
         super().__init__(torch.Size(), torch.Size([dim]), validate_args=False)
         self.prior = prior
         self.diagnostics: dict[str, Any] = {}
@@ -204,6 +210,12 @@ def information_gained(
         theta = belief.sample((num_samples,))
     gain = belief.log_prob(theta).double() - previous.log_prob(theta).double()
     return float(gain.mean())
+
+
+def parameter_dim(prior: Distribution) -> int:
+    """Return the number of parameters, without drawing from the prior."""
+    shape = prior.event_shape or prior.batch_shape
+    return shape[-1] if shape else 1
 
 
 def require_support(prior: Distribution | None) -> Distribution:

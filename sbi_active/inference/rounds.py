@@ -12,6 +12,7 @@ from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.inference.belief import parameter_dim
 from sbi_active.inference.condition import action_rows, outcome_rows
 
 __all__ = ["Observation", "RoundRows", "check_proposal", "round_rows"]
@@ -61,7 +62,7 @@ def round_rows(
     theta = torch.as_tensor(theta, dtype=torch.float32)
     x = torch.as_tensor(x, dtype=torch.float32)
     x = x[:, None] if x.ndim == 1 else x
-    dim = prior.sample((1,)).shape[-1]
+    dim = parameter_dim(prior)
     if theta.ndim != 2 or theta.shape[1] != dim or len(x) != len(theta):
         raise ValueError(
             f"expected theta (n, {dim}) and x (n, ...) with as many rows; got "

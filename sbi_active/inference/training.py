@@ -106,6 +106,8 @@ def train_mixture_density(
             loss = calibration_kernel(condition) * loss
         return loss.mean()
 
+    for group in optimizer.param_groups:  # resumed: an annealed rate starts again
+        group["lr"] = group.get("initial_lr", group["lr"])
     size = min(budget.batch_size, len(train_rows))
     steps_an_epoch = len(train_rows) // size
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(

@@ -1,0 +1,144 @@
+"""Updates with a simulator: the posterior of all trials from the original prior."""
+
+import pickle
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+from sbi_active import ASBI, MixtureDensity, Refinement
+from sbi_active.inference import ChainedBelief, Observation
+from sbi_active.inference.comparison import compare
+from tests.linear_gaussian import PRIOR, simulator
+
+TRIALS = [
+    Observation(torch.tensor([2.0]), torch.tensor([1.0, -1.5])),
+    Observation(torch.tensor([1.0]), torch.tensor([0.2, 0.1])),
+    Observation(torch.tensor([3.0]), torch.tensor([1.2, -2.0])),
+]
+SETTINGS = Refinement(num_histories=600)
+
+
+def exact(trials):
+    """Precision 1 + sum a^2, mean sum a x / precision."""
+    precision = 1 + sum(t.action**2 for t in trials)
+    mean = sum(t.action * t.x for t in trials) / precision
+    return MultivariateNormal(mean, torch.eye(2) / precision)
+
+
+def divergence(belief, truth):
+    theta = truth.sample((4_000,))
+    return float((truth.log_prob(theta) - belief.log_prob(theta)).mean())
+
+
+def test_updates_reach_the_closed_form_without_a_network():
+    inference = ASBI(PRIOR)
+    for k, trial in enumerate(TRIALS):
+        belief = inference.update(
+            trial.x, action=trial.action, simulator=simulator, refinement=SETTINGS,
+            seed=k,
+        )  # fmt: skip
+        assert belief.label == "refined"
+        # .01 is the price of the prior's share, the rest of 600 noisy histories
+        assert divergence(belief, exact(TRIALS[: k + 1])) < 0.06
+    assert len(inference.trials) == 3
+    assert inference.belief is belief
+
+
+def test_errors_of_a_chained_belief_do_not_stay():
+    """A wrong belief in between: chained it would stay, refined it is gone."""
+    wrong = MultivariateNormal(torch.tensor([2.0, 2.0]), 0.01 * torch.eye(2))
+    inference = ASBI(PRIOR, MixtureDensity(hidden_features=(16,), num_iterations=100))
+    theta, action = wrong.sample((500,)), 3 * torch.rand(500, 1)
+    x = simulator(theta, action)
+    inference.append_simulations(theta, x, action=action, belief=wrong).train()
+    trial = TRIALS[0]
+    belief = inference.update(
+        trial.x, action=trial.action, simulator=simulator, refinement=SETTINGS, seed=0
+    )
+    assert divergence(belief, exact(TRIALS[:1])) < 0.06
+    assert belief.diagnostics["chained_loss"] > 5
+
+
+def test_update_all_starts_from_scratch_and_order_does_not_matter():
+    inference = ASBI(PRIOR)
+    inference.update(torch.ones(2), action=torch.ones(1), simulator=simulator, seed=0)
+    beliefs = [
+        inference.update_all(trials, simulator, refinement=SETTINGS, seed=1)
+        for trials in (TRIALS, TRIALS[::-1])
+    ]
+    assert inference.trials == TRIALS[::-1]
+    for belief in beliefs:
+        assert divergence(belief, exact(TRIALS)) < 0.06
+
+
+def test_same_seed_same_belief():
+    beliefs = [
+        ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=s)
+        for s in (1, 1, 2)
+    ]
+    theta = torch.randn(5, 2)
+    assert torch.equal(beliefs[0].log_prob(theta), beliefs[1].log_prob(theta))
+    assert not torch.equal(beliefs[0].log_prob(theta), beliefs[2].log_prob(theta))
+
+
+def test_invalid_trials_are_left_out_and_counted():
+    invalid = Observation(torch.tensor([1.0]), torch.full((2,), torch.nan))
+    belief = ASBI(PRIOR).update_all([*TRIALS, invalid], simulator, seed=0)
+    assert belief.diagnostics["trials_left_out"] == 1
+    with pytest.raises(ValueError, match="expected a trial with a measurement"):
+        ASBI(PRIOR).update_all([invalid], simulator)
+
+
+class _Network:
+    """A stand-in for a chained belief: the exact posterior, scaled and moved."""
+
+    def __init__(self, spread, shift=0.0):
+        mean, cov = exact(TRIALS).mean, exact(TRIALS).covariance_matrix
+        self.normal = MultivariateNormal(mean + shift, spread**2 * cov)
+
+    def sample(self, shape):
+        return self.normal.sample(shape)
+
+    def log_prob(self, theta):
+        return self.normal.log_prob(theta)
+
+
+@pytest.mark.parametrize(
+    ("network", "kind"),
+    [
+        (_Network(6.0), "under-confident"),
+        (_Network(0.2), "overconfident"),
+        (_Network(1.0, shift=1.0), "misplaced"),
+        (_Network(1.1), None),
+    ],
+)
+def test_a_blunt_and_an_overconfident_network_are_told_apart(network, kind):
+    """Blunt by a factor 6 in two dimensions: 2 log 6 = 3.6 nats of entropy."""
+    belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)
+    compare(belief, network)
+    warnings = belief.diagnostics.get("network_warnings", [])
+    if kind is None:
+        assert not warnings
+    else:
+        assert kind in warnings[0]
+    if kind == "under-confident":
+        expected = 2 * torch.tensor(6.0).log()
+        assert abs(belief.diagnostics["chained_bluntness"] - expected) < 0.3
+
+
+def test_refined_beliefs_travel():
+    belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)
+    again = pickle.loads(pickle.dumps(belief))
+    theta = belief.sample((5,))
+    assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
+    assert not isinstance(belief, ChainedBelief)
+
+
+def test_the_first_trial_may_come_before_any_simulation():
+    belief = ASBI(PRIOR).update(
+        torch.ones(2), action=1.0, simulator=simulator, refinement=SETTINGS, seed=0
+    )
+    assert belief.sample((3,)).shape == (3, 2)
+    with pytest.raises(ValueError, match="expected num_histories in"):
+        Refinement(num_histories=10)
