@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -34,6 +33,7 @@ from sbi_active.inference.regions import (
 from sbi_active.inference.surrogate import Surrogate
 from sbi_active.inference.trust import Course, Stage, diagnose
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.threads import single_thread
 
 __all__ = ["RefinedBelief", "Refinement", "refine"]
 
@@ -51,7 +51,9 @@ class Refinement:
             a parameter set at which each executed action is simulated. Fewer are used
             where the surrogate is good sooner.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
-            by an error of the surrogate; .01 costs .01 nat.
+            by an error of the surrogate: a truth that it misses costs log(1 / share)
+            nats and not infinitely many. Moments see the share too: .01 of a wide
+            prior outweighs a sharp posterior.
         first_share: Share of the budget for the first stage, over the whole prior. It
             must find every mode; what it spends is lost where the posterior is narrow.
         stage_share: Share for each later stage.
@@ -63,7 +65,7 @@ class Refinement:
     """
 
     num_histories: int = 3_000
-    defensive: float = 0.01
+    defensive: float = 1e-5
     first_share: float = 0.25
     stage_share: float = 0.15
     replicate_share: float = 0.2
@@ -213,8 +215,7 @@ def refine(
     prior = require_support(prior)
     settings = Refinement() if settings is None else settings
     action, observed = _trials(action, x)
-    # The matrices are small: threads would only wait for each other.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with single_thread():
         return _refine(simulator, prior, action, observed, start, settings, seed)
 
 

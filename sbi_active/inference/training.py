@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field
 
@@ -18,24 +17,8 @@ from sbi_active.inference.mixture_density import MixtureDensityNetwork
 __all__ = [
     "TrainingBudget",
     "TrainingRecord",
-    "single_thread",
     "train_mixture_density",
 ]
-
-
-@contextmanager
-def single_thread() -> Iterator[None]:
-    """Run torch on one thread inside the block.
-
-    Matrices of 50 x 128 are too small to share: a second thread spins and doubles the
-    CPU time.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,7 +39,7 @@ def test_updates_reach_the_closed_form_without_a_network():
             seed=k,
         )  # fmt: skip
         assert belief.label == "refined"
-        # .01 is the price of the prior's share, the rest of 600 noisy histories
+        # what 600 noisy histories cost
         assert divergence(belief, exact(TRIALS[: k + 1])) < 0.06
     assert len(inference.trials) == 3
     assert inference.belief is belief

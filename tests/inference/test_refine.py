@@ -167,8 +167,7 @@ def test_density_is_normalized(linear):
     theta32 = theta.float()
     weight = (belief.log_prob(theta32).double() - wide.log_prob(theta32.double())).exp()
     error = float(weight.std()) / math.sqrt(len(weight))
-    # The defensive .01 lies almost wholly outside the core.
-    assert abs(float(weight.mean()) - 0.99) < 4 * error + 0.02
+    assert abs(float(weight.mean()) - 1) < 4 * error + 0.02
 
 
 def test_draws_follow_the_density(linear):
@@ -184,7 +183,7 @@ def test_draws_follow_the_density(linear):
 def test_defensive_share_of_the_prior(linear):
     belief, _, _ = linear
     far = torch.tensor([[4.0, -4.0]])
-    expected = math.log(0.01) + float(BOX.log_prob(far))
+    expected = math.log(Refinement().defensive) + float(BOX.log_prob(far))
     assert float(belief.log_prob(far)) == pytest.approx(expected, abs=1e-4)
     assert float(belief.log_prob(torch.tensor([[6.0, 0.0]]))) == -math.inf
 
