@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 
 __all__ = ["main"]
+
+SETTINGS = {"default": CampaignOptions, "faithful": CampaignOptions.faithful}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,24 +55,25 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "run",
         help="run a campaign on a task",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     run.set_defaults(command=_run)
     run.add_argument("task", help=f"one of: {', '.join(TASKS)}")
-    run.add_argument("--method", default="asbi", help=f"one of: {', '.join(METHODS)}")
-    run.add_argument("--rounds", type=int, default=4, help="real trials")
+    run.add_argument(
+        "--method", default="asbi", help=f"one of: {', '.join(METHODS)} (asbi)"
+    )
+    run.add_argument("--rounds", type=int, default=4, help="real trials (4)")
     run.add_argument("--seed", type=int, default=0)
     run.add_argument("--out", type=Path, required=True, help="folder for the results")
     run.add_argument("--variant", help="of the task, where it has variants")
     run.add_argument(
-        "--simulations", type=int, default=5_000, help="to train on, a round"
+        "--setting",
+        choices=[*SETTINGS],
+        default="default",
+        help="faithful: the paper's network and chained beliefs",
     )
-    run.add_argument(
-        "--samples", type=int, default=1_000, help="for the gain, a candidate action"
-    )
-    run.add_argument(
-        "--iterations", type=int, default=600, help="training steps a round"
-    )
+    run.add_argument("--simulations", type=int, help="to train on, a round")
+    run.add_argument("--samples", type=int, help="for the gain, a candidate action")
+    run.add_argument("--iterations", type=int, help="training steps a round")
     return parser
 
 
@@ -90,11 +94,7 @@ def _run(arguments: argparse.Namespace) -> int:
         task.actions,
         method=arguments.method,
         seed=arguments.seed,
-        options=CampaignOptions(
-            num_simulations=arguments.simulations,
-            num_samples=arguments.samples,
-            density_estimator=MixtureDensity(num_iterations=arguments.iterations),
-        ),
+        options=_campaign_options(arguments),
     )
     arguments.out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
@@ -132,8 +132,29 @@ def _run(arguments: argparse.Namespace) -> int:
         task.parameter_names, mean, sd, task.theta_true, strict=True
     ):
         print(f"{name}: {m:.4g} +- {s:.2g} (truth {truth:g})")
+    diagnostics = getattr(campaign.belief, "diagnostics", {})
+    for warning in (
+        *diagnostics.get("warnings", []),
+        *diagnostics.get("network_warnings", []),
+    ):
+        print(f"note: {warning}")
     print(f"{wall:.1f} s; figure: {figure_path}; results: {arguments.out}")
     return 0
+
+
+def _campaign_options(arguments: argparse.Namespace) -> CampaignOptions:
+    """Return the named setting with the sizes that were given."""
+    options = SETTINGS[arguments.setting]()
+    sizes = {
+        "num_simulations": arguments.simulations,
+        "num_samples": arguments.samples,
+    }
+    options = replace(options, **{k: v for k, v in sizes.items() if v is not None})
+    if arguments.iterations is not None:
+        estimator = options.density_estimator or MixtureDensity()
+        estimator = replace(estimator, num_iterations=arguments.iterations)
+        options = replace(options, density_estimator=estimator)
+    return options
 
 
 def _exact_gain(task: Task, campaign: Campaign) -> torch.Tensor | None:
@@ -141,7 +162,8 @@ def _exact_gain(task: Task, campaign: Campaign) -> torch.Tensor | None:
     reference = _reference(task, campaign.history)
     if reference is None:
         return None
-    return reference.expected_information_gain(task.actions.values)
+    gain = reference.expected_information_gain(task.actions.values)
+    return gain[0] if isinstance(gain, tuple) else gain
 
 
 def _reference(task: Task, trials: Sequence[Trial]) -> Any:
@@ -211,6 +233,7 @@ def _save(
         "task": arguments.task,
         "variant": arguments.variant,
         "method": arguments.method,
+        "setting": arguments.setting,
         "seed": arguments.seed,
         "version": __version__,
         "seconds": wall,

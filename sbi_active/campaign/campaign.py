@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,6 +22,7 @@ from sbi_active.inference.belief import require_support
 from sbi_active.inference.condition import action_rows, outcome_rows
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
+from sbi_active.threads import single_thread
 
 __all__ = ["METHODS", "Campaign"]
 
@@ -89,7 +91,9 @@ class Campaign:
             prior, options.density_estimator, show_progress_bars=False
         )
         self._designer = (
-            InformationGainDesigner(actions, num_samples=options.num_samples)
+            InformationGainDesigner(
+                actions, num_samples=options.num_samples, estimator=options.estimator
+            )
             if METHODS[method]
             else RandomDesigner(actions)
         )
@@ -135,7 +139,7 @@ class Campaign:
         self.state.trials.append(trial)
         try:
             model = self._trained(index) if METHODS[self.state.method] else None
-            with self._stage(index, "design"):
+            with self._stage(index, "design"), single_thread():
                 design = self._designer.select(
                     model,
                     self.simulator,
@@ -192,6 +196,12 @@ class Campaign:
         if action is not None:
             row = torch.as_tensor(np.asarray(action), dtype=torch.float32)
             executed = action_rows(row, self.actions.action_dim, num_rows=1)[0]
+        if not bool(self.actions.contains(executed)):
+            warnings.warn(
+                f"the executed action {executed.tolist()} is not in {self.actions}; it "
+                "is simulated where it was executed",
+                stacklevel=2,
+            )
         told = replace(target, action=executed, x=outcome, status=status)
         if target.status != "pending":
             if not _same_outcome(target, told):
@@ -248,14 +258,26 @@ class Campaign:
         assert trial.x is not None
         self._trained(trial.index)
         before = self.belief
+        seed, options = self.state.seed, self.state.options
         with self._stage(trial.index, "update"):
-            with forked_generators(self.state.seed, "update", trial.index):
-                belief = self._inference.update(trial.x, action=trial.action)
+            with forked_generators(seed, "update", trial.index):
+                belief = self._inference.update(
+                    trial.x,
+                    action=trial.action,
+                    simulator=self.simulator if options.refine else None,
+                    refinement=options.refinement,
+                    seed=derive_seed(seed, "refine", trial.index),
+                )
             gained = information_gained(
-                belief, before, seed=derive_seed(self.state.seed, "gain", trial.index)
+                belief, before, seed=derive_seed(seed, "gain", trial.index)
             )
+        spent = getattr(belief, "diagnostics", {}).get("num_simulations", 0)
         self._round_ready = False
-        self._change(trial.index, information_gained=gained)
+        self._change(
+            trial.index,
+            information_gained=gained,
+            num_simulations=self.state.trials[trial.index].num_simulations + spent,
+        )
 
     def _trained(self, index: int) -> Any:
         """Return the posterior trained under the current belief, training if needed."""
