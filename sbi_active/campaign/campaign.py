@@ -22,7 +22,6 @@ from sbi_active.inference.belief import require_support
 from sbi_active.inference.condition import action_rows, outcome_rows
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
-from sbi_active.threads import single_thread
 
 __all__ = ["METHODS", "Campaign"]
 
@@ -92,7 +91,10 @@ class Campaign:
         )
         self._designer = (
             InformationGainDesigner(
-                actions, num_samples=options.num_samples, estimator=options.estimator
+                actions,
+                num_samples=options.num_samples,
+                estimator=options.estimator,
+                eliminate=options.eliminate,
             )
             if METHODS[method]
             else RandomDesigner(actions)
@@ -139,7 +141,7 @@ class Campaign:
         self.state.trials.append(trial)
         try:
             model = self._trained(index) if METHODS[self.state.method] else None
-            with self._stage(index, "design"), single_thread():
+            with self._stage(index, "design"):
                 design = self._designer.select(
                     model,
                     self.simulator,

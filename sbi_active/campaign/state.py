@@ -27,6 +27,7 @@ class CampaignOptions:
         density_estimator: As in :class:`~sbi_active.ASBI`.
         estimator: Of the expected information gain, as in
             :class:`~sbi_active.InformationGainDesigner`; "posterior" is the paper's.
+        eliminate: Whether candidates far behind the leader get no further samples.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
         refinement: Settings of the refinement.
@@ -36,6 +37,7 @@ class CampaignOptions:
     num_samples: int = 1_000
     density_estimator: Any = None
     estimator: Any = "auto"
+    eliminate: bool = True
     refine: bool = True
     refinement: Refinement = Refinement()
 
@@ -52,6 +54,7 @@ class CampaignOptions:
             num_samples=2_000,
             density_estimator=MixtureDensity.faithful(),
             estimator="posterior",
+            eliminate=False,
             refine=False,
         )
 

@@ -4,6 +4,14 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
+from sbi_active.information_gain.entropy import EntropyGain
+from sbi_active.information_gain.nested import NestedGain
 from sbi_active.information_gain.posterior import PosteriorGain
 
-__all__ = ["CandidateSimulations", "InformationGainEstimator", "PosteriorGain"]
+__all__ = [
+    "CandidateSimulations",
+    "EntropyGain",
+    "InformationGainEstimator",
+    "NestedGain",
+    "PosteriorGain",
+]

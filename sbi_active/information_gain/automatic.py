@@ -1,0 +1,140 @@
+"""Which estimator to use, by what can be checked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.information_gain.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+)
+from sbi_active.information_gain.entropy import EntropyGain
+from sbi_active.information_gain.nested import NestedGain
+from sbi_active.information_gain.posterior import PosteriorGain
+
+__all__ = [
+    "ESTIMATORS",
+    "MAX_NEIGHBOR_OUTCOMES",
+    "choose_estimator",
+    "disagreements",
+    "find_estimator",
+]
+
+#: Name of an estimator: its class.
+ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
+    "entropy": EntropyGain,
+    "nested": NestedGain,
+    "posterior": PosteriorGain,
+}
+MAX_NEIGHBOR_OUTCOMES = 2  # numbers of x up to which nearest neighbors are trusted
+DISAGREEMENT = 0.3  # nats, beyond four standard errors
+
+
+def find_estimator(
+    estimator: str | InformationGainEstimator,
+) -> InformationGainEstimator | None:
+    """Return an estimator by name; None for "auto".
+
+    Raises:
+        ValueError: If the name is unknown; it lists the valid ones.
+    """
+    if isinstance(estimator, InformationGainEstimator):
+        return estimator
+    if estimator == "auto":
+        return None
+    if estimator not in ESTIMATORS:
+        raise ValueError(
+            f"expected estimator among 'auto', {', '.join(map(repr, ESTIMATORS))}; got "
+            f"{estimator!r}; do choose one of these or pass an estimator"
+        )
+    return ESTIMATORS[estimator]()
+
+
+def choose_estimator(
+    model: Any, simulations: CandidateSimulations
+) -> tuple[InformationGainEstimator, list[str]]:
+    """Return the first estimator whose assumptions pass their checks.
+
+    With declared noise: entropies where x is one number, else nested Monte Carlo.
+    With replicates: entropies for one or two numbers, else nested Monte Carlo on the
+    smoothed outcomes. Where checks fail, the network's bound.
+
+    Args:
+        model: What was learned, or None.
+        simulations: Of the candidates.
+
+    Returns:
+        The estimator, and why others were not taken.
+    """
+    options: list[InformationGainEstimator] = []
+    num_outcomes = simulations.x[0, 0].numel()
+    if simulations.mean is not None and simulations.noise is not None:
+        options.append(EntropyGain() if num_outcomes == 1 else NestedGain())
+    elif simulations.replicate is not None:
+        few = num_outcomes <= MAX_NEIGHBOR_OUTCOMES
+        options.append(EntropyGain() if few else NestedGain())
+    notes = []
+    for option in options:
+        problems = option.problems(simulations)
+        if not problems:
+            if isinstance(option, NestedGain) and simulations.noise is None:
+                notes.append(
+                    "noise not declared: it and the mean are learned from pairs, which "
+                    "can be off by 1 nat where x varies fast with theta"
+                )
+            return option, notes
+        notes += [f"{type(option).__name__} not used: {text}" for text in problems]
+    if hasattr(model, "log_posterior"):
+        return PosteriorGain(), notes
+    return options[0], [*notes, "used all the same: there is no model"]
+
+
+def disagreements(
+    estimator: InformationGainEstimator,
+    model: Any,
+    simulations: CandidateSimulations,
+    belief: Distribution,
+    gain: Tensor,
+) -> list[str]:
+    """Compare an estimator with the others that apply.
+
+    Args:
+        estimator: The one used.
+        model: What was learned, or None.
+        simulations: Of the candidates.
+        belief: Density of theta in the simulations.
+        gain: The estimator's contributions, shape (a, n).
+
+    Returns:
+        Short sentences, one a disagreement.
+    """
+    others: list[InformationGainEstimator] = []
+    num_outcomes = simulations.x[0, 0].numel()
+    if isinstance(estimator, NestedGain) and num_outcomes <= MAX_NEIGHBOR_OUTCOMES:
+        others.append(EntropyGain())
+    if hasattr(model, "log_posterior") and estimator.bound == "none":
+        others.append(PosteriorGain())
+    notes = []
+    for other in others:
+        rows = simulations.unpaired() if not other.needs_noise else simulations
+        contributions = other(model, rows, belief)[:, : gain.shape[1]]
+        difference = contributions - gain
+        error = difference.std(1) / difference.shape[1] ** 0.5
+        mean = difference.mean(1)
+        apart = mean.abs() > DISAGREEMENT + 4 * error
+        if not bool(apart.any()):
+            continue
+        worst = int(torch.where(apart, mean.abs(), 0.0).argmax())
+        side = "below" if float(mean[worst]) < 0 else "above"
+        blunt = other.bound == "lower" and side == "below"
+        notes.append(
+            f"{type(other).__name__} is {abs(float(mean[worst])):.1f} nats {side} at "
+            f"action {simulations.action[worst].tolist()}, apart at "
+            f"{int(apart.sum())} of {len(apart)}"
+            + (" (a lower bound: the network is blunt)" if blunt else "")
+        )
+    return notes

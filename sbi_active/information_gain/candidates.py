@@ -1,0 +1,104 @@
+"""Simulations of candidate actions, with what is known of their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.information_gain.base import CandidateSimulations
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.simulation import SimulatorModel, require_noise, simulate
+
+__all__ = ["CandidateSampler"]
+
+FEW = 16  # rows to look at a simulator
+
+
+class CandidateSampler:
+    """Draw parameters from the belief and simulate candidates at them.
+
+    Args:
+        simulator: ``simulator(theta, action)``.
+        belief: Distribution of the parameters.
+        action: Candidates, shape (a, action_dim).
+        seed: Of everything drawn.
+
+    Attributes:
+        declared: Whether the simulator declares its noise around an output that does
+            not change from run to run.
+        num_drawn: Simulations so far.
+    """
+
+    def __init__(
+        self,
+        simulator: Callable[..., Any],
+        belief: Distribution,
+        action: Tensor,
+        seed: int,
+    ) -> None:
+        self.simulator, self.belief = simulator, belief
+        self.action, self.seed = action, seed
+        self.num_drawn = 0
+        self._num_waves = 0
+        self.declared = self._probe()
+
+    def draw(
+        self, num_samples: int, candidates: Tensor, *, replicates: bool
+    ) -> CandidateSimulations:
+        """Simulate candidates at fresh parameters, the same for all.
+
+        Args:
+            num_samples: Simulations a candidate.
+            candidates: Indices, shape (k,).
+            replicates: Whether half of them repeat the parameters of the others;
+                ignored where the noise is declared.
+        """
+        self._num_waves += 1
+        paired = replicates and not self.declared
+        num = num_samples // 2 if paired else num_samples
+        with forked_generators(self.seed, "theta", self._num_waves):
+            theta = self.belief.sample((num,))
+        action = self.action[candidates]
+        rows = theta.repeat(len(action), 1), action.repeat_interleave(num, 0)
+        self.num_drawn += len(rows[0]) * (2 if paired else 1)
+        shape = (len(action), num)
+
+        def run(simulator: Callable[..., Any], key: str) -> Tensor:
+            seed = derive_seed(self.seed, key, self._num_waves)
+            x = simulate(simulator, *rows, seed=seed).x
+            return x.reshape(*shape, *x.shape[1:])
+
+        if self.declared:
+            assert isinstance(self.simulator, SimulatorModel)
+            noise = self.simulator.noise
+            assert noise is not None
+            mean = run(self.simulator.mean, "x")
+            seeds = row_seeds(derive_seed(self.seed, "noise", self._num_waves), num)
+            seeds = seeds.repeat(len(action))  # the same noise for all candidates
+            x = noise.sample(mean.flatten(0, 1), seeds).float().reshape(mean.shape)
+            return CandidateSimulations(theta, action, x, mean, noise)
+        x = run(self.simulator, "x")
+        again = run(self.simulator, "again") if paired else None
+        return CandidateSimulations(theta, action, x, replicate=again)
+
+    def _probe(self) -> bool:
+        """Look at a few rows: is there noise, and is the declared mean reproducible."""
+        with forked_generators(self.seed, "probe"):
+            theta = self.belief.sample((FEW,))
+        action = self.action[torch.arange(FEW) % len(self.action)]
+
+        def run(simulator: Callable[..., Any], key: str) -> Tensor:
+            seed = derive_seed(self.seed, "probe", key)
+            return simulate(simulator, theta, action, seed=seed).x
+
+        x = run(self.simulator, "first")
+        require_noise(x, run(self.simulator, "second"))
+        model = self.simulator
+        if not isinstance(model, SimulatorModel) or model.noise is None:
+            return False
+        first, second = run(model.mean, "first"), run(model.mean, "second")
+        return bool(torch.equal(first.nan_to_num(), second.nan_to_num()))
