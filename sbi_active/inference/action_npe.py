@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -27,15 +29,13 @@ from typing_extensions import Self
 
 from sbi_active.inference.belief import require_support
 from sbi_active.inference.condition import pack
-from sbi_active.inference.mixture_density import MixtureDensity, MixtureDensityNetwork
+from sbi_active.inference.mixture_density import MixtureDensity
+from sbi_active.inference.mixture_network import MixtureDensityNetwork, PreparedLoss
 from sbi_active.inference.posterior import ActionPosterior
 from sbi_active.inference.rounds import check_proposal, round_rows
 from sbi_active.inference.tracking import SilentTracker
-from sbi_active.inference.training import (
-    TrainingBudget,
-    single_thread,
-    train_mixture_density,
-)
+from sbi_active.inference.training import TrainingBudget, train_mixture_density
+from sbi_active.threads import single_thread
 
 __all__ = ["ActionNPE"]
 
@@ -44,6 +44,10 @@ _NPE_DEFAULTS = {
     for name, parameter in inspect.signature(NPE_C.train).parameters.items()
     if parameter.default is not inspect.Parameter.empty
 }
+_NONE_IS_THE_DEFAULT = (
+    *("num_atoms", "training_batch_size", "learning_rate", "validation_fraction"),
+    *("stop_after_epochs", "max_num_epochs"),
+)
 _NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
 
 
@@ -248,7 +252,8 @@ class ActionNPE(NPE_C):
         given = {
             name: value
             for name, value in locals().items()
-            if name in _NPE_DEFAULTS and (value is not None or name == "clip_max_norm")
+            if name in _NPE_DEFAULTS
+            and not (value is None and name in _NONE_IS_THE_DEFAULT)
         }
         arguments: dict[str, Any] = {**_NPE_DEFAULTS, **given}
         if not self.has_actions:
@@ -280,7 +285,9 @@ class ActionNPE(NPE_C):
         self._kernel = calibration_kernel
         # NPE_C.train would choose a multi-round loss here; its parent's train is plain
         # maximum likelihood on the rows that _get_start_index names.
-        network = PosteriorEstimatorTrainer.train(self, **arguments)
+        lean = isinstance(settings, MixtureDensity)
+        with single_thread() if lean else nullcontext():
+            network = PosteriorEstimatorTrainer.train(self, **arguments)
         self._trained_round = self._round
         return network
 
@@ -294,7 +301,12 @@ class ActionNPE(NPE_C):
         self, retrain_from_scratch: bool, start_idx: int
     ) -> None:
         if self.has_actions:
-            self._build_neural_net = self._action_estimator
+            settings = self._action_estimator
+            if isinstance(settings, MixtureDensity):
+                assert self._action_dim is not None
+                # It does better where it knows which numbers are the action.
+                settings = partial(settings.build, action_dim=self._action_dim)
+            self._build_neural_net = settings
         super()._initialize_neural_network(retrain_from_scratch, start_idx)
 
     def _run_training_loop(
@@ -325,23 +337,30 @@ class ActionNPE(NPE_C):
         if self._epoch_limit is not None:
             steps = max(len(self.train_indices) // train_config.training_batch_size, 1)
             num_iterations = min(num_iterations, steps * self._epoch_limit)
-        with single_thread():
-            record = train_mixture_density(
-                network,
-                self.optimizer,
-                theta.to(self._device),
-                condition.to(self._device),
-                train_rows=self.train_indices,
-                held_out_rows=self.val_indices,
-                budget=TrainingBudget(
-                    num_iterations=num_iterations,
-                    batch_size=train_config.training_batch_size,
-                    clip_max_norm=train_config.clip_max_norm,
-                    anneal=settings.anneal,
-                    patience=self._patience,
-                ),
-                calibration_kernel=self._kernel,
-            )
+        theta, condition = theta.to(self._device), condition.to(self._device)
+        trained: Any = network
+        patience = self._patience
+        if network.conditioning is not None and patience is None:
+            patience = num_iterations  # spends the budget, returns the best weights
+        if network.can_prepare and self._kernel is None:
+            theta, condition = network.prepare(theta, condition)
+            trained = PreparedLoss(network)
+        record = train_mixture_density(
+            trained,
+            self.optimizer,
+            theta,
+            condition,
+            train_rows=self.train_indices,
+            held_out_rows=self.val_indices,
+            budget=TrainingBudget(
+                num_iterations=num_iterations,
+                batch_size=train_config.training_batch_size,
+                clip_max_norm=train_config.clip_max_norm,
+                anneal=settings.anneal,
+                patience=patience,
+            ),
+            calibration_kernel=self._kernel,
+        )
         self._best_val_loss = min(record.validation_loss)
         self._summary["training_loss"] += record.training_loss
         self._summary["validation_loss"] += record.validation_loss

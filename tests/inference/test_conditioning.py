@@ -1,0 +1,400 @@
+import math
+import pickle
+
+import pytest
+import torch
+
+from sbi_active.inference import MixtureDensity
+from sbi_active.inference.baseline import Baseline, local
+from sbi_active.inference.conditioning import Conditioning
+from sbi_active.inference.mixture_network import PreparedLoss
+from sbi_active.inference.scaling import ActionScaling, Polynomials, exponents_of
+from sbi_active.tasks.numerical import NumericalTask
+from tests import linear_gaussian
+
+FULL = {"scaling": "action", "whiten": True, "baseline": "best"}
+SIMULATOR = {
+    variant: NumericalTask(variant=variant).simulator
+    for variant in ("linear", "sinh", "square")
+}
+
+
+def numerical(variant="linear", n=2_000, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    theta = 10 * torch.rand(n, 2, generator=generator) - 5
+    action = torch.randint(21, (n, 1), generator=generator) * 0.5 - 5
+    x = SIMULATOR[variant].mean(theta, action)
+    x = x + torch.randn(n, 1, generator=generator)
+    return theta, x, action
+
+
+def gaussian_world(n=2_000, seed=0):
+    torch.manual_seed(seed)
+    theta, action = torch.randn(n, 2), 4 * torch.rand(n, 1) - 2
+    return theta, linear_gaussian.simulator(theta, action), action
+
+
+def shaken(net):
+    """Far from the start, so that nothing is trivial."""
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.2)
+    return net
+
+
+def built(variant="linear", shake=True, n=2_000, **settings):
+    theta, x, action = numerical(variant, n)
+    condition = torch.cat([x, action], 1)
+    settings = {"hidden_features": (16,), **settings}
+    torch.manual_seed(1)
+    net = MixtureDensity(**settings).build(theta, condition, action_dim=1)
+    return (shaken(net) if shake else net), theta, condition
+
+
+# Location and scale given the action
+
+
+@pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])
+def test_location_and_scale_over_four_decades(shift):
+    """The true ones within five standard errors, at -9000 with spread 15 as well."""
+    torch.manual_seed(0)
+    n = 5_000
+    action = torch.randint(21, (n, 1)).double() * 0.5 - 5
+    spread = 0.005 if shift else 3.0
+    rate = torch.exp(3 - action)
+    x = (shift + spread * torch.randn(n, 1).double()) * rate + torch.randn(n, 1)
+    scaling = ActionScaling(x, action)
+    grid = torch.linspace(-5, 5, 41, dtype=torch.float64)[:, None]  # half of it unseen
+    location, scale = scaling.location_and_scale(grid)
+    rate = torch.exp(3 - grid)
+    truth = (1 + (spread * rate) ** 2).sqrt()
+    error = truth / math.sqrt(n / 41)  # each degree of freedom sees that many rows
+    assert ((location - shift * rate).abs() < 5 * error).all()
+    assert (scale / truth).log().abs().max() < 0.35
+    z = scaling(x, action)
+    assert abs(float(z.mean())) < 5 / math.sqrt(n)
+    assert float(z.std()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_known_function_of_two_actions():
+    torch.manual_seed(0)
+    n = 4_000
+    action = torch.rand(n, 2, dtype=torch.float64)
+
+    def truth(action):
+        first, second = action.T[..., None]
+        scale = torch.cat([torch.exp(2 * first), 0.1 + second], 1)
+        return torch.cat([100 * first * second, torch.sin(3 * first)], 1), scale
+
+    location, scale = truth(action)
+    scaling = ActionScaling(location + scale * torch.randn(n, 2), action)
+    grid = torch.rand(200, 2, dtype=torch.float64)
+    found, true = scaling.location_and_scale(grid), truth(grid)
+    assert ((found[0] - true[0]) / true[1]).abs().max() < 0.5
+    assert ((found[0] - true[0]) / true[1]).square().mean().sqrt() < 0.1
+    assert (found[1] / true[1]).log().abs().mean() < 0.1
+
+
+def test_wild_outcomes_do_not_set_the_scale():
+    torch.manual_seed(0)
+    action = 2 * torch.rand(3_000, 1) - 1
+    x = action.exp() * torch.distributions.StudentT(1.0).sample((3_000, 1))
+    location, scale = ActionScaling(x, action).location_and_scale(action)
+    assert location.abs().max() < 3
+    assert scale.max() < 40  # the standard deviation is infinite
+
+
+@pytest.mark.parametrize(
+    ("x", "action"),
+    [
+        (torch.full((100, 1), 7.0), torch.rand(100, 1)),
+        (torch.randn(100, 1), torch.full((100, 1), 3.0)),
+        (torch.full((100, 2), 7.0), torch.full((100, 2), 3.0)),
+        (torch.randn(8, 1), torch.rand(8, 1)),
+    ],
+    ids=["constant x", "constant action", "both", "few rows"],
+)
+def test_degenerate_rows_are_scaled_to_finite_numbers(x, action):
+    z = ActionScaling(x, action)(x, action)
+    assert z.isfinite().all()
+    assert z.abs().max() < 10
+
+
+def test_derivatives_of_polynomials():
+    rows = torch.rand(50, 3, dtype=torch.float64)
+    exponents, sizes = exponents_of(rows, max_degree=4, max_terms=100)
+    assert sizes == [1, 4, 10, 20, 35]
+    polynomials = Polynomials(rows, exponents)
+    inside = (0.2 + 0.6 * rows[:5]).requires_grad_()
+    values, slopes = polynomials.with_jacobian(inside)
+    for j in range(35):
+        (slope,) = torch.autograd.grad(values[:, j].sum(), inside, retain_graph=True)
+        assert torch.allclose(slope, slopes[:, j])
+
+
+def test_degrees_stop_where_actions_repeat():
+    rows = torch.cartesian_prod(torch.arange(2.0), torch.arange(3.0))
+    exponents, _ = exponents_of(rows, max_degree=9, max_terms=100)
+    assert exponents.max(0).values.tolist() == [1, 2]
+    assert len(exponents) == 6
+
+
+# The baseline
+
+
+def test_the_linear_baseline_is_the_exact_posterior_of_a_linear_world():
+    theta, x, action = gaussian_world(5_000)
+    scale = x.double().std(0)
+    baseline = Baseline(theta.double(), x / scale, action.double(), kind="linear")
+    theta, x, action = gaussian_world(5_000, seed=1)
+    frames = baseline(x / scale, action.double())
+    mean, variance = linear_gaussian.moments(x, action)
+    covariance = torch.linalg.inv(frames.factor.mT @ frames.factor)[:, 0]
+    assert ((frames.mean[:, 0] - mean) / variance.sqrt()).square().mean() < 0.01
+    ratio = covariance.diagonal(dim1=1, dim2=2) / variance
+    assert ratio.log().abs().mean() < 0.06
+    # Kullback-Leibler divergence, an error of second order in both.
+    log_q = frames.log_det - 0.5 * local(theta, frames).square().sum(-1)
+    error = theta.double() - mean
+    log_p = -0.5 * (error.square() / variance + variance.log()).sum(-1, keepdim=True)
+    assert float((log_p - log_q).mean()) < 0.02
+
+
+def test_the_baseline_alone_gives_the_exact_information():
+    theta, x, action = gaussian_world(5_000)
+    condition = torch.cat([x, action], 1)
+    torch.manual_seed(0)
+    settings = MixtureDensity(num_components=1)
+    net = settings.build(theta, condition, action_dim=1)
+    assert net.baseline_kind == "linear"
+    with torch.no_grad():  # a network of no effect
+        for parameter in net.parameters():
+            parameter.zero_()
+    for value in (-1.7, 0.6, 1.37):  # actions that no row has
+        theta, action = torch.randn(20_000, 2), torch.full((20_000, 1), value)
+        x = linear_gaussian.simulator(theta, action)
+        with torch.no_grad():
+            log_q = net.log_prob(theta, torch.cat([x, action], 1))[0]
+        gain = log_q - linear_gaussian.PRIOR.log_prob(theta)
+        error = float(gain.std()) / math.sqrt(20_000)
+        exact = float(linear_gaussian.information(action[:1]))
+        assert exact - 0.03 - 4 * error < float(gain.mean()) < exact + 4 * error
+
+
+@pytest.mark.parametrize(
+    ("variant", "kind"),
+    [("linear", "linear"), ("sinh", "curved"), ("square", "curved")],
+)
+def test_held_out_rows_choose_the_baseline(variant, kind):
+    net, theta, condition = built(variant, shake=False)
+    scores = net.conditioning.scores
+    assert net.baseline_kind == kind
+    assert scores[kind] > scores["none"] + 1
+    assert ("curved" in scores) == (kind == "curved")
+    pure = MixtureDensity(baseline="none").build(theta, condition, 1)
+    assert pure.baseline_kind == "none"
+    assert pure.num_frames == 1
+
+
+def test_no_baseline_where_x_tells_nothing():
+    torch.manual_seed(0)
+    theta, condition = torch.rand(1_000, 2), torch.randn(1_000, 3)
+    net = MixtureDensity().build(theta, condition, action_dim=1)
+    scores = net.conditioning.scores
+    assert scores.get("linear", 0.0) < scores["none"] + 0.05
+
+
+def test_two_modes_have_a_frame_each():
+    net, _, _ = built("square", shake=False, n=4_000)
+    theta = torch.tensor([[3.0, 1.0]])
+    action = torch.tensor([[-2.0]])
+    x = SIMULATOR["square"].mean(theta, action)
+    _, frames = net.conditioning(torch.cat([x, action], 1))
+    modes = net.conditioning.unwhiten(frames.mean)[0, :2, 0]
+    assert sorted(modes.tolist()) == pytest.approx([-3.0, 3.0], abs=0.05)
+
+
+# In the network
+
+
+@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
+@torch.no_grad()
+def test_samples_have_the_density(variant):
+    """E_q[r / q] = 1 for any density r that q covers: a component, but narrower."""
+    net, _, condition = built(variant)
+    for row in condition[:4].split(1):
+        draws = net.sample(torch.Size([30_000]), row)
+        seen, frames = net._see(row)
+        logits, mean, log_diagonal, upper = (each[0] for each in net._mixture(seen))
+        k = int(logits.argmax())
+        j = net._frame_of[k]
+        factor = upper[k].double() + log_diagonal[k].double().exp().diag()
+        u = net.conditioning.whiten(draws[:, 0])
+        v = (u - frames.mean[0, j]) @ frames.factor[0, j].mT
+        z = (v - mean[k]) @ factor.mT / 0.7
+        log_r = -z.square().sum(1) / 2 - math.log(2 * math.pi) - 2 * math.log(0.7)
+        jacobian = (
+            factor @ frames.factor[0, j] @ net.conditioning.theta_factor.inverse()
+        )
+        log_r = log_r + jacobian.det().log()
+        ratio = (log_r - net.log_prob(draws, row)[:, 0].double()).exp()
+        error = float(ratio.std()) / math.sqrt(30_000)
+        assert error < 0.05
+        assert abs(float(ratio.mean()) - 1) < 4 * error
+
+
+@pytest.mark.parametrize("variant", ["linear", "square"])
+def test_density_integrates_to_one(variant):
+    torch.manual_seed(0)
+    theta, x, action = numerical(variant, 2_000)
+    condition = torch.cat([x, action], 1)
+    net = MixtureDensity(hidden_features=(16,)).build(theta[:, :1], condition, 1)
+    net = shaken(net)
+    grid = torch.linspace(-60, 60, 400_001)[:, None, None]
+    for row in condition[action[:, 0] > 0][:3]:
+        with torch.no_grad():
+            density = net.log_prob(grid, row[None])[:, 0].exp()
+        total = float(torch.trapezoid(density, grid[:, 0, 0]))
+        assert total == pytest.approx(1.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("variant", ["linear", "sinh"])
+def test_units_of_theta_change_log_prob_by_the_determinant_only(variant):
+    theta, x, action = numerical(variant)
+    condition = torch.cat([x, action], 1)
+    matrix = torch.tensor([[2.0, 0.0], [0.3, 100.0]], dtype=torch.float64)
+    moved = (theta.double() @ matrix.mT + 7).float()
+    log_q = []
+    for rows in (theta, moved):
+        torch.manual_seed(1)
+        net = MixtureDensity(hidden_features=(16,)).build(rows, condition, 1)
+        with torch.no_grad():
+            log_q.append(net.log_prob(rows[:200], condition[:200])[0])
+    shift = log_q[0] - log_q[1] - float(matrix.logdet())
+    # Rows of theta are float32, and the likeliest are known to 1e-4 of their range.
+    assert shift.abs().median() < 5e-3
+    assert shift.abs().quantile(0.9) < 0.05
+
+
+@pytest.mark.parametrize("variant", ["linear", "sinh"])
+def test_gradients_flow_to_outcome_and_action(variant):
+    net, theta, condition = built(variant)
+    net = net.double()
+    inside = (condition[:, 1].abs() < 4.6).nonzero()[:4, 0]
+    rows = condition[inside].double().requires_grad_()
+    # The stop rule of a curved baseline's solver leaves errors that a step sees.
+    tolerance = {"linear": 1e-3, "sinh": 5e-2}[variant]
+    assert torch.autograd.gradcheck(
+        lambda c: net.log_prob(theta[inside].double(), c),
+        (rows,),
+        eps=1e-6,
+        atol=tolerance,
+        rtol=tolerance,
+    )
+
+
+def test_an_action_between_the_training_actions():
+    """Off-grid actions get what the neighbors get."""
+    net, _, _ = built("linear", n=4_000, shake=False)
+    theta, _, _ = numerical(seed=3)
+    gain = []
+    for value in (-3.0, -2.75, -2.5):
+        action = torch.full((len(theta), 1), value)
+        x = SIMULATOR["linear"].mean(theta, action) + torch.randn(len(theta), 1)
+        with torch.no_grad():
+            gain.append(float(net.log_prob(theta, torch.cat([x, action], 1)).mean()))
+    assert gain[1] == pytest.approx(0.5 * (gain[0] + gain[2]), abs=0.15)
+    assert gain[0] > 0.5
+
+
+def test_outcomes_without_a_measurement():
+    theta, x, action = numerical()
+    x = torch.cat([x, x], 1)
+    x[::7] = torch.nan
+    x[::5, 0] = torch.nan
+    condition = torch.cat([x, action], 1)
+    net = MixtureDensity(hidden_features=(16,)).build(theta, condition, 1)
+    assert net.baseline_kind != "none"
+    assert net.knows_invalid
+    assert net.log_prob(theta, condition).isfinite().all()
+    assert net.sample(torch.Size([3]), condition[:20]).isfinite().all()
+    _, frames = net.conditioning(condition[:1])  # no measurement: the belief itself
+    assert not frames.mean.any()
+    assert torch.equal(frames.factor[0, 0], torch.eye(2, dtype=torch.float64))
+    rows = condition[:10].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(net.log_prob(theta[:10], rows).sum(), rows)
+    assert gradient[:, 2].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("theta", "x", "action"),
+    [
+        (torch.randn(100, 2), torch.full((100, 1), 3.0), torch.rand(100, 1)),
+        (torch.randn(100, 2), torch.randn(100, 1), torch.full((100, 1), 2.0)),
+        (torch.randn(100, 3), torch.randn(100, 5), torch.rand(100, 2)),
+        (torch.randn(12, 2), torch.randn(12, 1), torch.rand(12, 1)),
+        (torch.randn(1, 2), torch.randn(1, 1), torch.rand(1, 1)),
+        (torch.ones(100, 2), torch.randn(100, 1), torch.rand(100, 1)),
+        (torch.randn(200, 2), torch.full((200, 1), torch.nan), torch.rand(200, 1)),
+        (torch.randn(200, 2), torch.randn(200, 50), torch.rand(200, 1)),
+    ],
+    ids=[
+        "constant x",
+        "constant action",
+        "many numbers",
+        "few rows",
+        "one row",
+        "constant theta",
+        "no measurement",
+        "large x",
+    ],
+)
+def test_degenerate_rows(theta, x, action):
+    condition = torch.cat([x, action], 1)
+    for baseline in ("best", "curved"):
+        settings = MixtureDensity(hidden_features=(8,), baseline=baseline)
+        net = settings.build(theta, condition, action.shape[1])
+        assert net.log_prob(theta, condition).isfinite().all()
+        assert net.sample(torch.Size([2]), condition).isfinite().all()
+
+
+def test_heavy_tails():
+    theta, _, action = numerical()
+    noise = torch.distributions.StudentT(1.5).sample((len(theta), 1))
+    condition = torch.cat([theta[:, :1] * action.exp() + noise, action], 1)
+    net = MixtureDensity().build(theta, condition, 1)
+    with torch.no_grad():
+        assert net.log_prob(theta, condition).mean() > -2 * math.log(10.0) - 1.0
+
+
+def test_prepared_rows_have_the_same_loss():
+    for variant in ("linear", "square"):
+        net, theta, condition = built(variant)
+        loss = PreparedLoss(net).loss(*net.prepare(theta, condition))
+        assert torch.allclose(loss, net.loss(theta, condition), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", ["linear", "sinh"])
+def test_pickle_and_state_keep_the_density(variant):
+    net, theta, condition = built(variant)
+    again = pickle.loads(pickle.dumps(net))
+    log_q = net.log_prob(theta[:9], condition[:9])
+    assert torch.equal(log_q, again.log_prob(theta[:9], condition[:9]))
+    assert {b.device.type for b in net.to("cpu").buffers()} == {"cpu"}
+    assert "conditioning.baseline.beta" in net.state_dict()
+
+
+def test_conditioning_leaves_the_random_state_alone():
+    theta, x, action = numerical("sinh", 500)
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    Conditioning(theta, torch.cat([x, action], 1), 1, **FULL)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_whitening_removes_all_correlation():
+    torch.manual_seed(0)
+    theta = torch.randn(1_000, 2) @ torch.tensor([[1.0, 0.999], [0.0, 1e-3]]) + 50
+    conditioning = Conditioning(theta, torch.randn(1_000, 2), 1, **FULL)
+    u = conditioning.whiten(theta)
+    assert torch.allclose(torch.cov(u.T), torch.eye(2).double(), atol=2e-3)
+    assert torch.allclose(conditioning.unwhiten(u), theta.double(), atol=1e-9)
