@@ -9,6 +9,7 @@ from torch.distributions import MultivariateNormal
 from sbi_active import ASBI, MixtureDensity, Refinement
 from sbi_active.inference import ChainedBelief, Observation
 from sbi_active.inference.comparison import compare
+from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator
 
 TRIALS = [
@@ -142,3 +143,21 @@ def test_the_first_trial_may_come_before_any_simulation():
     assert belief.sample((3,)).shape == (3, 2)
     with pytest.raises(ValueError, match="expected num_histories in"):
         Refinement(num_histories=10)
+
+
+def test_the_faithful_network_is_flagged_as_blunt():
+    """Stock z-scoring is nats blunter than the data allow, though calibrated."""
+    task = get_task("numerical")
+    inference = ASBI(task.prior, MixtureDensity.faithful())
+    theta, action = task.prior.sample((5_000,)), task.actions.sample((5_000,))
+    x = task.simulator(theta, action)
+    inference.append_simulations(theta, x, action=action).train()
+    belief = inference.update(
+        task.real_system(torch.tensor([-5.0]), seed=0),
+        action=torch.tensor([-5.0]),
+        simulator=task.simulator,
+        seed=0,
+    )
+    assert belief.diagnostics["trustworthy"]
+    assert belief.diagnostics["chained_bluntness"] > 3
+    assert "under-confident" in belief.diagnostics["network_warnings"][0]

@@ -1,0 +1,278 @@
+"""Campaigns on tasks with exact inference, beside the paper and the exact limit.
+
+    python benchmarks/numerical/run.py                       # theta_true = (-3, 1)
+    python benchmarks/numerical/run.py --truth random --trials 40 --settings default
+    python benchmarks/numerical/run.py --task sinh --settings default --methods asbi
+    python benchmarks/numerical/run.py --task oscillator --settings default default_500
+
+Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
+setting, in benchmarks/numerical/results; the table is printed at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active import Campaign, CampaignOptions, Refinement, Trial
+from sbi_active.plots import as_table
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import Task, get_task
+
+RESULTS = Path(__file__).parent / "results"
+REPORTED = (-3.0, 0.0, 3.0)  # actions of the paper's Table 1
+SETTINGS: dict[str, CampaignOptions] = {
+    "faithful": CampaignOptions.faithful(),
+    "default": CampaignOptions(),
+    "default_500": replace(CampaignOptions(), refinement=Refinement(num_histories=500)),
+}
+NUMERICAL = ("linear", "sinh", "square")
+#: Table 1 (mean and standard deviation of 10 trials) and figure 5 of the paper, and the
+#: exact posterior with exact greedy design and with random actions (200 trials).
+PUBLISHED = {
+    "paper, ASBI": ("-2.78 / - / - / 1.35", "34.5 +- 10.7", "1.95", "1.60"),
+    "paper, NSBI": ("", "127 +- 76", "6.35", "2.01"),
+    "exact limit": ("4.57 / 7.14 / 7.41 / 7.74", "0.39 +- 0.15", "0.0076", "0.485"),
+    "exact, random": ("-.51 / 2.91 / 4.17 / 5.14", "12.7 +- 73", "0.64", "1.04"),
+}
+STAGES = ("simulation", "training", "design", "update")
+COLUMNS = [
+    *["seed", "theta_true", "round", "action", "eig", "exact_eig", "regret"],
+    *["log_prob_true", "exact_log_prob_true", "gap", "kl", "hpd", "exact_hpd"],
+    *["mass_positive", *[f"rep_err_{action:g}" for action in REPORTED]],
+    *["num_simulations", *[f"cpu_{s}" for s in STAGES], *[f"wall_{s}" for s in STAGES]],
+    *["chained_loss", "chained_bluntness", "trustworthy"],
+]
+
+
+def make_task(name: str, truth: str, seed: int) -> Task:
+    """Return the task with the paper's truth or one drawn from the prior."""
+    task = get_task("numerical", variant=name) if name in NUMERICAL else get_task(name)
+    if truth == "fixed":
+        return task
+    with forked_generators(derive_seed(seed, "truth")):
+        return task.with_truth(task.prior.sample((1,))[0])
+
+
+def reference(task: Task, trials: Sequence[Trial]) -> Any:
+    """Return exact inference after the trials."""
+    dim = task.actions.action_dim
+    if not trials:
+        return task.reference(torch.empty(0, dim), torch.empty(0, 1))
+    x = torch.stack([t.x for t in trials if t.x is not None])
+    return task.reference(torch.stack([t.action for t in trials]), x)
+
+
+def run_trial(
+    task: Task, method: str, setting: str, seed: int, arguments: argparse.Namespace
+) -> list[dict[str, object]]:
+    """Return one row a round of one campaign."""
+    campaign = Campaign(
+        task.simulator,
+        task.prior,
+        task.actions,
+        method=method,
+        seed=seed,
+        options=SETTINGS[setting],
+    )
+    rows: list[dict[str, object]] = []
+    for index in range(arguments.rounds):
+        gain = None
+        if task.name == "numerical":
+            before = reference(task, campaign.history)
+            gain = before.expected_information_gain(task.actions.values)
+        trial = campaign.ask()
+        real_seed = derive_seed(seed, "real", index)
+        executed = trial.action
+        if arguments.jitter:  # the robot does not do quite what it was asked
+            generator = torch.Generator().manual_seed(real_seed)
+            off = torch.randn(executed.shape, generator=generator)
+            executed = executed * (1 + arguments.jitter * off)
+        campaign.tell(task.real_system(executed, seed=real_seed), action=executed)
+        campaign.update()
+        rows.append(
+            {"seed": seed, "round": index + 1} | round_row(task, campaign, gain, index)
+        )
+    return rows
+
+
+def round_row(
+    task: Task, campaign: Campaign, gain: Tensor | None, index: int
+) -> dict[str, object]:
+    """Return the figures of the last round."""
+    trial, belief = campaign.history[-1], campaign.belief
+    assert trial.design is not None
+    exact, truth = reference(task, campaign.history), task.theta_true
+    log_q, log_p = (
+        float(belief.log_prob(truth)),
+        float(exact.log_prob(truth[None].double())[0]),
+    )
+    with forked_generators(derive_seed(index, "draws")):
+        draws = belief.sample((2_000,))
+    exact_draws = exact.sample(2_000, seed=index)
+    exact_log_p = exact.log_prob(exact_draws)
+    chosen = trial.design.index
+    diagnostics = getattr(belief, "diagnostics", {})
+    row: dict[str, object] = {
+        "theta_true": " ".join(f"{v:.6g}" for v in truth.tolist()),
+        "action": " ".join(f"{v:g}" for v in trial.action.tolist()),
+        "eig": float(trial.design.expected_information_gain[chosen]),
+        "log_prob_true": log_q,
+        "exact_log_prob_true": log_p,
+        "gap": log_p - log_q,
+        "kl": float((exact_log_p - belief.log_prob(exact_draws.float())).mean()),
+        # Share of the distribution that is denser than the truth: the truth is in the
+        # region of highest density of level c where this is below c.
+        "hpd": float((belief.log_prob(draws) > log_q).double().mean()),
+        "exact_hpd": float((exact_log_p > log_p).double().mean()),
+        "mass_positive": float((draws[:, 0] > 0).double().mean()),
+        "num_simulations": trial.num_simulations,
+        "chained_loss": diagnostics.get("chained_loss", ""),
+        "chained_bluntness": diagnostics.get("chained_bluntness", ""),
+        "trustworthy": diagnostics.get("trustworthy", ""),
+    }
+    if gain is not None:
+        row |= {"exact_eig": gain[chosen], "regret": gain.max() - gain[chosen]}
+        row |= {f"rep_err_{a:g}": task.reproduction_error(belief, a) for a in REPORTED}
+    for stage in STAGES:
+        row[f"cpu_{stage}"] = trial.cpu_seconds.get(stage, 0.0)
+        row[f"wall_{stage}"] = trial.seconds.get(stage, 0.0)
+    return row
+
+
+def run_setting(arguments: argparse.Namespace, method: str, setting: str) -> list[dict]:
+    """Run the trials that are not in the file yet and return all its rows."""
+    name = f"{arguments.task}_{arguments.truth}_{setting}_{method}"
+    name += f"_jitter_{arguments.jitter:g}" if arguments.jitter else ""
+    path = RESULTS / f"{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done = {int(row["seed"]) for row in read(path)}
+    for seed in range(arguments.trials):
+        if seed in done:
+            continue
+        start = time.process_time()
+        task = make_task(arguments.task, arguments.truth, seed)
+        rows = run_trial(task, method, setting, seed, arguments)
+        new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            if new:
+                writer.writeheader()
+            writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+        print(f"{name} trial {seed}: {time.process_time() - start:.0f} CPU s")
+    return [row for row in read(path) if int(row["seed"]) < arguments.trials]
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file, none if it is not there."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def short(value: object) -> object:
+    """Return a number with six digits."""
+    return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value
+
+
+def column(rows: list[dict[str, str]], key: str, round_: int | None = None) -> Any:
+    """Return a column of one round, or of all, as an array."""
+    kept = [r[key] for r in rows if round_ is None or int(r["round"]) == round_]
+    return np.array([float(v) if v else np.nan for v in kept])
+
+
+def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
+    """Return the table's row of a setting."""
+    last = max(int(r["round"]) for r in rows)
+    medians = [np.median(column(rows, "log_prob_true", r + 1)) for r in range(last)]
+    gap, kl = column(rows, "gap", last), column(rows, "kl", last)
+    hpd, exact_hpd = column(rows, "hpd", last), column(rows, "exact_hpd", last)
+    regret = [column(rows, "regret", r).mean() for r in (1, 2)]
+    cells = [
+        f"{name} ({len(gap)})",
+        " / ".join(f"{m:.2f}" for m in medians),
+        f"{np.median(gap):.2f} {gap.mean():.2f} {np.percentile(gap, 95):.2f}",
+        f"{np.median(kl):.3f}",
+        f"{regret[0]:.2f} / {regret[1]:.2f}",
+        f"{np.mean(hpd < 0.5):.2f} {np.mean(hpd < 0.9):.2f}",
+        f"{np.mean(exact_hpd < 0.5):.2f} {np.mean(exact_hpd < 0.9):.2f}",
+    ]
+    for action in REPORTED:
+        error = column(rows, f"rep_err_{action:g}", last)
+        cells.append(f"{error.mean():.3g} +- {error.std():.2g}")
+    return cells
+
+
+def notes(rows: list[dict[str, str]]) -> str:
+    """Return the chosen actions round by round, and what a round costs."""
+    lines = []
+    for round_ in sorted({int(r["round"]) for r in rows}):
+        chosen = [r["action"] for r in rows if int(r["round"]) == round_]
+        values, counts = np.unique(chosen, return_counts=True)
+        order = np.argsort(-counts, kind="stable")[:6]
+        cells = [f"{values[i]} x{counts[i]}" for i in order]
+        lines.append(f"    round {round_}: {', '.join(cells)}")
+    for kind in ("cpu", "wall"):
+        means = {s: column(rows, f"{kind}_{s}").mean() for s in STAGES}
+        cells = [f"{s} {m:.2f}" for s, m in means.items()]
+        total = sum(means.values())
+        lines.append(f"    {kind} s a round: {total:.2f} ({', '.join(cells)})")
+    rounds = max(int(r["round"]) for r in rows)
+    spent = column(rows, "num_simulations").mean() * rounds
+    lines.append(f"    simulations a trial: {spent:.0f}")
+    masses = column(rows, "mass_positive", rounds)
+    lines.append(
+        f"    P(theta_1 > 0): in [.35, .65] in {np.mean(abs(masses - 0.5) <= 0.15):.2f}"
+    )
+    loss = column(rows, "chained_loss")
+    if not np.isnan(loss).all():
+        lines.append(
+            f"    network behind the refined belief: {np.nanmedian(loss):.2f} nats"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Campaigns beside the exact limit.")
+    parser.add_argument("--task", choices=[*NUMERICAL, "oscillator"], default="linear")
+    parser.add_argument("--truth", choices=["fixed", "random"], default="fixed")
+    parser.add_argument("--trials", type=int, default=20)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--methods", nargs="*", default=["asbi", "nsbi"])
+    parser.add_argument("--settings", nargs="*", default=["faithful", "default"])
+    parser.add_argument(
+        "--jitter", type=float, default=0.0, help="relative error of executed actions"
+    )
+    arguments = parser.parse_args()
+    warnings.filterwarnings("ignore", message="the executed action")
+    torch.set_num_threads(1)
+
+    table, lines = [], []
+    for setting in arguments.settings:
+        for method in arguments.methods:
+            rows = run_setting(arguments, method, setting)
+            table.append(summary(f"{setting}, {method.upper()}", rows))
+            lines += [f"  {setting}, {method.upper()}", notes(rows)]
+    header = [f"{arguments.task}, truth {arguments.truth} (trials)"]
+    header += ["median log p(truth), round 1 / 2 / ..", "gap: median mean 95 %"]
+    header += ["median KL", "regret r1 / r2", "in 50, 90 % region", "(exact's own)"]
+    header += [f"RepErr({a:g})" for a in REPORTED]
+    if arguments.truth == "fixed" and arguments.task == "linear":
+        table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in PUBLISHED.items()]
+    print(as_table(table, header))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
