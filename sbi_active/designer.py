@@ -154,7 +154,7 @@ class InformationGainDesigner:
         self,
         actions: ActionSpace,
         *,
-        num_samples: int = 1_000,
+        num_samples: int = 1_500,
         estimator: str | InformationGainEstimator = "auto",
         eliminate: bool = True,
     ) -> None:

@@ -34,7 +34,7 @@ class CampaignOptions:
     """
 
     num_simulations: int = 5_000
-    num_samples: int = 1_000
+    num_samples: int = 1_500
     density_estimator: Any = None
     estimator: Any = "auto"
     eliminate: bool = True

@@ -160,7 +160,9 @@ class ASBI(ActionNPE):
         Raises:
             ValueError: If no trial has a measurement.
         """
-        belief = self._refined([*trials], simulator, None, refinement, seed)
+        belief = self._refined(
+            [*trials], simulator, None, refinement, seed, reuse=False
+        )
         self.trials = [*trials]
         self._belief, self._trained_round = belief, None
         return belief
@@ -208,6 +210,8 @@ class ASBI(ActionNPE):
         chained: ChainedBelief | None,
         refinement: Refinement | None,
         seed: int | None,
+        *,
+        reuse: bool = True,
     ) -> Belief:
         measured = [t for t in trials if bool(t.x.isfinite().all())]
         if not measured:
@@ -221,6 +225,7 @@ class ASBI(ActionNPE):
             torch.stack([t.action for t in measured]),
             torch.stack([t.x for t in measured]),
             start=chained,
+            past=getattr(self._belief, "histories", None) if reuse else None,
             settings=refinement,
             seed=int(torch.randint(2**62, ())) if seed is None else seed,
         )

@@ -1,14 +1,16 @@
-"""The chained belief against the refined one: is the network blunt or overconfident?"""
+"""Beliefs against each other: network and refined, one order of trials and another."""
 
 from __future__ import annotations
 
 from sbi_active.inference.belief import Belief, ChainedBelief
 from sbi_active.seeding import forked_generators
 
-__all__ = ["TOLERANCE", "compare"]
+__all__ = ["ORDER_TOLERANCE", "TOLERANCE", "compare", "compare_orders"]
 
 #: Nats by which the network may lie beside the refined belief before it is said.
 TOLERANCE = 0.5
+#: Nats between two refinements of the same trials beyond which it is said.
+ORDER_TOLERANCE = 0.2
 #: No density in float32 is further below another than this.
 FLOOR = -60.0
 
@@ -58,3 +60,32 @@ def compare(
     refined.diagnostics.setdefault("network_warnings", []).append(
         f"the amortized network is {kind}"
     )
+
+
+def compare_orders(belief: Belief, other: Belief, *, num_samples: int = 2_000) -> None:
+    r"""Add the divergence from a second refinement to a belief's diagnostics.
+
+    .. math::
+        \mathrm{KL}(b \,\|\, b') = E_b[\log b(\theta) - \log b'(\theta)],
+
+    with b' from the trials in another order and other simulations. The likelihood is
+    a product over trials, so anything beyond Monte Carlo error is an error.
+
+    Args:
+        belief: Its ``diagnostics`` gain "order_swap_kl" and, beyond .2 nat, a warning.
+        other: Of the same trials.
+        num_samples: Draws.
+    """
+    with forked_generators(0, "orders"):
+        draws = belief.sample((num_samples,))
+    difference = (belief.log_prob(draws) - other.log_prob(draws)).double()
+    divergence = float(difference.clamp_max(-FLOOR).mean())
+    diagnostics = belief.diagnostics
+    diagnostics["order_swap_kl"] = divergence
+    diagnostics["num_simulations"] += other.diagnostics["num_simulations"]
+    if divergence > ORDER_TOLERANCE:
+        diagnostics["trustworthy"] = False
+        diagnostics["warnings"].append(
+            f"a second refinement of the same trials, in reverse order, differs by "
+            f"{divergence:.2g} nats; do raise num_histories"
+        )

@@ -13,8 +13,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.belief import Belief, require_support
+from sbi_active.inference.comparison import compare_orders
 from sbi_active.inference.coordinates import PriorCoordinates
-from sbi_active.inference.histories import Histories
+from sbi_active.inference.histories import Histories, HistoryRecord
 from sbi_active.inference.population import (
     GaussianMixture,
     Particles,
@@ -62,6 +63,9 @@ class Refinement:
         num_particles: Of the importance sample of the surrogate, which costs no
             simulations; its effective number bounds the error of the normalizer.
         max_regions: Ellipsoids at most, but for splits against misfit.
+        check_order: Refine a second time, with the trials in reverse and new
+            simulations, and report the divergence between the two: what the order and
+            the draws contribute. It doubles the cost.
     """
 
     num_histories: int = 3_000
@@ -71,6 +75,7 @@ class Refinement:
     replicate_share: float = 0.2
     num_particles: int = 8_000
     max_regions: int = 8
+    check_order: bool = False
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -103,9 +108,13 @@ class RefinedBelief(Belief):
         surrogate: The prior times the learned likelihood :math:`\hat L`.
         particles: Importance sample of it, which gives Z and the proposal of draws.
         defensive: The share :math:`\epsilon`.
+
+    Attributes:
+        histories: The simulations behind it, to go on from after a further trial.
     """
 
     label = "refined"
+    histories: HistoryRecord
 
     def __init__(
         self,
@@ -168,6 +177,7 @@ def refine(
     x: Tensor,
     *,
     start: Distribution | None = None,
+    past: HistoryRecord | None = None,
     settings: Refinement | None = None,
     seed: int,
 ) -> RefinedBelief:
@@ -188,6 +198,8 @@ def refine(
         x: Their observed outcomes, shape (t, *x_shape), all finite.
         start: Where else to look first, for example a chained belief. It adds
             simulations and no weight, so it cannot bias.
+        past: ``belief.histories`` of an earlier call whose trials are the first of
+            these: what still lies in a region is simulated at the new actions only.
         settings: Budget and shares; None is ``Refinement()``.
         seed: Of everything random here.
 
@@ -216,7 +228,24 @@ def refine(
     settings = Refinement() if settings is None else settings
     action, observed = _trials(action, x)
     with single_thread():
-        return _refine(simulator, prior, action, observed, start, settings, seed)
+        belief = _refine(
+            simulator, prior, action, observed, start, past, settings, seed
+        )
+        if settings.check_order:
+            swapped = observed.reshape(len(action), -1)[::-1].reshape(-1)
+            other_seed = derive_seed(seed, "reversed")
+            other = _refine(
+                simulator,
+                prior,
+                action.flip(0),
+                swapped,
+                start,
+                None,
+                settings,
+                other_seed,
+            )
+            compare_orders(belief, other)
+    return belief
 
 
 def _refine(
@@ -225,12 +254,13 @@ def _refine(
     action: Tensor,
     observed: Array,
     start: Distribution | None,
+    past: HistoryRecord | None,
     settings: Refinement,
     seed: int,
 ) -> RefinedBelief:
     rng = np.random.default_rng(derive_seed(seed, "refine"))
     coordinates = PriorCoordinates(prior, rng)
-    histories = Histories(simulator, action, observed, coordinates, seed)
+    histories = Histories(simulator, action, observed, coordinates, seed, past)
 
     regions = [whole_space(coordinates.dim)]
     if start is not None:
@@ -286,7 +316,7 @@ def _refine(
 
     diagnostics = diagnose(
         course,
-        num_simulations=len(histories) * len(action),
+        num_simulations=histories.num_simulations,
         share_invalid=float((~histories.valid).mean()),
         num_trials=len(action),
         rng=rng,
@@ -297,6 +327,7 @@ def _refine(
     surrogate = Surrogate(coordinates, slim)
     belief = RefinedBelief(prior, surrogate, particles, defensive=settings.defensive)
     belief.diagnostics = diagnostics
+    belief.histories = histories.record()
     return belief
 
 
@@ -315,15 +346,21 @@ def _simulate_stage(
     settings: Refinement,
     rng: np.random.Generator,
 ) -> None:
-    num_replicates = max(int(settings.replicate_share * size), 12)
-    num_places = size - num_replicates
+    """Bring a stage's regions to their numbers, past histories first."""
+    is_first = len(histories) == 0
+    num_places = size - max(int(settings.replicate_share * size), 12)
     counts = np.diff(np.linspace(0, num_places, len(regions) + 1).astype(int))
-    places = [
-        region.sample_inside(int(count), histories.coordinates, rng)
-        for region, count in zip(regions, counts, strict=True)
-    ]
-    z = rng.permutation(np.concatenate(places))
-    histories.add(z, min(num_replicates, len(z)))
+    for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
+        # The first stage's first region is the whole space, seen from the prior.
+        is_overview = is_first and k == 0
+        before = len(histories) - len(histories.second)
+        histories.reuse(region, int(count), is_overview=is_overview)
+        missing = int(count) - (len(histories) - len(histories.second) - before)
+        if missing <= 0:
+            continue
+        z = rng.permutation(region.sample_inside(missing, histories.coordinates, rng))
+        num_replicates = missing * (size - num_places) // num_places
+        histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
 
 
 def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Array]:

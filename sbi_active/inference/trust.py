@@ -271,7 +271,9 @@ def _tail_probability(
             continue
         error, widening = fit.whitened(z)
         n, q = fit.residual.shape
-        observed = _squares(error, num_trials) / widening[:, None]
+        # A little leverage is the price of few rows; much of it is extrapolation, which
+        # must not excuse a misfit.
+        observed = _squares(error, num_trials) / np.minimum(widening, 2.0)[:, None]
         rows = rng.integers(n, size=(len(z), num_pairs))
         inflation = n / (n - len(fit.root))  # residuals are smaller than the noise
         simulated = inflation * _squares(fit.residual, num_trials)[rows]

@@ -22,6 +22,7 @@ from torch.distributions import (
 
 from sbi_active.inference.refine import RefinedBelief, Refinement, refine
 from sbi_active.seeding import forked_generators
+from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior
 
 BOX = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
@@ -280,9 +281,11 @@ def test_impossible_observation_is_flagged(linear):
     assert 0.01 < linear[0].diagnostics["tail_probability"] <= 1
     action = torch.tensor([[0.0], [0.0], [5.0]])
     x = torch.tensor([[50.0], [-50.0], [200.0]])  # the same action, 100 sigma apart
-    diagnostics = refine(numerical(), BOX, action, x, seed=0).diagnostics
-    assert diagnostics["tail_probability"] < 1e-3
-    assert any("unlike anything simulated" in text for text in diagnostics["warnings"])
+    for seed in range(3):
+        diagnostics = refine(numerical(), BOX, action, x, seed=seed).diagnostics
+        assert diagnostics["tail_probability"] < 1e-3
+        warnings = " ".join(diagnostics["warnings"])
+        assert "unlike anything simulated" in warnings
 
 
 def test_diagnostics_are_plain(linear):
@@ -388,3 +391,57 @@ def test_deterministic_simulator_is_refused():
 def test_settings_validate_themselves(option: dict):
     with pytest.raises(ValueError, match=f"expected {next(iter(option))} in"):
         Refinement(**option)
+
+
+def counted(simulator):
+    """Return a simulator that counts its rows, and the count."""
+    count = [0]
+
+    def wrapped(theta, action):
+        count[0] += len(theta)
+        return simulator(theta, action)
+
+    return wrapped, count
+
+
+def test_past_histories_are_used_first():
+    """The belief of four trials from that of three: fewer rows, the same posterior."""
+    task = get_task("numerical")
+    action = torch.tensor([[-5.0], [5.0], [-5.0], [4.0]])
+    x = torch.stack([task.real_system(a, seed=i) for i, a in enumerate(action)])
+    exact = task.reference(action, x)
+    theta = exact.sample(4_000, seed=0)
+    rows, divergences = [], []
+    for reuse in (True, False):
+        past = None
+        for t in (3, 4):
+            simulator, count = counted(task.simulator)
+            belief = refine(
+                simulator, task.prior, action[:t], x[:t],
+                past=past if reuse else None, seed=t,
+            )  # fmt: skip
+            past = belief.histories
+            assert belief.diagnostics["num_simulations"] == count[0]
+        rows.append(count[0])
+        difference = exact.log_prob(theta) - belief.log_prob(theta.float())
+        divergences.append(float(difference.mean()))
+    assert rows[0] < 0.6 * rows[1]
+    assert max(divergences) < 0.08
+
+
+def test_the_record_keeps_outcomes_and_pairs():
+    task = get_task("numerical")
+    action, x = torch.tensor([[0.0]]), torch.tensor([[-60.0]])
+    past = refine(task.simulator, task.prior, action, x, seed=0).histories
+    assert past.x.shape == (len(past.theta), 1, 1)
+    mean = task.simulator.mean(past.theta, action.expand(len(past.theta), 1))
+    residual = torch.from_numpy(past.x[:, :, 0]) - mean
+    assert abs(float(residual.std()) - 1) < 4 / (2 * len(residual)) ** 0.5
+    again = torch.from_numpy(past.again[past.has_again][:, :, 0])
+    second = again - mean[torch.from_numpy(past.has_again)]
+    assert abs(float(second.std()) - 1) < 4 / (2 * len(second)) ** 0.5
+    assert 0 < past.is_overview.sum() < len(past.theta)
+    # other first trials: nothing is taken over
+    other = torch.tensor([[1.0], [0.0]])
+    assert not past.precedes(other)
+    assert past.precedes(torch.tensor([[0.0], [1.0]]))
