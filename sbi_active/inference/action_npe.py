@@ -30,7 +30,7 @@ from typing_extensions import Self
 from sbi_active.inference.belief import require_support
 from sbi_active.inference.condition import pack
 from sbi_active.inference.mixture_density import MixtureDensity
-from sbi_active.inference.mixture_network import MixtureDensityNetwork, PreparedLoss
+from sbi_active.inference.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.posterior import ActionPosterior
 from sbi_active.inference.rounds import check_proposal, round_rows
 from sbi_active.inference.tracking import SilentTracker
@@ -337,19 +337,11 @@ class ActionNPE(NPE_C):
         if self._epoch_limit is not None:
             steps = max(len(self.train_indices) // train_config.training_batch_size, 1)
             num_iterations = min(num_iterations, steps * self._epoch_limit)
-        theta, condition = theta.to(self._device), condition.to(self._device)
-        trained: Any = network
-        patience = self._patience
-        if network.conditioning is not None and patience is None:
-            patience = num_iterations  # spends the budget, returns the best weights
-        if network.can_prepare and self._kernel is None:
-            theta, condition = network.prepare(theta, condition)
-            trained = PreparedLoss(network)
         record = train_mixture_density(
-            trained,
+            network,
             self.optimizer,
-            theta,
-            condition,
+            theta.to(self._device),
+            condition.to(self._device),
             train_rows=self.train_indices,
             held_out_rows=self.val_indices,
             budget=TrainingBudget(
@@ -357,7 +349,7 @@ class ActionNPE(NPE_C):
                 batch_size=train_config.training_batch_size,
                 clip_max_norm=train_config.clip_max_norm,
                 anneal=settings.anneal,
-                patience=patience,
+                patience=self._patience,
             ),
             calibration_kernel=self._kernel,
         )

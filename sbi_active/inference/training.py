@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 
-from sbi_active.inference.mixture_density import MixtureDensityNetwork
+from sbi_active.inference.mixture_network import MixtureDensityNetwork, PreparedLoss
 
 __all__ = [
     "TrainingBudget",
@@ -64,7 +64,8 @@ def train_mixture_density(
     r"""Minimize :math:`-\sum_n K(c_n) \log q(\theta_n | c_n)` over the training rows.
 
     sbi's loop passes every row through a DataLoader, which costs more than the network;
-    this one indexes tensors.
+    this one indexes tensors. Rows go through a network's conditioning once, and such a
+    network ends with its best weights on the held-out rows.
 
     Args:
         network: Changed in place.
@@ -82,9 +83,16 @@ def train_mixture_density(
     Raises:
         RuntimeError: If the loss is not finite.
     """
+    trained: MixtureDensityNetwork | PreparedLoss = network
+    patience = budget.patience
+    if network.conditioning is not None and patience is None:
+        patience = budget.num_iterations  # never runs out
+    if network.can_prepare and calibration_kernel is None:
+        theta, condition = network.prepare(theta, condition)
+        trained = PreparedLoss(network)
 
     def loss_of(theta: Tensor, condition: Tensor) -> Tensor:
-        loss = network.loss(theta, condition)
+        loss = trained.loss(theta, condition)
         if calibration_kernel is not None:
             loss = calibration_kernel(condition) * loss
         return loss.mean()
@@ -97,7 +105,7 @@ def train_mixture_density(
         optimizer, budget.num_iterations
     )
     record, best, best_state, fruitless, done = TrainingRecord(), torch.inf, None, 0, 0
-    while done < budget.num_iterations and fruitless != budget.patience:
+    while done < budget.num_iterations and fruitless != patience:
         start, total = time.time(), torch.zeros(())
         network.train()
         num_steps = min(steps_an_epoch, budget.num_iterations - done)
@@ -132,7 +140,7 @@ def train_mixture_density(
             )
         if validation_loss < best:
             best, fruitless = validation_loss, 0
-            if budget.patience is not None:
+            if patience is not None:
                 best_state = deepcopy(network.state_dict())
         else:
             fruitless += 1
