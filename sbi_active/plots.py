@@ -53,6 +53,7 @@ def plot_belief(
         xlabel=parameter_names[i],
         ylabel=parameter_names[j],
     )
+    ax.locator_params(axis="x", nbins=4)  # labels of a narrow belief are long
 
 
 def plot_rounds(
