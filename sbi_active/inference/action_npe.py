@@ -32,7 +32,7 @@ from sbi_active.inference.condition import pack
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.posterior import ActionPosterior
-from sbi_active.inference.rounds import check_proposal, round_rows
+from sbi_active.inference.rounds import Observation, check_proposal, round_rows
 from sbi_active.inference.tracking import SilentTracker
 from sbi_active.inference.training import TrainingBudget, train_mixture_density
 from sbi_active.threads import single_thread
@@ -104,6 +104,7 @@ class ActionNPE(NPE_C):
         self._action_dim: int | None = None
         self._outcome_shape: torch.Size | None = None
         self._trained_round: int | None = None
+        self.trials: list[Observation] = []  # real ones, each of which ended a round
 
     @property
     def belief(self) -> Distribution | None:

@@ -5,16 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
-    ConditionalEstimatorBuilder,
 )
-from sbi.sbi_types import Tracker
 from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.inference.action_npe import ActionNPE
 from sbi_active.inference.belief import Belief, ChainedBelief, require_support
@@ -68,29 +65,6 @@ class ASBI(ActionNPE):
         >>> belief.sample((3,)).shape
         torch.Size([3, 1])
     """
-
-    def __init__(
-        self,
-        prior: Distribution | None = None,
-        density_estimator: Literal["nsf", "maf", "mdn", "made"]
-        | ConditionalEstimatorBuilder[ConditionalDensityEstimator]
-        | None = None,
-        device: str = "cpu",
-        logging_level: int | str = "WARNING",
-        summary_writer: Any = None,
-        tracker: Tracker | None = None,
-        show_progress_bars: bool = True,
-    ) -> None:
-        super().__init__(
-            prior,
-            density_estimator,
-            device,
-            logging_level,
-            summary_writer,
-            tracker,
-            show_progress_bars,
-        )
-        self.trials: list[Observation] = []
 
     def update(
         self,
