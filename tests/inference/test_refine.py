@@ -251,10 +251,17 @@ def test_start_is_a_hint_without_weight(linear):
     assert abs(float(difference.mean())) < 0.1
 
 
-@pytest.mark.parametrize("noise", ["gaussian", "uniform"])
-def test_hard_edged_noise_is_flagged(noise: str):
+@pytest.mark.parametrize(
+    ("noise", "num_seeds"),
+    [
+        ("gaussian", 3),
+        ("uniform", 3),
+        pytest.param("uniform", 20, marks=pytest.mark.slow),
+    ],
+)
+def test_hard_edged_noise_is_flagged(noise: str, num_seeds: int):
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-    for seed in range(3):
+    for seed in range(num_seeds):
         simulator = numerical(noise=noise)
         x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, seed)
         diagnostics = refine(simulator, BOX, action, x, seed=seed).diagnostics
