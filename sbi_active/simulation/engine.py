@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,35 +15,13 @@ from sbi_active.simulation.model import (
     require_noise,
     takes_seeds,
 )
+from sbi_active.simulation.outcomes import Simulations
 
-__all__ = ["Simulations", "simulate"]
+__all__ = ["simulate"]
 
 #: Rows that share one seed of the global generators. Part of the definition of x for a
 #: simulator that takes no seeds, so it is never a setting.
 BLOCK = 256
-
-
-@dataclass(frozen=True)
-class Simulations:
-    """Simulated outcomes, one a row.
-
-    Attributes:
-        theta: Parameters, shape (n, theta_dim).
-        action: Actions, shape (n, action_dim).
-        x: Outcomes, shape (n, *x_shape), float32; NaN where there is no measurement.
-    """
-
-    theta: Tensor
-    action: Tensor
-    x: Tensor
-
-    @property
-    def valid(self) -> Tensor:
-        """Rows with a measurement, shape (n,), bool."""
-        return self.x.flatten(1).isfinite().any(-1)
-
-    def __len__(self) -> int:
-        return len(self.theta)
 
 
 def simulate(

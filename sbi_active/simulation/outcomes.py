@@ -1,0 +1,74 @@
+"""What became of each simulated row: a measurement, none, or a fault."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+__all__ = ["Outcome", "Simulations"]
+
+
+class Outcome(IntEnum):
+    """What became of a row.
+
+    Attributes:
+        OK: A measurement; some of its numbers may be NaN, which masks them.
+        INVALID: The system ran and gave no measurement (it fell off the table): NaN
+            throughout, information about the parameters, and so a part of x.
+        MISSING: A fault unrelated to the parameters (an exception, a time-out, a lost
+            worker): NaN throughout, and ignored.
+    """
+
+    OK = 0
+    INVALID = 1
+    MISSING = 2
+
+
+@dataclass(frozen=True)
+class Simulations:
+    """Simulated outcomes, one a row.
+
+    Attributes:
+        theta: Parameters, shape (n, theta_dim).
+        action: Actions, shape (n, action_dim).
+        x: Outcomes, shape (n, *x_shape), float32; NaN where there is no measurement.
+        status: An :class:`Outcome` a row, shape (n,), int8; None reads it from x, NaN
+            throughout being invalid.
+        tracebacks: Of the rows that failed, by index.
+    """
+
+    theta: Tensor
+    action: Tensor
+    x: Tensor
+    status: Tensor = None  # type: ignore[assignment]  # filled in below
+    tracebacks: dict[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.status is None:
+            lost = ~self.x.flatten(1).isfinite().any(-1)
+            object.__setattr__(self, "status", lost.to(torch.int8))
+
+    @property
+    def valid(self) -> Tensor:
+        """Rows with a measurement, shape (n,), bool."""
+        return self.status == Outcome.OK
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of rows by outcome."""
+        return {o.name.lower(): int((self.status == o).sum()) for o in Outcome}
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def without_missing(self) -> Simulations:
+        """Return the rows that tell something: those not missing."""
+        keep = self.status != Outcome.MISSING
+        if bool(keep.all()):
+            return self
+        return Simulations(
+            self.theta[keep], self.action[keep], self.x[keep], self.status[keep]
+        )
