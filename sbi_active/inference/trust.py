@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import kurtosis
 
 from sbi_active.inference.population import Particles
 from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
@@ -21,6 +22,7 @@ MAX_DIM = 6
 MIN_EFFECTIVE = 0.05  # share of the particles
 ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
 HARD_NOISE = 0.03  # nats a number that a Gaussian loses on the noise
+LIGHT_TAILS = -0.3  # excess kurtosis; -1.2 for uniform noise, 0 for Gaussian
 SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 UNSETTLED = 0.1  # nats a dimension
 CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
@@ -155,6 +157,7 @@ def diagnose(
     )
     roughness = course.stages[0].surrogate.regressions[0].roughness
     negentropy, is_gaussian = _noise_shape(live, rng)
+    is_gaussian &= not _has_hard_edges(course.stages)
     correlation, is_independent = _trial_correlation(live, num_trials)
     valid = float(np.exp(min((fit.log_valid for fit in live), default=0.0)))
     ratio = max((fit.ratio for fit in live), default=np.inf)
@@ -321,6 +324,26 @@ def _noise_shape(
             excess.append(_negentropy(member) - mean)
             clear.append(excess[-1] > HARD_NOISE + 4 * deviation)
     return float(max(*excess, 0.0)), not any(clear)
+
+
+def _has_hard_edges(stages: list[Stage]) -> bool:
+    r"""Return whether the residuals of all stages have lighter tails than a Gaussian.
+
+    A few hundred numbers tell by their kurtosis what their entropy cannot tell yet. Its
+    standard error is :math:`\sqrt{24 / n}` for Gaussian numbers (Fisher, Proc. Lond.
+    Math. Soc. 1930). Regressions with misfit are left out, whose error has edges too.
+    """
+    residuals = [
+        fit.standardized[:, fit.standardized.var(0) > 1e-6].ravel()
+        for stage in stages
+        for fit, mass in zip(stage.surrogate.regressions, stage.mass, strict=True)
+        if mass > LIVE and not fit.has_misfit
+    ]
+    values = np.concatenate([np.zeros(0), *residuals])
+    if values.size < 100:
+        return False
+    margin = 3.5 * np.sqrt(24 / values.size)
+    return bool(kurtosis(values) < LIGHT_TAILS - margin)
 
 
 def _negentropy(values: Array) -> float:
