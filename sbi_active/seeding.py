@@ -18,7 +18,13 @@ import torch
 from scipy.special import ndtri
 from torch import Tensor
 
-__all__ = ["derive_seed", "forked_generators", "row_normals", "row_seeds"]
+__all__ = [
+    "derive_seed",
+    "forked_generators",
+    "row_normals",
+    "row_seeds",
+    "row_uniforms",
+]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
@@ -95,8 +101,27 @@ def row_seeds(seed: int, num_rows: int, *, first: int = 0) -> Tensor:
     return torch.from_numpy((seeds >> np.uint64(1)).astype(np.int64))
 
 
+def row_uniforms(seeds: Tensor, num: int, *, first: int = 0) -> Tensor:
+    """Return uniform numbers within (0, 1), row i a function of ``seeds[i]`` alone.
+
+    Args:
+        seeds: Shape (n,), int64.
+        num: Numbers a row.
+        first: Place of the first of them in the row's stream.
+
+    Returns:
+        Shape (n, num), float64.
+    """
+    key = seeds.cpu().numpy().astype(np.uint64)[:, None]
+    with np.errstate(over="ignore"):
+        counter = _GOLDEN * np.arange(first + 1, first + num + 1, dtype=np.uint64)
+        bits = _mix(_mix(key) + counter)
+    # 53 random bits, centred in their cells: never 0 or 1, where ndtri is infinite.
+    return torch.from_numpy(((bits >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53)
+
+
 def row_normals(seeds: Tensor, num: int) -> Tensor:
-    """Return standard normal numbers, row i a function of ``seeds[i]`` alone.
+    """Return standard normal numbers, the quantiles of :func:`row_uniforms`.
 
     Args:
         seeds: Shape (n,), int64.
@@ -105,13 +130,7 @@ def row_normals(seeds: Tensor, num: int) -> Tensor:
     Returns:
         Shape (n, num), float64.
     """
-    key = seeds.cpu().numpy().astype(np.uint64)[:, None]
-    with np.errstate(over="ignore"):
-        counter = _GOLDEN * np.arange(1, num + 1, dtype=np.uint64)
-        bits = _mix(_mix(key) + counter)
-    # 53 random bits, centred in their cells: never 0 or 1, where ndtri is infinite.
-    uniform = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
-    return torch.from_numpy(ndtri(uniform))
+    return torch.from_numpy(ndtri(row_uniforms(seeds, num).numpy()))
 
 
 def _mix(z: np.ndarray) -> np.ndarray:

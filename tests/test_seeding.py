@@ -3,7 +3,13 @@ import pytest
 import torch
 from scipy import stats
 
-from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
+from sbi_active.seeding import (
+    derive_seed,
+    forked_generators,
+    row_normals,
+    row_seeds,
+    row_uniforms,
+)
 
 
 def test_rows_depend_on_seed_and_index_alone():
@@ -26,6 +32,16 @@ def test_row_normals_are_standard_normal_and_uncorrelated():
     assert np.abs(correlation).max() < 4 / np.sqrt(20_000)
     # and along rows, whose seeds are neighbors
     assert abs(np.corrcoef(draws[1:, 0], draws[:-1, 0])[0, 1]) < 4 / np.sqrt(20_000)
+
+
+def test_row_uniforms_are_uniform_and_continue_the_stream():
+    seeds = row_seeds(2, 20_000)
+    draws = row_uniforms(seeds, 4)
+    assert stats.kstest(draws.numpy().ravel(), "uniform").pvalue > 1e-3
+    assert torch.equal(row_uniforms(seeds, 2, first=2), draws[:, 2:])
+    assert torch.equal(row_uniforms(seeds[[7, 3]], 4), draws[[7, 3]])
+    normals = stats.norm.ppf(draws.numpy())
+    assert np.allclose(row_normals(seeds, 4).numpy(), normals, atol=1e-9)
 
 
 def test_fork_seeds_inside_and_restores_outside():

@@ -3,43 +3,71 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+import os
+import threading
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.noise import NoiseModel
+from sbi_active.simulation.simulator import (
+    Simulator,
+    outcome_tensor,
+    require_noise,
+)
 
-__all__ = ["Simulator", "SimulatorModel", "require_noise", "takes_seeds"]
+__all__ = [
+    "Simulator",
+    "SimulatorModel",
+    "outcome_tensor",
+    "require_noise",
+    "takes_seeds",
+]
 
+FEW = 8  # rows that show whether fn is random
+ROUNDING = 1e-6  # relative difference that makes no draw
+NOISE_STREAM = 0x9E3779B97F4A7C1  # sets the noise's seeds apart from those of fn
 
-class Simulator(Protocol):
-    """What users bring: a draw from p(x | theta, action), one row a parameter set.
-
-    A plain function will do. It may also accept ``seeds`` (shape (n,), int64), and then
-    row i depends on ``seeds[i]`` alone.
-    """
-
-    def __call__(self, theta: Tensor, action: Tensor, /) -> Any:
-        """Return x of shape (n, *x_shape), torch or NumPy.
-
-        Args:
-            theta: Shape (n, theta_dim), float32.
-            action: Shape (n, action_dim), float32.
-        """
-        ...
+# What setup() gave, by process and model: a worker that receives the same model with
+# every batch sets it up once.
+_contexts: dict[tuple[int, str], Any] = {}
+_setting_up = threading.Lock()
 
 
 class SimulatorModel:
     r"""A simulator that owns its noise, :math:`x = f(\theta, \xi) + \epsilon`.
 
+    Further keyword arguments of ``fn`` are its *effects*, given to the model by name:
+    a number, or one a row, shape (n, ...).
+
     Args:
         fn: ``fn(theta, action)``, shapes (n, theta_dim) and (n, action_dim), giving
-            (n, *x_shape); it may accept ``seeds``.
+            (n, *x_shape); it may accept ``seeds``, shape (n,). With ``batched=False``,
+            ``fn(theta, action, rng)`` of one row: float64 NumPy arrays of shapes
+            (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed.
         noise: Added to the output of ``fn``; None where ``fn`` is itself the draw.
+        batched: Whether ``fn`` takes all rows at once.
+        setup: Called without arguments once a process, before the first run; ``fn``
+            receives what it returns as keyword argument ``context``. It is neither
+            pickled nor freed before the process ends.
         parameter_names: One a parameter.
         channel_names: One an entry of x's last axis.
+        sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
+            noise.
+
+    Attributes:
+        noise: With the time stamps, where there are any.
+        effect_names: Names of the effects that ``fn`` declares.
+        is_batched: Whether ``fn`` takes all rows at once.
+        fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
+
+    Raises:
+        ValueError: If ``setup`` is given and ``fn`` takes no ``context``.
 
     Example:
         >>> from sbi_active.simulation import GaussianNoise
@@ -53,17 +81,41 @@ class SimulatorModel:
         fn: Callable[..., Any],
         *,
         noise: NoiseModel | None = None,
+        batched: bool = True,
+        setup: Callable[[], Any] | None = None,
         parameter_names: Sequence[str] | None = None,
         channel_names: Sequence[str] | None = None,
+        sample_times: Tensor | None = None,
     ) -> None:
         self.fn = fn
-        self.noise = noise
+        self.is_batched = batched
+        self.setup = setup
         self.parameter_names = None if parameter_names is None else [*parameter_names]
         self.channel_names = None if channel_names is None else [*channel_names]
-        self.fn_takes_seeds = takes_seeds(fn)
+        self.sample_times = sample_times
+        if sample_times is not None:
+            self.sample_times = torch.as_tensor(sample_times, dtype=torch.float64)
+        self.noise = noise
+        if noise is not None and self.sample_times is not None:
+            self.noise = noise.at(self.sample_times)
+        keywords, self._takes_any = _keywords(fn, 2 if batched else 3)
+        self.fn_takes_seeds = not batched or "seeds" in keywords
+        reserved = ("seeds", "context") if batched else ("context",)
+        self.effect_names = tuple(k for k in keywords if k not in reserved)
+        if setup is not None and "context" not in keywords and not self._takes_any:
+            raise ValueError(
+                "expected fn to take what setup returns; got a fn without an argument "
+                f"'context', only {keywords}; do add it as a keyword argument"
+            )
+        self._token = uuid.uuid4().hex
+        self._is_deterministic: bool | None = None
 
     def __call__(
-        self, theta: Tensor, action: Tensor, seeds: Tensor | None = None
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor | None = None,
+        **effects: Any,
     ) -> Tensor:
         """Return one draw a row.
 
@@ -71,19 +123,35 @@ class SimulatorModel:
             theta: Shape (n, theta_dim).
             action: Shape (n, action_dim).
             seeds: One a row, shape (n,); None uses torch's global generator.
+            effects: By name, a number or one a row.
 
         Returns:
             Shape (n, *x_shape).
         """
-        x = self._run(theta, action, seeds)
-        return x if self.noise is None else self.noise.sample(x, seeds)
+        x = self._run(theta, action, seeds, effects)
+        if self.noise is None:
+            return x
+        if self.fn_takes_seeds and seeds is not None:
+            seeds = seeds ^ NOISE_STREAM
+        return self.noise.sample(x, seeds)
 
-    def mean(self, theta: Tensor, action: Tensor) -> Tensor:
+    def prepare(self) -> None:
+        """Run ``setup`` in this process, unless that has been done."""
+        if self.setup is not None:
+            self._context()
+
+    def mean(self, theta: Tensor, action: Tensor, **effects: Any) -> Tensor:
         """Return the noise-free output, shape (n, *x_shape).
 
+        Args:
+            theta: Shape (n, theta_dim).
+            action: Shape (n, action_dim).
+            effects: By name, a number or one a row.
+
         Raises:
-            ValueError: If the model was built without a noise model, since ``fn`` is
-                then the draw itself.
+            ValueError: If the model was built without a noise model, or ``fn`` is
+                random: it is then a draw itself. The latter is looked up once, on the
+                first few rows of the first call.
         """
         if self.noise is None:
             raise ValueError(
@@ -91,12 +159,188 @@ class SimulatorModel:
                 "output of fn is already a random draw; do build "
                 "SimulatorModel(fn, noise=GaussianNoise(sd)) around a noise-free fn"
             )
-        return self._run(theta, action, None)
+        if not self.is_deterministic(theta, action, **effects):
+            raise ValueError(
+                "expected a noise-free fn beside declared noise; got different outputs "
+                "from two seeds, so that noise would count twice; do remove the random "
+                "numbers from fn, or build SimulatorModel(fn, noise=None)"
+            )
+        return self._run(theta, action, _zeros(theta), effects)
 
-    def _run(self, theta: Tensor, action: Tensor, seeds: Tensor | None) -> Tensor:
-        if self.fn_takes_seeds and seeds is not None:
-            return outcome_tensor(self.fn(theta, action, seeds=seeds), len(theta))
-        return outcome_tensor(self.fn(theta, action), len(theta))
+    def log_prob(
+        self, x: Tensor, theta: Tensor, action: Tensor, **effects: Any
+    ) -> Tensor:
+        r"""Return :math:`\log p(x | \theta, \xi)`, the noise's density around the mean.
+
+        Args:
+            x: Observations, shape (n, *x_shape).
+            theta: Shape (n, theta_dim).
+            action: Shape (n, action_dim).
+            effects: By name, a number or one a row.
+
+        Returns:
+            Shape (n,), float64, nats.
+        """
+        mean = self.mean(theta, action, **effects)
+        assert self.noise is not None
+        return self.noise.log_prob(x, mean)
+
+    def is_deterministic(self, theta: Tensor, action: Tensor, **effects: Any) -> bool:
+        """Return whether ``fn`` gives the same output under two seeds.
+
+        The first call runs ``fn`` twice on at most 8 rows; its answer is kept.
+
+        Args:
+            theta: Shape (n, theta_dim).
+            action: Shape (n, action_dim).
+            effects: By name, a number or one a row.
+        """
+        if self._is_deterministic is None:
+            few = {k: v[:FEW] if np.ndim(v) else v for k, v in effects.items()}
+            self._is_deterministic = self._agrees(theta[:FEW], action[:FEW], few)
+        return self._is_deterministic
+
+    def _agrees(
+        self, theta: Tensor, action: Tensor, effects: Mapping[str, Any]
+    ) -> bool:
+        """Compare two seeds; rows that raise have no say where others do not."""
+        try:
+            x, again = (self._few(theta, action, effects, seed) for seed in (0, 1))
+        except Exception:
+            if len(theta) == 1:
+                raise
+            answers = []
+            for i in range(len(theta)):
+                own = {k: v[i : i + 1] if np.ndim(v) else v for k, v in effects.items()}
+                try:
+                    row = slice(i, i + 1)
+                    answers.append(self._agrees(theta[row], action[row], own))
+                except Exception:
+                    continue
+            if not answers:
+                raise
+            return all(answers)
+        scale = torch.maximum(x.abs(), again.abs())
+        same = ((x - again).abs() <= ROUNDING * scale) | (x == again)
+        return bool((same | (x.isnan() & again.isnan())).all())
+
+    def _few(
+        self, theta: Tensor, action: Tensor, effects: Mapping[str, Any], seed: int
+    ) -> Tensor:
+        with forked_generators(seed, "deterministic"):
+            return self._run(theta, action, row_seeds(seed, len(theta)), effects)
+
+    def _run(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor | None,
+        effects: Mapping[str, Any],
+    ) -> Tensor:
+        theta, action = torch.as_tensor(theta), torch.as_tensor(action)
+        self._check(theta, action, effects)
+        if self.fn_takes_seeds and seeds is None:
+            seeds = torch.randint(2**62, (len(theta),))
+        keywords = {}
+        if self.setup is not None:
+            keywords["context"] = self._context()
+        if not self.is_batched:
+            assert seeds is not None
+            x = self._run_rows(theta, action, seeds, effects, keywords)
+        else:
+            if self.fn_takes_seeds:
+                keywords["seeds"] = seeds
+            x = self.fn(theta, action, **effects, **keywords)
+        x = outcome_tensor(x, len(theta))
+        names = self.channel_names
+        if names is not None and x.shape[-1] != len(names):
+            raise ValueError(
+                f"expected {len(names)} channels, {', '.join(names)}; got x of shape "
+                f"{tuple(x.shape)}; do name the entries of its last axis"
+            )
+        return x
+
+    def _run_rows(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor,
+        effects: Mapping[str, Any],
+        keywords: Mapping[str, Any],
+    ) -> np.ndarray:
+        thetas = theta.detach().cpu().double().numpy()
+        actions = action.detach().cpu().double().numpy()
+        arrays = {k: np.asarray(v, dtype=np.float64) for k, v in effects.items()}
+        rows: list[np.ndarray] = []
+        for i, seed in enumerate(seeds.tolist()):
+            own = {k: v[i] if v.ndim else float(v) for k, v in arrays.items()}
+            rng = np.random.default_rng(seed)
+            x = self.fn(thetas[i].copy(), actions[i].copy(), rng, **own, **keywords)
+            rows.append(np.asarray(x, dtype=np.float64))
+            if rows[i].shape != rows[0].shape:
+                raise ValueError(
+                    f"expected rows of one shape, {rows[0].shape}; got "
+                    f"{rows[i].shape} in row {i}; do fill what is missing with NaN"
+                )
+        return np.stack(rows) if rows else np.empty((0, 1))
+
+    def _context(self) -> Any:
+        key = os.getpid(), self._token
+        with _setting_up:
+            if key not in _contexts:
+                assert self.setup is not None
+                _contexts[key] = self.setup()
+        return _contexts[key]
+
+    def _check(self, theta: Tensor, action: Tensor, effects: Mapping[str, Any]) -> None:
+        if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
+            raise ValueError(
+                "expected theta (n, theta_dim) and action (n, action_dim) with as many "
+                f"rows; got {tuple(theta.shape)} and {tuple(action.shape)}; do repeat "
+                "the action for each row"
+            )
+        names = self.parameter_names
+        if names is not None and theta.shape[1] != len(names):
+            raise ValueError(
+                f"expected {len(names)} parameters, {', '.join(names)}; got theta of "
+                f"shape {tuple(theta.shape)}; do give one column a parameter"
+            )
+        for name, rows in (("theta", theta), ("action", action)):
+            bad = torch.nonzero(~rows.isfinite().all(1))[:, 0]
+            if len(bad):
+                raise ValueError(
+                    f"expected finite {name}; got {rows[bad[0]].tolist()} in row "
+                    f"{int(bad[0])}; do remove NaN and inf"
+                )
+        for name, value in effects.items():
+            if name not in self.effect_names and not self._takes_any:
+                known = ", ".join(map(repr, self.effect_names)) or "none"
+                raise TypeError(
+                    f"expected effects among the keyword arguments of fn, {known}; got "
+                    f"{name!r}; do add it to fn, with its null value as the default"
+                )
+            if np.ndim(value) and len(value) != len(theta):
+                raise ValueError(
+                    f"expected {name} as a number or one a row, shape ({len(theta)}, "
+                    f"...); got {tuple(np.shape(value))}; do repeat it for each row"
+                )
+
+
+def _zeros(theta: Tensor) -> Tensor:
+    return torch.zeros(len(theta), dtype=torch.int64)
+
+
+def _keywords(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
+    """Return names of keyword arguments behind the positional ones, and if any go."""
+    try:
+        parameters = [*inspect.signature(fn).parameters.values()]
+    except (TypeError, ValueError):  # builtins and C functions have no signature
+        return [], False
+    kinds = inspect.Parameter
+    named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
+    positional = [p for p in parameters if p.kind != kinds.KEYWORD_ONLY][:num_rows]
+    names = [p.name for p in parameters if p.kind in named and p not in positional]
+    return names, any(p.kind == kinds.VAR_KEYWORD for p in parameters)
 
 
 def takes_seeds(simulator: Callable[..., Any]) -> bool:
@@ -107,40 +351,3 @@ def takes_seeds(simulator: Callable[..., Any]) -> bool:
         return "seeds" in inspect.signature(simulator).parameters
     except (TypeError, ValueError):  # builtins and C functions have no signature
         return False
-
-
-def outcome_tensor(x: Any, num_rows: int) -> Tensor:
-    """Return a simulator's output as a tensor with one row a parameter set.
-
-    Raises:
-        ValueError: If the output does not have ``num_rows`` rows.
-    """
-    x = torch.as_tensor(x)
-    if x.ndim == 0 or x.shape[0] != num_rows:
-        raise ValueError(
-            f"expected x with one row a parameter set, shape ({num_rows}, ...); got "
-            f"{tuple(x.shape)}; do return a simulator's rows stacked along axis 0"
-        )
-    if x.ndim == 1:  # one number a row
-        x = x[:, None]
-    return x if x.is_floating_point() else x.to(torch.get_default_dtype())
-
-
-def require_noise(x: Tensor, again: Tensor) -> None:
-    """Raise where two seeds gave identical outcomes.
-
-    Args:
-        x: Outcomes under one seed, shape (n, *x_shape).
-        again: Outcomes of the same parameters and actions under another seed.
-
-    Raises:
-        ValueError: If no finite number of x differs.
-    """
-    both = x.isfinite() & again.isfinite()
-    if bool(both.any()) and bool((x[both] == again[both]).all()):
-        raise ValueError(
-            "expected a simulator with noise; got identical x from two seeds, and a "
-            "deterministic simulator has neither a posterior density nor a finite "
-            "information gain; do declare the measurement noise, "
-            "SimulatorModel(simulator, noise=GaussianNoise(sd))"
-        )

@@ -1,52 +1,41 @@
-"""Measurement noise: what separates a simulator's output from an observation."""
+"""Independent Gaussian noise."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
-from sbi_active.seeding import row_normals
+from sbi_active.simulation.noise_model import (
+    NoiseModel,
+    ScaleNoise,
+    observed_terms,
+    standard_normals,
+)
+from sbi_active.simulation.noise_posterior import (
+    InverseChiSquare,
+    NoisePosterior,
+    log_student_evidence,
+)
 
 __all__ = ["GaussianNoise", "NoiseModel"]
 
-
-class NoiseModel(ABC):
-    """Distribution of an observation around the simulator's noise-free output."""
-
-    @abstractmethod
-    def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
-        """Return observations.
-
-        Args:
-            mean: Noise-free outputs, shape (n, *x_shape).
-            seeds: One a row, shape (n,); None draws from torch's global generator.
-
-        Returns:
-            Shape (n, *x_shape).
-        """
-
-    @abstractmethod
-    def log_prob(self, x: Tensor, mean: Tensor) -> Tensor:
-        """Return the log density of observations.
-
-        Args:
-            x: Observations, shape (n, *x_shape).
-            mean: Noise-free outputs, broadcastable to x.
-
-        Returns:
-            Shape (n,), float64.
-        """
+LOG_2PI = math.log(2 * math.pi)
 
 
-class GaussianNoise(NoiseModel):
+class GaussianNoise(ScaleNoise):
     r"""Independent Gaussian noise, :math:`x \sim N(\mu, \sigma^2)`.
 
+    With the posterior of :func:`~sbi_active.simulation.estimate_noise`, a row is a
+    multivariate Student-t, exactly: numbers that share a standard deviation have one
+    draw of it in common.
+
     Args:
-        sd: Standard deviation, in the units of x; a number, or one a channel (the last
-            axis of x).
+        sd: Standard deviation :math:`\sigma`, in the units of x; a number, or one a
+            channel (the last axis of x).
+        posterior: Over the standard deviations, event shape (channels,).
 
     Raises:
         ValueError: If a standard deviation is negative or not finite.
@@ -57,25 +46,32 @@ class GaussianNoise(NoiseModel):
         -1.612...
     """
 
-    def __init__(self, sd: float | Tensor) -> None:
-        self.sd = torch.as_tensor(sd, dtype=torch.float64)
-        if not bool((self.sd.isfinite() & (self.sd >= 0)).all()):
-            raise ValueError(
-                f"expected a standard deviation >= 0; got {sd}; do give it in the "
-                "units of x"
-            )
+    def __init__(
+        self, sd: float | Tensor, *, posterior: Distribution | None = None
+    ) -> None:
+        super().__init__(sd, posterior=posterior)
 
-    def __repr__(self) -> str:
-        return f"GaussianNoise(sd={self.sd.tolist()})"
+    def _draw(
+        self,
+        seeds: Tensor | None,
+        shape: torch.Size,
+        parameters: Tensor,
+        times: Tensor | None,
+    ) -> Tensor:
+        return self._spread(parameters, shape) * standard_normals(seeds, shape)
 
-    def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
-        if seeds is None:
-            normal = torch.randn(mean.shape, dtype=torch.float64)
-        else:
-            normal = row_normals(seeds, mean[0].numel()).reshape(mean.shape)
-        return mean + (self.sd * normal).to(mean.dtype)
+    def _log_density(
+        self, residual: Tensor, parameters: Tensor, times: Tensor | None
+    ) -> Tensor:
+        sd = self._spread(parameters, residual.shape)
+        density = -0.5 * (residual / sd) ** 2 - torch.log(sd) - 0.5 * LOG_2PI
+        return observed_terms(density, residual).flatten(1).sum(1)
 
-    def log_prob(self, x: Tensor, mean: Tensor) -> Tensor:
-        z = (x.double() - mean.double()) / self.sd
-        density = -0.5 * z**2 - torch.log(self.sd) - 0.5 * math.log(2 * math.pi)
-        return density.flatten(1).sum(-1)
+    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
+        posterior = self.posterior
+        if not isinstance(posterior, NoisePosterior):
+            return super()._marginal(residual, times)
+        assert isinstance(posterior.sd, InverseChiSquare)
+        square = self._by_channel(observed_terms(residual.square(), residual))
+        count = self._by_channel((~residual.isnan()).double())
+        return log_student_evidence(square, count, posterior.sd, cell=0).sum(1)

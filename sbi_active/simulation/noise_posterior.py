@@ -1,0 +1,240 @@
+r"""Posteriors over the parameters of a noise model.
+
+All have the same form: cells of the one shared parameter (a correlation time, degrees
+of freedom), and given the cell, independent standard deviations of the channels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from scipy.special import chdtri
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+__all__ = [
+    "Cells",
+    "InverseChiSquare",
+    "NoisePosterior",
+    "SdGrid",
+    "log_student_evidence",
+]
+
+
+class ConditionalSd(Protocol):
+    """Standard deviations given the cell of the shared parameter."""
+
+    @property
+    def num_channels(self) -> int:
+        """Number of standard deviations."""
+        ...
+
+    def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
+        """Return sd at cells (n,) and levels (n, channels)."""
+        ...
+
+    def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
+        """Return log densities (n,) of sd (n, channels) at cells (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class InverseChiSquare:
+    r"""Scaled inverse chi-square variances, :math:`\nu s^2 / \sigma^2 \sim \chi^2_\nu`.
+
+    Args:
+        freedom: :math:`\nu`, shape (channels,).
+        variance: :math:`s^2`, shape (cells, channels).
+
+    References:
+        Gelman et al., Bayesian Data Analysis, 3rd edition, section 3.2.
+    """
+
+    freedom: Tensor
+    variance: Tensor
+
+    @property
+    def num_channels(self) -> int:
+        """Number of standard deviations."""
+        return len(self.freedom)
+
+    def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
+        """Return sd at cells (n,) and levels (n, channels)."""
+        chi_square = chdtri(self.freedom.numpy(), uniform.numpy())
+        return (
+            self.freedom * self.variance[cell] / torch.from_numpy(chi_square)
+        ).sqrt()
+
+    def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
+        """Return log densities (n,) of sd (n, channels) at cells (n,)."""
+        half = 0.5 * self.freedom
+        chi_square = self.freedom * self.variance[cell] / sd**2
+        log_p = half * torch.log(0.5 * chi_square) - 0.5 * chi_square
+        return (log_p - torch.lgamma(half) + math.log(2.0) - torch.log(sd)).sum(-1)
+
+
+@dataclass(frozen=True)
+class Cells:
+    r"""A density on a positive number, constant in its logarithm within each cell.
+
+    Args:
+        edges: Of the cells, increasing, shape (..., cells + 1).
+        log_weight: Log probability of the cells, shape (..., cells).
+    """
+
+    edges: Tensor
+    log_weight: Tensor
+
+    def quantile(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the cell and the value at levels of the leading shape."""
+        mass = self.log_weight.exp()
+        above = mass.cumsum(-1)
+        above = above / above[..., -1:]
+        last = mass.shape[-1] - 1
+        level = uniform[..., None].contiguous()
+        cell = torch.searchsorted(above, level).clamp_max(last)
+        top, share = above.gather(-1, cell), mass.gather(-1, cell)
+        within = 1 - ((top - level) / share).clamp(0, 1)
+        low, high = self.edges.gather(-1, cell), self.edges.gather(-1, cell + 1)
+        return cell[..., 0], (low * (high / low) ** within)[..., 0]
+
+    def log_prob(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the cell and the log density of values of the leading shape."""
+        last = self.log_weight.shape[-1] - 1
+        cell = (
+            torch.searchsorted(self.edges, value[..., None].contiguous()) - 1
+        ).clamp(0, last)
+        width = torch.log(self.edges[..., 1:] / self.edges[..., :-1]).gather(-1, cell)
+        log_p = self.log_weight.gather(-1, cell) - width.log()
+        inside = (value >= self.edges[..., 0]) & (value <= self.edges[..., -1])
+        log_p = torch.where(inside, log_p[..., 0] - value.log(), -torch.inf)
+        return cell[..., 0], log_p
+
+
+@dataclass(frozen=True)
+class SdGrid:
+    """Standard deviations on a grid.
+
+    Args:
+        edges: Of the cells of sd, shape (channels, s + 1).
+        log_weight: Log probability of the cells, shape (cells, channels, s).
+    """
+
+    edges: Tensor
+    log_weight: Tensor
+
+    @property
+    def num_channels(self) -> int:
+        """Number of standard deviations."""
+        return len(self.edges)
+
+    @property
+    def nodes(self) -> Tensor:
+        """Geometric middle of the cells, shape (channels, s)."""
+        return (self.edges[:, 1:] * self.edges[:, :-1]).sqrt()
+
+    def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
+        """Return sd at cells (n,) and levels (n, channels)."""
+        return self._cells(cell).quantile(uniform)[1]
+
+    def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
+        """Return log densities (n,) of sd (n, channels) at cells (n,)."""
+        return self._cells(cell).log_prob(sd.contiguous())[1].sum(-1)
+
+    def _cells(self, cell: Tensor) -> Cells:
+        edges = self.edges.expand(len(cell), *self.edges.shape).contiguous()
+        return Cells(edges, self.log_weight[cell])
+
+
+class NoisePosterior(Distribution):
+    r"""Posterior of standard deviations and at most one shared parameter.
+
+    .. math::
+        p(\sigma_1, \ldots, \sigma_c, \psi | D) =
+        p(\psi | D) \prod_i p(\sigma_i | \psi, D)
+
+    Args:
+        sd: Standard deviations given the cell of the shared parameter.
+        shared: Of the shared parameter :math:`\psi`, its cells and weights (shape
+            (cells,)); None where there is none.
+    """
+
+    arg_constraints: dict[str, Any] = {}  # pyright: ignore
+
+    def __init__(self, sd: ConditionalSd, *, shared: Cells | None = None) -> None:
+        self.sd, self.shared = sd, shared
+        num = sd.num_channels + (shared is not None)
+        super().__init__(torch.Size(), torch.Size([num]), validate_args=False)
+
+    @property
+    def support(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Positive numbers."""
+        return constraints.independent(constraints.positive, 1)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore
+        """Return draws from torch's global generator, shape (*sample_shape, p)."""
+        shape = (*sample_shape, *self.event_shape)
+        uniform = torch.rand(shape, dtype=torch.float64).reshape(-1, shape[-1])
+        return self.quantile(uniform).reshape(shape)
+
+    def quantile(self, uniform: Tensor) -> Tensor:
+        """Return the draws that belong to uniform numbers, (n, p) -> (n, p)."""
+        c = self.sd.num_channels
+        # torch.rand may give 0, where a standard deviation would be 0
+        uniform = uniform.clamp(1e-16, 1 - 1e-16)
+        cell = torch.zeros(len(uniform), dtype=torch.long)
+        if self.shared is None:
+            return self.sd.quantile(cell, uniform)
+        cell, value = self._shared(len(uniform)).quantile(uniform[:, c])
+        sd = self.sd.quantile(cell, uniform[:, :c])
+        return torch.cat([sd, value[:, None]], 1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return log densities, (..., p) -> (...)."""
+        shape, c = value.shape[:-1], self.sd.num_channels
+        value = value.double().reshape(-1, value.shape[-1])
+        cell = torch.zeros(len(value), dtype=torch.long)
+        if self.shared is None:
+            return self.sd.log_prob(cell, value).reshape(shape)
+        cell, log_p = self._shared(len(value)).log_prob(value[:, c])
+        return (log_p + self.sd.log_prob(cell, value[:, :c])).reshape(shape)
+
+    def _shared(self, num: int) -> Cells:
+        assert self.shared is not None
+        edges, weight = self.shared.edges, self.shared.log_weight
+        return Cells(
+            edges.expand(num, -1).contiguous(), weight.expand(num, -1).contiguous()
+        )
+
+
+def log_student_evidence(
+    square: Tensor, count: Tensor, sd: InverseChiSquare, *, cell: int
+) -> Tensor:
+    r"""Integrate a Gaussian's standard deviation out.
+
+    .. math::
+        \int \prod_{j=1}^{m} N(e_j; 0, \sigma^2) \, p(\sigma) \, d\sigma =
+        \frac{\Gamma(\frac{\nu + m}{2})}{\Gamma(\frac{\nu}{2}) (\pi \nu s^2)^{m / 2}}
+        \left( 1 + \frac{\sum_j e_j^2}{\nu s^2} \right)^{-\frac{\nu + m}{2}}
+
+    Args:
+        square: Sum of squares, shape (n, channels).
+        count: Their number m, alike.
+        sd: Posterior of the standard deviations.
+        cell: Of the shared parameter.
+
+    Returns:
+        Shape (n, channels), nats.
+    """
+    freedom = sd.freedom.to(square)
+    total = freedom * sd.variance[cell].to(square)
+    return (
+        torch.lgamma(0.5 * (freedom + count))
+        - torch.lgamma(0.5 * freedom)
+        - 0.5 * count * torch.log(math.pi * total)
+        - 0.5 * (freedom + count) * torch.log1p(square / total)
+    )

@@ -1,0 +1,283 @@
+import os
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from joblib import Parallel, delayed
+from joblib.externals.loky import get_reusable_executor
+
+from sbi_active import (
+    AutocorrelatedNoise,
+    GaussianNoise,
+    SimulatorModel,
+    estimate_noise,
+)
+from sbi_active.seeding import row_normals, row_seeds
+from sbi_active.simulation.model import takes_seeds
+
+THETA = torch.tensor([[1.0, 2.0], [3.0, -1.0], [0.5, 0.0]])
+ACTION = torch.tensor([[2.0], [1.0], [-1.0]])
+SEEDS = row_seeds(0, 3)
+
+
+def line(theta, action, *, drag=0.0, tilt=0.0):
+    drag, tilt = (torch.as_tensor(e).reshape(-1, 1) for e in (drag, tilt))
+    return theta[:, :1] + theta[:, 1:] * action - drag * action**2 + tilt
+
+
+def line_row(theta, action, rng, *, drag=0.0, tilt=0.0):
+    assert isinstance(theta, np.ndarray)
+    assert theta.dtype == action.dtype == np.float64
+    assert isinstance(rng, np.random.Generator)
+    return theta[0] + theta[1] * action - drag * action**2 + tilt
+
+
+def noisy_row(theta, action, rng):
+    return theta + action + rng.normal(size=2)
+
+
+def noisy(theta, action, seeds):
+    return theta + action + row_normals(seeds, 2)
+
+
+@pytest.fixture(params=["batched", "rows"])
+def model(request):
+    batched = request.param == "batched"
+    fn = line if batched else line_row
+    return SimulatorModel(fn, noise=GaussianNoise(0.1), batched=batched)
+
+
+def test_mean_and_density_of_batches_and_rows(model):
+    mean = model.mean(THETA, ACTION)
+    assert mean[:, 0].tolist() == pytest.approx([5.0, 2.0, 0.5])
+    x = mean + 0.1
+    expected = 3 * [-0.5 - np.log(0.1 * np.sqrt(2 * np.pi))]
+    assert model.log_prob(x, THETA, ACTION).tolist() == pytest.approx(expected, 1e-5)
+    assert model.is_batched == (model.fn is line)
+    assert model.is_deterministic(THETA, ACTION)
+
+
+def test_effects_are_numbers_or_one_a_row(model):
+    assert model.effect_names == ("drag", "tilt")
+    mean = model.mean(THETA, ACTION)
+    dragged = model.mean(THETA, ACTION, drag=2.0)
+    assert torch.allclose(dragged, mean - 2.0 * ACTION**2)
+    own = torch.tensor([0.0, 1.0, 3.0])
+    both = model.mean(THETA, ACTION, drag=own, tilt=1.0)
+    assert torch.allclose(both, mean - own[:, None] * ACTION**2 + 1)
+    x = model(THETA, ACTION, SEEDS, drag=2.0)
+    assert torch.allclose(x - dragged, model(THETA, ACTION, SEEDS) - mean, atol=1e-6)
+    density = model.log_prob(x, THETA, ACTION, drag=2.0)
+    assert (density > model.log_prob(x, THETA, ACTION)).all()
+    with pytest.raises(TypeError, match="keyword arguments of fn, 'drag', 'tilt'; got"):
+        model(THETA, ACTION, SEEDS, friction=1.0)
+    with pytest.raises(ValueError, match=r"expected drag as a number or one a row, s"):
+        model.mean(THETA, ACTION, drag=torch.ones(2))
+
+
+def test_functions_without_effects_and_with_any():
+    with pytest.raises(TypeError, match="keyword arguments of fn, none; got 'drag'"):
+        SimulatorModel(noisy)(THETA, ACTION, SEEDS, drag=1.0)
+    anything = SimulatorModel(lambda t, a, **effects: t + effects.get("push", 0))
+    assert torch.equal(anything(THETA, ACTION, push=1), THETA + 1)
+    assert SimulatorModel(torch.add).effect_names == ()
+    assert torch.equal(SimulatorModel(torch.add)(THETA, ACTION), THETA + ACTION)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        SimulatorModel(noisy),
+        SimulatorModel(noisy_row, batched=False),
+        SimulatorModel(noisy, noise=GaussianNoise(1.0)),
+        SimulatorModel(line_row, batched=False, noise=GaussianNoise(1.0)),
+    ],
+)
+def test_rows_depend_on_their_seeds_alone(model):
+    assert takes_seeds(model)
+    x = model(THETA, ACTION, SEEDS)
+    order = torch.tensor([2, 0])
+    assert torch.equal(model(THETA[order], ACTION[order], SEEDS[order]), x[order])
+    assert not torch.equal(model(THETA, ACTION, SEEDS + 1), x)
+    torch.manual_seed(4)
+    first = model(THETA, ACTION)
+    torch.manual_seed(4)
+    assert torch.equal(model(THETA, ACTION), first)
+    assert not torch.equal(model(THETA, ACTION), first)
+
+
+def test_own_randomness_and_noise_are_independent():
+    num = 20_000
+    model = SimulatorModel(noisy, noise=GaussianNoise(1.0))
+    zero = torch.zeros(num, 2)
+    x = model(zero, zero[:, :1], row_seeds(0, num)).double()
+    # Variance 2, where the same numbers twice would give 4.
+    assert ((x.var(0) / 2 - 1).abs() < 4 * (2 / num) ** 0.5).all()
+
+
+def test_a_random_function_has_no_mean():
+    for model in (
+        SimulatorModel(noisy, noise=GaussianNoise(1.0)),
+        SimulatorModel(noisy_row, batched=False, noise=GaussianNoise(1.0)),
+        SimulatorModel(lambda t, a: torch.randn_like(t), noise=GaussianNoise(1.0)),
+    ):
+        assert not model.is_deterministic(THETA, ACTION)
+        with pytest.raises(ValueError, match="got different outputs from two seeds"):
+            model.mean(THETA, ACTION)
+        with pytest.raises(ValueError, match="so that noise would count twice"):
+            model.log_prob(THETA, THETA, ACTION)
+
+
+def test_determinism_is_looked_up_once_and_leaves_the_generator_alone():
+    calls = []
+
+    def fn(theta, action):
+        calls.append(len(theta))
+        torch.rand(3)
+        return theta
+
+    model = SimulatorModel(fn, noise=GaussianNoise(1.0))
+    theta, action = torch.zeros(20, 1), torch.zeros(20, 1)
+    model.mean(theta, action)
+    model.mean(theta, action)
+    assert calls == [8, 8, 20, 20]
+    torch.manual_seed(1)
+    expected = torch.rand(1)
+    torch.manual_seed(1)
+    SimulatorModel(fn).is_deterministic(theta, action)
+    assert torch.equal(torch.rand(1), expected)
+
+
+def test_invalid_rows_stay_so_and_are_no_randomness():
+    model = SimulatorModel(
+        lambda t, a: torch.where(t > 0, t, torch.nan), noise=GaussianNoise(1.0)
+    )
+    assert model.is_deterministic(THETA, ACTION)
+    x = model(THETA, ACTION, SEEDS)
+    assert torch.equal(x.isnan(), THETA <= 0)
+    assert torch.equal(model.log_prob(x, THETA, ACTION).isfinite(), torch.ones(3) > 0)
+
+
+def test_sample_times_reach_the_noise():
+    times = torch.tensor([0.0, 0.3, 1.0])
+    noise = AutocorrelatedNoise(1.0, 0.5)
+    model = SimulatorModel(
+        lambda t, a: torch.zeros(len(t), 3), noise=noise, sample_times=times
+    )
+    x = torch.randn(3, 3)
+    expected = noise.log_prob(x, torch.zeros(3, 3), times=times)
+    assert torch.equal(model.log_prob(x, THETA, ACTION), expected)
+    assert torch.equal(model.noise.log_prob(x, torch.zeros(3, 3)), expected)
+    assert noise.times is None
+
+
+def setup():
+    return {"pid": os.getpid(), "mark": np.random.default_rng().random()}
+
+
+def with_context(theta, action, rng, context):
+    return np.array([context["pid"], context["mark"]])
+
+
+def run_in_worker(model):
+    row = torch.zeros(1, 1)
+    return os.getpid(), model(row, row)[0].tolist()
+
+
+def test_setup_runs_once_a_process():
+    model = SimulatorModel(with_context, batched=False, setup=setup)
+    assert model.effect_names == ()
+    here = model(THETA, ACTION)
+    assert here[:, 0].tolist() == 3 * [os.getpid()]
+    assert here.unique(dim=0).shape[0] == 1
+    assert torch.equal(model(THETA, ACTION), here)
+    again = pickle.loads(pickle.dumps(model))
+    assert torch.equal(again(THETA, ACTION), here)
+    other = SimulatorModel(with_context, batched=False, setup=setup)
+    assert other(THETA, ACTION)[0, 1] != here[0, 1]
+
+
+@pytest.mark.slow
+def test_setup_runs_once_a_worker():
+    model = SimulatorModel(with_context, batched=False, setup=setup)
+    results = Parallel(n_jobs=2)(delayed(run_in_worker)(model) for _ in range(8))
+    get_reusable_executor().shutdown(wait=True)
+    for pid, (seen, _) in results:
+        assert pid == seen != os.getpid()
+    marks = {(pid, mark) for pid, (_, mark) in results}
+    assert len(marks) == len({pid for pid, _ in marks})
+
+
+def test_setup_without_context_is_an_error():
+    with pytest.raises(ValueError, match="expected fn to take what setup returns"):
+        SimulatorModel(line, setup=setup)
+
+
+def test_models_with_estimated_noise_are_picklable():
+    noise = estimate_noise(torch.randn(4, 1))
+    model = pickle.loads(pickle.dumps(SimulatorModel(line, noise=noise)))
+    x = torch.randn(3, 1)
+    assert torch.equal(
+        model.log_prob(x, THETA, ACTION),
+        SimulatorModel(line, noise=noise).log_prob(x, THETA, ACTION),
+    )
+
+
+def test_exceptions_of_a_row_pass():
+    def fails(theta, action, rng):
+        raise FloatingPointError("unstable")
+
+    with pytest.raises(FloatingPointError, match="unstable"):
+        SimulatorModel(fails, batched=False)(THETA, ACTION)
+
+
+@pytest.mark.parametrize("sd", [0.0, 1.0])
+def test_rows_that_raise_do_not_hide_whether_the_others_are_random(sd):
+    def unstable(theta, action, rng):
+        if theta[0] > 2:
+            raise FloatingPointError("unstable")
+        return theta + sd * rng.normal(size=2)
+
+    model = SimulatorModel(unstable, batched=False, noise=GaussianNoise(1.0))
+    assert model.is_deterministic(THETA, ACTION) == (sd == 0)
+    with pytest.raises(FloatingPointError, match="unstable"):
+        SimulatorModel(unstable, batched=False).is_deterministic(THETA[1:2], ACTION[:1])
+
+
+NAN = torch.tensor([[1.0, torch.nan], [0, 0], [0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("run", "text"),
+    [
+        (lambda m: m(THETA[:2], ACTION), r"as many rows; got \(2, 2\) and \(3, 1\)"),
+        (lambda m: m(THETA[0], ACTION), "expected theta"),
+        (lambda m: m(NAN, ACTION), r"finite theta; got \[1.0, nan\] in row 0"),
+        (lambda m: m(THETA, ACTION / 0), "expected finite action; got"),
+        (lambda m: m(THETA[:, :1], ACTION), "expected 2 parameters, a, b; got theta"),
+    ],
+)
+def test_bad_input(run, text):
+    for batched, fn in ((True, line), (False, line_row)):
+        model = SimulatorModel(fn, batched=batched, parameter_names=["a", "b"])
+        with pytest.raises(ValueError, match=text):
+            run(model)
+
+
+@pytest.mark.parametrize(
+    ("fn", "options", "text"),
+    [
+        (lambda t, a: t[:1], {}, r"expected x with one row a parameter set"),
+        (lambda t, a: 3.0, {}, r"expected x with one row a parameter set"),
+        (line, {"channel_names": ["x", "y"]}, "expected 2 channels, x, y; got x of"),
+        (
+            lambda t, a, rng: np.zeros(1 + int(t[0])),
+            {"batched": False},
+            r"expected rows of one shape, \(2,\); got \(4,\) in row 1",
+        ),
+    ],
+)
+def test_bad_output(fn, options, text):
+    with pytest.raises(ValueError, match=text):
+        SimulatorModel(fn, **options)(THETA, ACTION)

@@ -1,0 +1,235 @@
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch.distributions import Independent, LogNormal
+
+from sbi_active import AutocorrelatedNoise, GaussianNoise, StudentTNoise
+from sbi_active.seeding import row_seeds
+
+SD = torch.tensor([0.5, 2.0]).double()
+TIMES = torch.tensor([0.0, 0.1, 0.5, 0.6, 2.0]).double()
+NUM = 20_000
+
+NOISES = {
+    "gaussian": GaussianNoise(1.5),
+    "gaussian by channel": GaussianNoise(SD),
+    "autocorrelated": AutocorrelatedNoise(1.5, 0.7),
+    "autocorrelated by channel": AutocorrelatedNoise(SD, 0.7),
+    "student": StudentTNoise(1.5, 5.0),
+    "student by channel": StudentTNoise(SD, 5.0),
+}
+
+
+@pytest.fixture(params=NOISES.values(), ids=NOISES.keys())
+def noise(request):
+    return request.param.at(TIMES)
+
+
+def covariance(times, tau, sd):
+    times = np.asarray(times)
+    return sd**2 * np.exp(-np.abs(times[:, None] - times) / tau)
+
+
+def scipy_log_prob(noise, x):
+    """Log density of residuals (n, 5, 2), independent of the library."""
+    sd, shared = noise.sd.expand(2).numpy(), noise.parameters[-1].item()
+    total = np.zeros(len(x))
+    for c in range(2):
+        for i, column in enumerate(x[..., c].numpy()):
+            seen = ~np.isnan(column)
+            if not seen.any():
+                continue
+            if isinstance(noise, AutocorrelatedNoise):
+                cov = covariance(TIMES, shared, sd[c])[np.ix_(seen, seen)]
+                law = stats.multivariate_normal(np.zeros(seen.sum()), cov)
+                total[i] += law.logpdf(column[seen])
+            elif isinstance(noise, StudentTNoise):
+                scale = sd[c] * np.sqrt((shared - 2) / shared)
+                total[i] += stats.t(shared, 0, scale).logpdf(column[seen]).sum()
+            else:
+                total[i] += stats.norm(0, sd[c]).logpdf(column[seen]).sum()
+    return total
+
+
+def test_log_density_is_that_of_scipy_also_where_masked(noise):
+    x = 2 * torch.randn(40, 5, 2).double()
+    x[torch.rand(40, 5, 2) < 0.3] = torch.nan
+    x[0] = torch.nan
+    mean = torch.full((1, 5, 2), 0.3).double()
+    log_prob = noise.log_prob(x, mean)
+    assert log_prob.dtype == torch.float64
+    assert log_prob.shape == (40,)
+    assert log_prob[0] == 0
+    assert log_prob.numpy() == pytest.approx(scipy_log_prob(noise, x - mean))
+
+
+def test_samples_have_the_declared_moments(noise):
+    x = noise.sample(torch.ones(NUM, 5, 2), row_seeds(0, NUM)).double() - 1
+    sd = noise.sd.expand(2)
+    # Var(s^2) = (kurtosis - 1) sd^4 / n; kurtosis is 3, of t with 5 df it is 9
+    kurtosis = 9 if isinstance(noise, StudentTNoise) else 3
+    error = 4 * ((kurtosis - 1) / NUM) ** 0.5
+    assert ((x.var(0) / sd**2 - 1).abs() < error).all()
+    tau = 0.7 if isinstance(noise, AutocorrelatedNoise) else 1e-9
+    expected = torch.from_numpy(covariance(TIMES, tau, 1.0)).float()
+    for c in range(2):
+        correlation = torch.corrcoef(x[..., c].T).float()
+        assert (correlation - expected).abs().max() < 4 * 3 / NUM**0.5
+
+
+def test_student_samples_follow_scipys_distribution():
+    noise = StudentTNoise(2.0, 3.0)
+    x = noise.sample(torch.zeros(NUM, 1).double(), row_seeds(1, NUM))[:, 0].numpy()
+    law = stats.t(3, 0, 2.0 / np.sqrt(3))
+    assert law.std() == pytest.approx(2.0)
+    assert stats.kstest(x, law.cdf).pvalue > 1e-3
+    gaussian = stats.norm(0, 2.0)
+    assert stats.kstest(x, gaussian.cdf).pvalue < 1e-3  # the test can tell
+
+
+def test_a_row_depends_on_its_seed_alone(noise):
+    seeds, mean = row_seeds(3, 8), torch.randn(8, 5, 2)
+    x = noise.sample(mean, seeds)
+    order = torch.tensor([5, 0, 3])
+    assert torch.equal(noise.sample(mean[order], seeds[order]), x[order])
+    assert not torch.equal(noise.sample(mean, seeds + 1), x)
+    torch.manual_seed(1)
+    first = noise.sample(mean)
+    torch.manual_seed(1)
+    assert torch.equal(noise.sample(mean), first)
+
+
+def test_no_mean_no_observation(noise):
+    mean = torch.zeros(2, 5, 2)
+    mean[1, 3, 0] = torch.nan
+    x = noise.sample(mean, row_seeds(0, 2))
+    assert torch.equal(x.isnan(), mean.isnan())
+    assert noise.log_prob(x, mean).isfinite().all()
+    assert noise.log_prob(torch.zeros(2, 5, 2), mean)[1] == -torch.inf
+    infinite = torch.zeros(2, 5, 2)
+    infinite[0, 2, 1] = torch.inf
+    log_prob = noise.log_prob(infinite, torch.zeros(2, 5, 2))
+    assert log_prob[0] == -torch.inf
+    assert log_prob[1].isfinite()
+
+
+def test_parameters_may_be_one_set_a_row(noise):
+    x, mean = torch.randn(3, 5, 2), torch.zeros(3, 5, 2)
+    sets = noise.parameters * torch.tensor([[1.0], [1.5], [2.0]])
+    together = noise.log_prob(x, mean, parameters=sets)
+    apart = [
+        noise.log_prob(x[i : i + 1], mean[:1], parameters=row)
+        for i, row in enumerate(sets)
+    ]
+    assert torch.allclose(together, torch.cat(apart))
+    assert together[0] == noise.log_prob(x, mean)[0]
+    drawn = noise.sample(mean, row_seeds(0, 3), parameters=sets)
+    assert torch.equal(drawn[0], noise.sample(mean, row_seeds(0, 3))[0])
+    assert not torch.equal(drawn[1], noise.sample(mean, row_seeds(0, 3))[1])
+
+
+def test_time_stamps_a_row_and_none():
+    noise = AutocorrelatedNoise(1.0, 2.0)
+    x, mean = torch.randn(2, 4), torch.zeros(2, 4)
+    stamps = torch.arange(4).double()
+    assert torch.equal(noise.log_prob(x, mean), noise.log_prob(x, mean, times=stamps))
+    own = torch.stack([stamps, 3 * stamps])
+    log_prob = noise.log_prob(x, mean, times=own)
+    assert log_prob[1] == noise.log_prob(x, mean, times=3 * stamps)[1]
+    assert log_prob[0] == noise.log_prob(x, mean)[0]
+    assert noise.at(3 * stamps).log_prob(x, mean)[1] == log_prob[1]
+
+
+def test_no_correlation_time_is_independent_noise():
+    x, mean = torch.randn(3, 6), torch.zeros(3, 6)
+    log_prob = AutocorrelatedNoise(1.3, 0.0).log_prob(x, mean)
+    assert torch.allclose(log_prob, GaussianNoise(1.3).log_prob(x, mean))
+
+
+@pytest.mark.parametrize("kind", [GaussianNoise, AutocorrelatedNoise, StudentTNoise])
+def test_any_posterior_is_averaged_over_fixed_draws(kind):
+    p = 1 if kind is GaussianNoise else 2
+    center = torch.tensor([0.0, 1.5])[:p]
+    posterior = Independent(LogNormal(center, 0.1 * torch.ones(p)), 1)
+    noise = kind(*center.exp(), posterior=posterior)
+    assert len(noise.parameter_names) == p
+    x, mean = torch.randn(4, 3), torch.zeros(4, 3)
+    log_prob = noise.log_prob(x, mean)
+    assert torch.equal(log_prob, noise.log_prob(x, mean))
+    draws = posterior.sample((20_000,))
+    exact = torch.stack(
+        [
+            noise.log_prob(
+                row.expand(len(draws), -1), mean[:1], parameters=draws
+            ).logsumexp(0)
+            for row in x
+        ]
+    ) - np.log(len(draws))
+    # 256 draws of sd to 10 %, slopes of log p to (x^2 - 1) per log sd
+    slope = ((x**2).sum(1) - 3).abs() + 3
+    assert ((log_prob - exact).abs() < 4 * 0.1 * slope / 16).all()
+    seeds = row_seeds(0, 4)
+    drawn = noise.sample(mean, seeds)
+    assert torch.equal(noise.sample(mean[2:], seeds[2:]), drawn[2:])
+    fixed = noise.sample(mean, seeds, parameters=noise.parameters)
+    ratio = (drawn / fixed)[:, 0]
+    assert ratio.unique().numel() == 4  # each row has a draw of its own
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: GaussianNoise(torch.ones(2, 2)), "a number or one a channel; got"),
+        (lambda: GaussianNoise(float("nan")), "expected a standard deviation >= 0"),
+        (lambda: AutocorrelatedNoise(1, -1), "expected a correlation time >= 0"),
+        (lambda: StudentTNoise(1, 2), "expected df > 2"),
+        (
+            lambda: GaussianNoise(SD).sample(torch.ones(3, 4)),
+            "one standard deviation a",
+        ),
+        (lambda: GaussianNoise(1).sample(torch.ones(3)), "expected outcomes of shape"),
+        (
+            lambda: AutocorrelatedNoise(SD, 1).sample(torch.ones(3, 2)),
+            "time before channels",
+        ),
+        (
+            lambda: AutocorrelatedNoise(1, 1).at(TIMES).sample(torch.ones(3, 4)),
+            "expected times of shape",
+        ),
+        (
+            lambda: AutocorrelatedNoise(1, 1).at(-TIMES).sample(torch.ones(3, 5)),
+            "expected times that increase",
+        ),
+        (
+            lambda: GaussianNoise(1).log_prob(torch.ones(3, 2), torch.ones(2, 2)),
+            "expected a mean broadcastable to x",
+        ),
+        (
+            lambda: GaussianNoise(0).log_prob(torch.ones(3, 2), torch.ones(3, 2)),
+            "expected a standard deviation > 0 for a density",
+        ),
+        (
+            lambda: GaussianNoise(1).sample(torch.ones(3, 2), parameters=torch.ones(2)),
+            r"expected parameters of shape \(1,\) or \(3, 1\), for sd; got \(2,\)",
+        ),
+        (
+            lambda: GaussianNoise(1).sample(
+                torch.ones(3, 2), parameters=-torch.ones(1)
+            ),
+            "expected a standard deviation >= 0",
+        ),
+    ],
+)
+def test_errors(make, text):
+    with pytest.raises(ValueError, match=text):
+        make()
+
+
+def test_repr_names_the_parameters():
+    assert repr(StudentTNoise(1.0, 4.0)) == "StudentTNoise(sd=1.0, df=4.0)"
+    assert NOISES["autocorrelated by channel"].parameter_names == (
+        "sd_1",
+        "sd_2",
+        "correlation_time",
+    )

@@ -1,0 +1,228 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from sbi_active import (
+    AutocorrelatedNoise,
+    GaussianNoise,
+    StudentTNoise,
+    estimate_noise,
+)
+from sbi_active.seeding import row_seeds
+
+SETS = 400
+
+
+def binomial_error(level, num):
+    return 3 * math.sqrt(level * (1 - level) / num)
+
+
+def coverage(inside):
+    return np.mean(inside), binomial_error(0.9, len(inside))
+
+
+@pytest.mark.parametrize("num_repeats", [3, 5, 10])
+def test_posterior_over_sd_covers(num_repeats):
+    truth = torch.tensor([0.2, 3.0]).double()
+    center = torch.tensor([1.0, -4.0]).double()
+    inside, plugged = [], []
+    for seed in range(SETS):
+        mean = center.expand(num_repeats, 2)
+        x = GaussianNoise(truth).sample(mean, row_seeds(seed, num_repeats))
+        noise = estimate_noise(x)
+        level = torch.tensor([[0.05, 0.05], [0.95, 0.95]]).double()
+        low, high = noise.posterior.quantile(level)
+        inside.append(bool((low[0] < truth[0]) & (truth[0] < high[0])))
+        # An interval of 90 % for the next measurement, the estimate plugged in:
+        # too narrow, which shows that this test can fail.
+        new = GaussianNoise(truth).sample(center[None], row_seeds(seed + SETS, 1))
+        plugged.append(bool(((new - x.mean(0)) / noise.sd).abs()[0, 0] < 1.645))
+    share, error = coverage(inside)
+    assert abs(share - 0.9) < error
+    assert num_repeats > 3 or coverage(plugged)[0] < 0.9 - error
+
+
+def test_posterior_is_the_scaled_inverse_chi_square():
+    x = torch.tensor([[1.0, 2.0], [2.0, 2.5], [4.0, 1.0]]).double()
+    posterior = estimate_noise(x).posterior
+    sd = torch.tensor([[0.7, 2.0], [1.5, 0.4]]).double()
+    variance = x.var(0).numpy()
+    # sigma^2 = 2 s^2 / chi^2_2: density over sigma by the change of variables
+    expected = [
+        (stats.invgamma(1, scale=variance).logpdf(s**2) + np.log(2 * s)).sum()
+        for s in sd.numpy()
+    ]
+    assert posterior.log_prob(sd).numpy() == pytest.approx(np.array(expected))
+    draws = posterior.sample((20_000,))
+    assert draws.shape == (20_000, 2)
+    for c in range(2):
+        law = stats.invgamma(1, scale=variance[c])
+        assert stats.kstest(draws[:, c].square().numpy(), law.cdf).pvalue > 1e-3
+
+
+def test_marginal_of_gaussian_noise_is_a_student_t():
+    x = torch.tensor([[1.0], [2.0], [4.0], [2.2]]).double()
+    noise = estimate_noise(x)
+    row = torch.tensor([[2.0]]).double()
+    scale = x.std(0).item()
+    expected = stats.t(3, 0, scale).logpdf(2.0)
+    assert noise.log_prob(row, 0 * row).item() == pytest.approx(expected)
+    drawn = noise.sample(torch.zeros(20_000, 1).double(), row_seeds(0, 20_000))
+    law = stats.t(3, 0, scale)
+    assert stats.kstest(drawn[:, 0].numpy(), law.cdf).pvalue > 1e-3
+    # numbers that share one sd are dependent: a multivariate t
+    pooled = estimate_noise(torch.randn(5, 4), pooled=True)
+    assert pooled.parameter_names == ("sd",)
+    e = torch.randn(6, 4).double()
+    e[2, 1] = torch.nan
+    joint = pooled.log_prob(e, torch.zeros(6, 4))
+    sd = pooled.sd.item()
+    for row, value in zip(e, joint, strict=True):
+        seen = row[~row.isnan()].numpy()
+        law = stats.multivariate_t(
+            np.zeros(len(seen)), sd**2 * np.eye(len(seen)), df=16
+        )
+        assert value.item() == pytest.approx(law.logpdf(seen))
+
+
+def test_groups_have_means_of_their_own_and_nan_is_left_out():
+    first = torch.tensor([[1.0], [2.0], [torch.nan], [3.0]])
+    second = torch.tensor([[101.0], [103.0]])
+    noise = estimate_noise([first, second, torch.tensor([[7.0]])])
+    assert noise.sd.item() == pytest.approx(math.sqrt((2 + 2) / 3))
+    partly = torch.tensor([[1.0, 5.0], [2.0, torch.nan], [3.0, 6.0]])
+    sd = estimate_noise(partly).sd
+    assert sd.tolist() == pytest.approx([1.0, math.sqrt(0.5)])
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
+def test_autocorrelated_noise_recovers_rho(rho):
+    tau, step, sets = -0.02 / math.log(rho), 0.02, 100
+    times = step * torch.arange(50).double()
+    truth = AutocorrelatedNoise(2.0, tau).at(times)
+    level = torch.tensor([[0.05, 0.05], [0.5, 0.5], [0.95, 0.95]]).double()
+    inside, medians = [], []
+    for seed in range(sets):
+        x = truth.sample(torch.zeros(5, 50).double(), row_seeds(seed, 5))
+        noise = estimate_noise(x + times.sin(), kind="autocorrelated", times=times)
+        low, middle, high = torch.exp(-step / noise.posterior.quantile(level)[:, 1])
+        inside.append(bool((low < rho) & (rho < high)))
+        medians.append(middle.item())
+    share, error = coverage(inside)
+    assert abs(share - 0.9) < error
+    spread = np.std(medians)
+    assert abs(np.mean(medians) - rho) < 3 * spread / math.sqrt(sets) + 0.1 * spread
+    assert spread < 0.1
+
+
+@pytest.mark.slow
+def test_posterior_over_sd_covers_under_autocorrelation():
+    times = torch.arange(30).double()
+    truth = AutocorrelatedNoise(torch.tensor([2.0, 0.1]), 5.0).at(times)
+    inside = []
+    for seed in range(200):
+        x = truth.sample(torch.zeros(3, 30, 2).double(), row_seeds(seed, 3))
+        posterior = estimate_noise(x, kind="autocorrelated").posterior
+        torch.manual_seed(seed)
+        sd = posterior.sample((1000,))[:, 0]
+        low, high = sd.quantile(torch.tensor([0.05, 0.95]).double())
+        inside.append(bool((low < 2.0) & (high > 2.0)))
+    share, error = coverage(inside)
+    assert abs(share - 0.9) < error
+
+
+@pytest.mark.parametrize("kind", ["autocorrelated", "student"])
+def test_marginal_agrees_with_draws_of_the_posterior(kind):
+    truth = AutocorrelatedNoise(1.0, 3.0) if kind != "student" else StudentTNoise(1, 4)
+    x = truth.sample(torch.zeros(4, 12, 2).double(), row_seeds(1, 4))
+    x[1, 3, 0] = torch.nan
+    noise = estimate_noise(x, kind=kind)
+    assert len(noise.parameters) == noise.posterior.event_shape[0] == 3
+    e = truth.sample(torch.zeros(3, 12, 2).double(), row_seeds(9, 3))
+    e[0, 4:6, 1] = torch.nan
+    marginal = noise.log_prob(e, torch.zeros(1, 12, 2))
+    draws = noise.posterior.sample((20_000,))
+    for row, value in zip(e, marginal, strict=True):
+        terms = noise.log_prob(
+            row.expand(len(draws), 12, 2), torch.zeros(1, 12, 2), parameters=draws
+        )
+        weight = (terms - terms.max()).exp()
+        error = (weight.std() / weight.mean() / len(draws) ** 0.5).item()
+        average = terms.logsumexp(0).item() - math.log(len(draws))
+        # .03 nats for the width of the grid's cells
+        assert abs(value.item() - average) < 4 * error + 0.03
+
+
+@pytest.mark.parametrize("kind", ["autocorrelated", "student"])
+def test_posterior_density_is_that_of_its_draws(kind):
+    x = StudentTNoise(1, 4).sample(torch.zeros(6, 8).double(), row_seeds(1, 6))
+    posterior = estimate_noise(x, kind=kind, pooled=True).posterior
+    draws = posterior.sample((40_000,)).log()
+    low, high = draws.quantile(torch.tensor([0.2, 0.7]).double(), 0)
+    inside = ((draws > low) & (draws < high)).all(1).double().mean().item()
+    side = torch.linspace(0, 1, 201).double()
+    middle = 0.5 * (side[1:] + side[:-1])
+    axes = [low[i] + (high - low)[i] * middle for i in (0, 1)]
+    grid = torch.cartesian_prod(*axes)
+    density = posterior.log_prob(grid.exp()) + grid.sum(1)  # over logarithms
+    mass = density.exp().mean().item() * (high - low).prod().item()
+    assert abs(mass - inside) < 4 * math.sqrt(0.25 / 40_000) + 0.005
+
+
+def test_heavy_tails_are_recognized():
+    heavy = StudentTNoise(1.0, 3.0).sample(torch.zeros(6, 60), row_seeds(5, 6))
+    light = GaussianNoise(1.0).sample(torch.zeros(6, 60), row_seeds(5, 6))
+    quantile = torch.tensor([[0.05, 0.05], [0.95, 0.95]]).double()
+    for x, low, high in ((heavy, 2.05, 6.0), (light, 8.0, 101.0)):
+        noise = estimate_noise(x, kind="student", pooled=True)
+        interval = noise.posterior.quantile(quantile)[:, 1]
+        assert low <= interval[0]
+        assert interval[1] < high
+
+
+@pytest.mark.slow
+def test_posterior_over_students_sd_covers():
+    inside = []
+    for seed in range(200):
+        x = StudentTNoise(1.0, 5.0).sample(torch.zeros(4, 10), row_seeds(seed, 4))
+        posterior = estimate_noise(x, kind="student", pooled=True).posterior
+        torch.manual_seed(seed)
+        low, high = posterior.sample((1000,))[:, 0].quantile(
+            torch.tensor([0.05, 0.95]).double()
+        )
+        inside.append(bool((low < 1.0) & (high > 1.0)))
+    share, error = coverage(inside)
+    assert abs(share - 0.9) < error
+
+
+def test_two_repeats_are_warned_of():
+    with pytest.warns(UserWarning, match="at least 3 repeats to estimate noise; got 2"):
+        estimate_noise(torch.tensor([[1.0], [2.0]]))
+
+
+@pytest.mark.parametrize(
+    ("repeats", "options", "text"),
+    [
+        (torch.ones(1, 3), {}, "expected at least 2 repeats of one action; got 1"),
+        (torch.full((3, 2), torch.nan), {}, "at least 2 repeats of one action; got 0"),
+        (torch.ones(3, 2), {}, r"expected repeats that differ; got identical ones in "),
+        (
+            torch.tensor([[1.0, torch.nan], [2.0, torch.nan], [3.0, 1.0]]),
+            {},
+            r"at least 2 repeats of every channel; got none for channels \[1\]",
+        ),
+        (
+            [torch.rand(3, 2), torch.rand(3, 3)],
+            {},
+            r"expected repeats of shape \(k, \*x_shape\), or groups of such; got",
+        ),
+        (torch.rand(3, 2), {"kind": "normal"}, "expected kind among 'gaussian'"),
+        (torch.rand(3, 2), {"kind": "autocorrelated"}, "at least 3 samples; got x"),
+    ],
+)
+def test_errors(repeats, options, text):
+    with pytest.raises(ValueError, match=text):
+        estimate_noise(repeats, **options)
