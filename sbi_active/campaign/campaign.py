@@ -171,12 +171,13 @@ class Campaign:
         """Record the outcome of a trial and return at once.
 
         Args:
-            x: The outcome, shape x_shape; NaN throughout makes the trial "invalid".
+            x: The outcome, shape x_shape; NaN throughout makes the trial "invalid", NaN
+                in part of it says that these numbers were not observed.
             trial: The trial or its index; None is the pending one, or a new trial
                 where none is pending and ``action`` is given.
             action: The executed action where it is not the one asked for.
-            status: "ok", "invalid" (it ran and gave no measurement) or "missing" (a
-                fault unrelated to the parameters).
+            status: "ok", "invalid" (it ran and gave no measurement, which tells about
+                the parameters) or "missing" (a fault unrelated to them).
 
         Returns:
             The recorded trial. Telling the same outcome again changes nothing.
@@ -267,18 +268,21 @@ class Campaign:
                     trial.x,
                     action=trial.action,
                     simulator=self.simulator if options.refine else None,
-                    refinement=options.refinement,
+                    refinement=replace(options.refinement, **options.engine),
                     seed=derive_seed(seed, "refine", trial.index),
                 )
             gained = information_gained(
                 belief, before, seed=derive_seed(seed, "gain", trial.index)
             )
-        spent = getattr(belief, "diagnostics", {}).get("num_simulations", 0)
+        diagnostics, trial = belief.diagnostics, self.state.trials[trial.index]
         self._round_ready = False
         self._change(
             trial.index,
             information_gained=gained,
-            num_simulations=self.state.trials[trial.index].num_simulations + spent,
+            num_simulations=(
+                trial.num_simulations + diagnostics.get("num_simulations", 0)
+            ),
+            num_missing=trial.num_missing + diagnostics.get("num_missing", 0),
         )
 
     def _trained(self, index: int) -> Any:
@@ -292,16 +296,25 @@ class Campaign:
                     (options.num_simulations,), seed=derive_seed(seed, "action", index)
                 )
                 rows = simulate(
-                    self.simulator, theta, action, seed=derive_seed(seed, "x", index)
+                    self.simulator,
+                    theta,
+                    action,
+                    seed=derive_seed(seed, "x", index),
+                    **options.engine,
                 )
+                known = rows.without_missing()
             with self._stage(index, "training"):
                 self._inference.append_simulations(
-                    rows.theta, rows.x, action=rows.action, belief=self.belief
+                    known.theta, known.x, action=known.action, belief=self.belief
                 )
                 with forked_generators(seed, "train", index):
                     self._inference.train()
-            spent = self.state.trials[index].num_simulations + len(rows)
-            self._change(index, num_simulations=spent)
+            trial = self.state.trials[index]
+            self._change(
+                index,
+                num_simulations=trial.num_simulations + len(rows),
+                num_missing=trial.num_missing + rows.counts["missing"],
+            )
             self._round_ready = True
         return self._inference.build_posterior()
 
@@ -317,6 +330,7 @@ class Campaign:
             action,
             seed=derive_seed(seed, "probe", 1),
             check_noise=True,
+            **self.state.options.engine,
         )
         return rows.x.shape[1:]
 
@@ -341,9 +355,9 @@ class Campaign:
     def _outcome(self, x: Any, status: Status) -> Tensor | None:
         if status == "missing":
             return None
+        if status == "invalid":  # numbers told along with it are no measurement
+            return torch.full(self._x_shape, torch.nan)
         if x is None:
-            if status == "invalid":
-                return torch.full(self._x_shape, torch.nan)
             raise ValueError(
                 "expected the outcome x; got None; do tell(x), or tell(status=...) "
                 "with 'invalid' or 'missing' where there is none"

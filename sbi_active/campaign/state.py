@@ -30,7 +30,13 @@ class CampaignOptions:
         eliminate: Whether candidates far behind the leader get no further samples.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
-        refinement: Settings of the refinement.
+        refinement: Settings of the refinement; those of its simulations are taken from
+            here.
+        num_workers: Of the simulations of training and refinement, see
+            :func:`~sbi_active.simulation.simulate`.
+        time_limit: Seconds a simulated row may take; None waits for ever. With it, or
+            with more than one worker, a simulator that ends its process costs a row.
+        num_retries: How often a row that a fault lost is tried again.
     """
 
     num_simulations: int = 5_000
@@ -40,6 +46,18 @@ class CampaignOptions:
     eliminate: bool = True
     refine: bool = True
     refinement: Refinement = Refinement()
+    num_workers: int = 1
+    time_limit: float | None = None
+    num_retries: int = 0
+
+    @property
+    def engine(self) -> dict[str, Any]:
+        """Options of :func:`~sbi_active.simulation.simulate`."""
+        return {
+            "num_workers": self.num_workers,
+            "time_limit": self.time_limit,
+            "num_retries": self.num_retries,
+        }
 
     @classmethod
     def faithful(cls) -> CampaignOptions:
@@ -82,6 +100,8 @@ class Trial:
         seconds: Wall time by stage.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
+        num_missing: Those of them lost to faults of the simulator, in training and
+            refinement.
     """
 
     index: int
@@ -93,6 +113,7 @@ class Trial:
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
     num_simulations: int = 0
+    num_missing: int = 0
 
 
 @dataclass

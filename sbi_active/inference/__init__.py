@@ -5,7 +5,8 @@ from sbi_active.inference.belief import Belief, ChainedBelief, information_gaine
 from sbi_active.inference.condition import ActionEmbedding
 from sbi_active.inference.mixture_density import MixtureDensity, MixtureDensityNetwork
 from sbi_active.inference.posterior import ActionPosterior
-from sbi_active.inference.refine import RefinedBelief, Refinement, refine
+from sbi_active.inference.refine import Refinement, refine
+from sbi_active.inference.refined_belief import RefinedBelief
 from sbi_active.inference.rounds import Observation
 
 __all__ = [

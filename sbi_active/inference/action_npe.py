@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
@@ -34,21 +33,15 @@ from sbi_active.inference.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.posterior import ActionPosterior
 from sbi_active.inference.rounds import Observation, check_proposal, round_rows
 from sbi_active.inference.tracking import SilentTracker
+from sbi_active.inference.train_arguments import (
+    NPE_DEFAULTS,
+    action_arguments,
+    given_arguments,
+)
 from sbi_active.inference.training import TrainingBudget, train_mixture_density
 from sbi_active.threads import single_thread
 
 __all__ = ["ActionNPE"]
-
-_NPE_DEFAULTS = {
-    name: parameter.default
-    for name, parameter in inspect.signature(NPE_C.train).parameters.items()
-    if parameter.default is not inspect.Parameter.empty
-}
-_NONE_IS_THE_DEFAULT = (
-    *("num_atoms", "training_batch_size", "learning_rate", "validation_fraction"),
-    *("stop_after_epochs", "max_num_epochs"),
-)
-_NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
 
 
 class ActionNPE(NPE_C):
@@ -137,9 +130,11 @@ class ActionNPE(NPE_C):
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             proposal: Without actions as in sbi. With them, None, the belief itself or
                 sbi's ``RestrictedPrior`` of it.
-            exclude_invalid_x: With actions, None keeps invalid rows as information for
-                :class:`MixtureDensity` and drops them for sbi's networks, which cannot
-                take them; True drops them.
+            exclude_invalid_x: With actions, None keeps rows with NaN as information
+                for :class:`MixtureDensity`, and drops them for sbi's networks, which
+                cannot take them, with a warning. True drops them: information gain is
+                then biased towards actions that fail, since what failures tell about
+                theta is lost and what is left is all success.
             data_device: Where to keep the rows.
             action: Shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.
@@ -199,6 +194,7 @@ class ActionNPE(NPE_C):
             exclude_invalid=(
                 not keeps_invalid if exclude_invalid_x is None else exclude_invalid_x
             ),
+            may_be_invalid=bool(self.trials),
         )
         self._action_dim = rows.action.shape[1]
         self._outcome_shape = rows.x.shape[1:]
@@ -224,7 +220,7 @@ class ActionNPE(NPE_C):
         validation_fraction: float | None = None,
         stop_after_epochs: int | None = None,
         max_num_epochs: int | None = None,
-        clip_max_norm: float | None = _NPE_DEFAULTS["clip_max_norm"],
+        clip_max_norm: float | None = NPE_DEFAULTS["clip_max_norm"],
         calibration_kernel: Callable | None = None,
         resume_training: bool = False,
         force_first_round_loss: bool = False,
@@ -250,43 +246,22 @@ class ActionNPE(NPE_C):
             RuntimeError: If there are no simulations.
             ValueError: If an argument has no meaning in a round with actions.
         """
-        given = {
-            name: value
-            for name, value in locals().items()
-            if name in _NPE_DEFAULTS
-            and not (value is None and name in _NONE_IS_THE_DEFAULT)
-        }
-        arguments: dict[str, Any] = {**_NPE_DEFAULTS, **given}
+        given = given_arguments(locals())
         if not self.has_actions:
-            return super().train(**arguments)
+            return super().train(**{**NPE_DEFAULTS, **given})
         if resume_training and self._trained_round != max(self._data_round_index):
             raise ValueError(
                 "expected resume_training after train() on the same rows; got rows "
                 "appended since; do train() without resume_training"
             )
-        for name in _NO_MEANING_WITH_ACTION:
-            if arguments[name] != _NPE_DEFAULTS[name]:
-                raise ValueError(
-                    f"expected {name} to be left out in a round with actions, which is "
-                    f"trained by maximum likelihood; got {arguments[name]}; do drop it"
-                )
         settings = self._action_estimator
-        if isinstance(settings, MixtureDensity):
-            defaults = {
-                "training_batch_size": settings.batch_size,
-                "learning_rate": settings.learning_rate,
-            }
-            arguments = {**arguments, **defaults, **given}
-            self._epoch_limit = given.get("max_num_epochs")
-            self._patience = given.get("stop_after_epochs")
-        for name in ("num_atoms", "use_combined_loss"):
-            del arguments[name]
-        arguments["force_first_round_loss"] = True
-        arguments["retrain_from_scratch"] = not resume_training
+        lean = isinstance(settings, MixtureDensity)
+        arguments = action_arguments(given, settings if lean else None)
+        self._epoch_limit = given.get("max_num_epochs")
+        self._patience = given.get("stop_after_epochs")
         self._kernel = calibration_kernel
         # NPE_C.train would choose a multi-round loss here; its parent's train is plain
         # maximum likelihood on the rows that _get_start_index names.
-        lean = isinstance(settings, MixtureDensity)
         with single_thread() if lean else nullcontext():
             network = PosteriorEstimatorTrainer.train(self, **arguments)
         self._trained_round = self._round

@@ -14,10 +14,17 @@ from sbi.neural_nets.estimators.base import (
 from torch import Tensor
 
 from sbi_active.inference.action_npe import ActionNPE
-from sbi_active.inference.belief import Belief, ChainedBelief, require_support
+from sbi_active.inference.belief import (
+    Belief,
+    ChainedBelief,
+    UnchangedBelief,
+    require_support,
+)
 from sbi_active.inference.comparison import compare
 from sbi_active.inference.condition import action_rows, outcome_rows, pack
+from sbi_active.inference.mixture_density import MixtureDensityNetwork
 from sbi_active.inference.refine import Refinement, refine
+from sbi_active.inference.refined_belief import RefinedBelief
 from sbi_active.inference.rounds import Observation
 
 __all__ = ["ASBI"]
@@ -84,8 +91,16 @@ class ASBI(ActionNPE):
         (:func:`~sbi_active.inference.refine.refine`). That needs no network; where one
         was trained in this round, ``belief.diagnostics`` compares the two.
 
+        NaN in x_o is information, as it is in the simulations: "no measurement" where
+        it is NaN throughout, else a number that was not observed. Where no simulation
+        of this round lacked those numbers, the network has never seen such an outcome
+        and what it would say is arbitrary. Without a simulator the belief then stays
+        as it is, with a warning: that the outcome is rare all over the belief says
+        nothing about where it is less rare, so there is no reason to widen it either.
+
         Args:
-            x_o: The observed outcome, shape x_shape or (1, *x_shape).
+            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN where there
+                was no measurement.
             action: The executed action, shape (action_dim,) or (1, action_dim); it need
                 not be one of the actions that were asked for.
             simulator: ``simulator(theta, action)`` to refine with.
@@ -93,19 +108,16 @@ class ASBI(ActionNPE):
             seed: Of the refinement; None draws one from torch's global generator.
 
         Returns:
-            The belief, labelled "refined" or "chained approximation".
+            The belief, labelled "refined", "chained approximation" or "unchanged".
 
         Raises:
             RuntimeError: If there is no simulator and no network was trained since the
                 belief last changed.
-            ValueError: If shapes do not fit, or x_o has no measurement and no
-                simulation of this round had none either.
+            ValueError: If shapes do not fit.
         """
         trial = self._observation(x_o, action)
-        finite = bool(trial.x.isfinite().all())
-        needs_network = simulator is None or not finite
-        chained = self._chained(trial, required=needs_network)
-        if simulator is None or not finite:
+        chained = self._chained(trial, required=simulator is None)
+        if simulator is None:
             assert chained is not None
             belief: Belief = chained
         else:
@@ -130,9 +142,6 @@ class ASBI(ActionNPE):
             simulator: As in :meth:`update`.
             refinement: As in :meth:`update`.
             seed: As in :meth:`update`.
-
-        Raises:
-            ValueError: If no trial has a measurement.
         """
         belief = self._refined(
             [*trials], simulator, None, refinement, seed, reuse=False
@@ -157,8 +166,12 @@ class ASBI(ActionNPE):
             action_rows(action, self._action_dim, num_rows=1)[0], rows[0]
         )
 
-    def _chained(self, trial: Observation, *, required: bool) -> ChainedBelief | None:
-        """Return the network's value at the trial, None where there is no network."""
+    def _chained(self, trial: Observation, *, required: bool) -> Belief | None:
+        """Return the network's value at the trial.
+
+        It is None where there is no network, or it has never seen such an outcome; if
+        a belief is required, the first is an error and the second the belief before.
+        """
         network, previous = self._neural_net, self.belief
         if self._trained_round is None or network is None or previous is None:
             if not required:
@@ -168,10 +181,19 @@ class ASBI(ActionNPE):
                 "the last update() or append_simulations(); do append simulations of "
                 "the belief with action= and train() first"
             )
-        if required:
-            self._require_known(trial.x, network)
         condition = pack(trial.x[None], trial.action[None]).to(self._device)
         prior = require_support(self._prior)
+        if not _knows(network, condition):
+            if not required:
+                return None
+            warnings.warn(
+                f"the network has never seen an outcome like {trial.x.tolist()}: no "
+                "simulation it was trained on lacks these numbers, so the belief is "
+                "left unchanged. Refine with the simulator, simulate such outcomes as "
+                "NaN, or leave the trial out where a fault caused them.",
+                stacklevel=3,
+            )
+            return UnchangedBelief(prior, previous)
         with warnings.catch_warnings():
             if not required:  # refinement repairs what the network misses
                 warnings.simplefilter("ignore")
@@ -181,40 +203,35 @@ class ASBI(ActionNPE):
         self,
         trials: Sequence[Observation],
         simulator: Callable[..., Any],
-        chained: ChainedBelief | None,
+        chained: Belief | None,
         refinement: Refinement | None,
         seed: int | None,
         *,
         reuse: bool = True,
     ) -> Belief:
-        measured = [t for t in trials if bool(t.x.isfinite().all())]
-        if not measured:
-            raise ValueError(
-                f"expected a trial with a measurement; got {len(trials)} without; do "
-                "update with the trained network, which can use invalid outcomes"
-            )
+        previous = self._belief if reuse else None
+        # A chained belief can be wrong; the refined one before the trial holds the
+        # posterior, if only it is wide enough.
+        start = [] if chained is None else [chained]
+        if isinstance(previous, RefinedBelief):
+            start.append(previous)
         belief = refine(
             simulator,
             require_support(self._prior),
-            torch.stack([t.action for t in measured]),
-            torch.stack([t.x for t in measured]),
-            start=chained,
-            past=getattr(self._belief, "histories", None) if reuse else None,
+            torch.stack([t.action for t in trials]),
+            torch.stack([t.x for t in trials]),
+            start=start,
+            past=getattr(previous, "histories", None),
             settings=refinement,
             seed=int(torch.randint(2**62, ())) if seed is None else seed,
         )
-        belief.diagnostics["trials_left_out"] = len(trials) - len(measured)
-        if chained is not None:
+        if isinstance(chained, ChainedBelief):
             compare(belief, chained)
         return belief
 
-    @staticmethod
-    def _require_known(x: Tensor, network: ConditionalDensityEstimator) -> None:
-        """Raise where x has no measurement and the network never saw that."""
-        if bool(x.isfinite().all()) or getattr(network, "knows_invalid", False):
-            return
-        raise ValueError(
-            f"expected an outcome with a measurement; got {x.flatten().tolist()}, and "
-            "no simulation of this round had NaN, so the network knows nothing of it; "
-            "do leave the trial out, or simulate invalid outcomes as NaN"
-        )
+
+def _knows(network: ConditionalDensityEstimator, condition: Tensor) -> bool:
+    """Return whether rows like the condition, shape (1, c), were trained on."""
+    if isinstance(network, MixtureDensityNetwork):
+        return network.knows(condition)
+    return bool(condition.isfinite().all())  # sbi's networks take no NaN

@@ -19,6 +19,7 @@ from sbi_active.seeding import forked_generators
 __all__ = [
     "Belief",
     "ChainedBelief",
+    "UnchangedBelief",
     "information_gained",
     "parameter_dim",
     "require_support",
@@ -189,6 +190,27 @@ class ChainedBelief(Belief):
 
 #: Below this share of q inside the support, rejection is too wasteful.
 MINIMAL_ACCEPTANCE = 1e-3
+
+
+class UnchangedBelief(Belief):
+    """The belief before a trial that the network knows nothing of.
+
+    Args:
+        prior: The original prior.
+        previous: The belief before the trial.
+    """
+
+    label = "unchanged"
+
+    def __init__(self, prior: Distribution, previous: Distribution) -> None:
+        super().__init__(prior)
+        self.previous = previous
+
+    def _sample(self, num_samples: int) -> Tensor:
+        return self.previous.sample(torch.Size([num_samples]))
+
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        return self.previous.log_prob(theta)
 
 
 def information_gained(

@@ -73,6 +73,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         masks, columns = missing.unique(dim=1, return_inverse=True)
         masked = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
         masked = [column for column in masked if bool(missing[:, column].any())]
+        ever_missing, largest_gap = missing.any(0), int(missing.sum(1).max())
 
         conditioning = _conditioning(settings, theta, condition, action_dim)
         embedding = settings.embedding_net or nn.Identity()
@@ -93,6 +94,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         self._embedding: nn.Module = embedding
         self._num_components, self._dim = num, dim
         self._masked_columns = masked
+        self._ever_missing, self._largest_gap = ever_missing.cpu(), largest_gap
         self._sections = [num, num * dim, num * dim, num * dim * dim]
         with torch.no_grad():  # start near a broad mixture that ignores the condition
             last.weight.mul_(0.1)
@@ -116,10 +118,19 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
     def embedding_net(self) -> nn.Module:
         return self._embedding
 
-    @property
-    def knows_invalid(self) -> bool:
-        """Whether training rows held outcomes without a measurement."""
-        return bool(self._masked_columns)
+    def knows(self, condition: Tensor) -> bool:
+        """Return whether training rows lacked what conditions lack.
+
+        Each number that is missing must have been so in some row, and as many as are
+        missing must have been so at once.
+
+        Args:
+            condition: Shape (n, condition_dim).
+        """
+        missing = ~condition.isfinite().cpu()
+        unheard = missing & ~self._ever_missing
+        gap = int(missing.sum(1).max())
+        return not bool(unheard.any()) and gap <= self._largest_gap
 
     @property
     def num_frames(self) -> int:

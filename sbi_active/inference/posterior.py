@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from abc import abstractmethod
 from copy import deepcopy
 from typing import Any
 
@@ -13,6 +15,7 @@ from sbi.sbi_types import Shape
 from torch import Tensor, nn
 
 from sbi_active.inference.condition import action_rows, outcome_rows, pack
+from sbi_active.inference.mixture_network import MixtureDensityNetwork
 
 __all__ = ["ActionPosterior"]
 
@@ -58,7 +61,8 @@ class ActionPosterior:
 
         Args:
             sample_shape: Any shape.
-            x: The outcome, shape x_shape or (1, *x_shape).
+            x: The outcome, shape x_shape or (1, *x_shape); NaN where there was no
+                measurement.
             action: The action that led to it, shape (action_dim,) or (1, action_dim).
             kwargs: Passed to sbi's ``sample``.
 
@@ -69,8 +73,8 @@ class ActionPosterior:
             ValueError: If x or action is missing or has another shape.
         """
         kwargs.setdefault("show_progress_bars", False)
-        condition = self._condition(x, action)
-        draws = self._packed.sample(sample_shape, x=condition, **kwargs)
+        posterior, condition = self._given(x, action)
+        draws = posterior.sample(sample_shape, x=condition, **kwargs)
         return draws.reshape(*torch.Size(sample_shape), -1)
 
     def sample_batched(
@@ -92,8 +96,8 @@ class ActionPosterior:
             Shape (*sample_shape, b, theta_dim).
         """
         kwargs.setdefault("show_progress_bars", False)
-        condition = self._condition(x, action)
-        return self._packed.sample_batched(sample_shape, x=condition, **kwargs)
+        posterior, condition = self._given(x, action)
+        return posterior.sample_batched(sample_shape, x=condition, **kwargs)
 
     def log_prob(
         self,
@@ -113,8 +117,9 @@ class ActionPosterior:
         Returns:
             Shape (n,); -inf outside the prior's support.
         """
-        condition = self._condition(x, action)
-        return self._direct().log_prob(theta.float(), x=condition, **kwargs)
+        self._direct()
+        posterior, condition = self._given(x, action)
+        return posterior.log_prob(theta.float(), x=condition, **kwargs)
 
     def log_prob_batched(
         self,
@@ -134,8 +139,9 @@ class ActionPosterior:
         Returns:
             Shape (n, b).
         """
-        condition = self._condition(x, action)
-        return self._direct().log_prob_batched(theta.float(), x=condition, **kwargs)
+        self._direct()
+        posterior, condition = self._given(x, action)
+        return posterior.log_prob_batched(theta.float(), x=condition, **kwargs)
 
     def map(
         self, x: Tensor | None = None, action: Tensor | None = None, **kwargs: Any
@@ -147,11 +153,11 @@ class ActionPosterior:
             action: The action that led to it.
             kwargs: Passed to sbi's ``map``.
         """
-        condition = self._condition(x, action)
+        posterior, condition = self._given(x, action)
         if "init_method" not in kwargs:
             num = kwargs.get("num_init_samples", 1_000)
             kwargs["init_method"] = self.sample((num,), x=x, action=action)
-        return deepcopy(self._packed).set_default_x(condition).map(**kwargs)
+        return deepcopy(posterior).set_default_x(condition).map(**kwargs)
 
     def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\log q(\theta_i | x_i, \xi_i)` row by row.
@@ -195,6 +201,36 @@ class ActionPosterior:
             )
         return self._packed
 
+    def _given(self, x: Tensor | None, action: Tensor | None) -> tuple[Any, Tensor]:
+        """Return a posterior of sbi's and the condition it takes.
+
+        sbi refuses NaN, which here says that nothing was measured. A network that
+        takes it is then given the number of a row in a table of the conditions.
+        """
+        condition = self._condition(x, action)
+        if bool(condition.isfinite().all()) or not isinstance(
+            self._packed, DirectPosterior
+        ):
+            return self._packed, condition
+        direct = self._packed
+        network = direct.posterior_estimator
+        if not isinstance(network, MixtureDensityNetwork):
+            return direct, condition  # sbi says what is wrong
+        if not network.knows(condition):
+            warnings.warn(
+                "the network has never seen an outcome like this: no simulation it was "
+                "trained on lacks these numbers, so what it says is arbitrary",
+                stacklevel=3,
+            )
+        posterior = DirectPosterior(
+            _AtConditions(network, condition),
+            direct.prior,
+            max_sampling_batch_size=direct.max_sampling_batch_size,
+            device=direct.device,
+            enable_transform=direct.enable_transform,
+        )
+        return posterior, torch.arange(float(len(condition)))[:, None]
+
     def _condition(self, x: Tensor | None, action: Tensor | None) -> Tensor:
         if x is None or action is None:
             given = "x without action" if action is None else "action without x"
@@ -207,23 +243,28 @@ class ActionPosterior:
         return pack(rows, action_rows(action, self.action_dim, num_rows=len(rows)))
 
 
-class _AtAction(ConditionalDensityEstimator):
-    """A packed estimator at one action: its condition is x alone."""
+class _Rewritten(ConditionalDensityEstimator):
+    """A packed estimator whose condition is made from another one.
 
-    action: Tensor
+    Args:
+        packed: Takes packed (x, action).
+        condition_shape: Of what is given instead.
+    """
 
     def __init__(
-        self, packed: ConditionalDensityEstimator, action: Tensor, x_shape: torch.Size
+        self, packed: ConditionalDensityEstimator, condition_shape: torch.Size
     ) -> None:
-        super().__init__(nn.Identity(), packed.input_shape, x_shape)
+        super().__init__(nn.Identity(), packed.input_shape, condition_shape)
         self.packed = packed
-        self.register_buffer("action", action)
 
-    def _pack(self, x: Tensor) -> Tensor:
-        rows = x.reshape(-1, *self.condition_shape)
-        condition = pack(rows, self.action.expand(len(rows), -1))
-        leading = x.shape[: x.ndim - len(self.condition_shape)]
-        return condition.reshape(*leading, -1)
+    @abstractmethod
+    def _rows(self, given: Tensor) -> Tensor:
+        """Return packed rows, (n, *condition_shape) -> (n, packed_dim)."""
+
+    def _pack(self, given: Tensor) -> Tensor:
+        rows = self._rows(given.reshape(-1, *self.condition_shape))
+        leading = given.shape[: given.ndim - len(self.condition_shape)]
+        return rows.reshape(*leading, -1)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
         return self.packed.log_prob(input, self._pack(condition), **kwargs)
@@ -235,3 +276,31 @@ class _AtAction(ConditionalDensityEstimator):
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
     ) -> Tensor:
         return self.packed.sample(sample_shape, self._pack(condition), **kwargs)
+
+
+class _AtAction(_Rewritten):
+    """At one action: the condition is x alone."""
+
+    action: Tensor
+
+    def __init__(
+        self, packed: ConditionalDensityEstimator, action: Tensor, x_shape: torch.Size
+    ) -> None:
+        super().__init__(packed, x_shape)
+        self.register_buffer("action", action)
+
+    def _rows(self, given: Tensor) -> Tensor:
+        return pack(given, self.action.expand(len(given), -1))
+
+
+class _AtConditions(_Rewritten):
+    """At the rows of a table: the condition is a row's number."""
+
+    table: Tensor
+
+    def __init__(self, packed: ConditionalDensityEstimator, table: Tensor) -> None:
+        super().__init__(packed, torch.Size([1]))
+        self.register_buffer("table", table)
+
+    def _rows(self, given: Tensor) -> Tensor:
+        return self.table[given[:, 0].long()]

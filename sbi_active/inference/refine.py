@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,17 +13,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.belief import Belief, require_support
+from sbi_active.inference.belief import require_support
 from sbi_active.inference.comparison import compare_orders
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.histories import Histories, HistoryRecord
+from sbi_active.inference.outcome_checks import check_outcomes
 from sbi_active.inference.population import (
     GaussianMixture,
-    Particles,
     Proposal,
     StudentProposal,
     population_monte_carlo,
 )
+from sbi_active.inference.refined_belief import RefinedBelief
 from sbi_active.inference.regions import (
     PriorProposal,
     Region,
@@ -34,9 +36,10 @@ from sbi_active.inference.regions import (
 from sbi_active.inference.surrogate import Surrogate
 from sbi_active.inference.trust import Course, Stage, diagnose
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation.outcomes import MissingRowsWarning
 from sbi_active.threads import single_thread
 
-__all__ = ["RefinedBelief", "Refinement", "refine"]
+__all__ = ["Refinement", "refine"]
 
 Array = NDArray[Any]
 
@@ -50,7 +53,8 @@ class Refinement:
     Attributes:
         num_histories: Budget of simulated histories, replicates included; a history is
             a parameter set at which each executed action is simulated. Fewer are used
-            where the surrogate is good sooner.
+            where the surrogate is good sooner. A trial that had a measurement is
+            simulated again, up to 16 times, where by chance simulations have none.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
@@ -66,6 +70,10 @@ class Refinement:
         check_order: Refine a second time, with the trials in reverse and new
             simulations, and report the divergence between the two: what the order and
             the draws contribute. It doubles the cost.
+        num_workers: Of the simulations, see :func:`~sbi_active.simulation.simulate`.
+        time_limit: Seconds a simulated row may take; None waits for ever.
+        num_retries: How often a row that a fault lost is tried again. A history of
+            which a row stays lost is left out.
     """
 
     num_histories: int = 3_000
@@ -76,6 +84,9 @@ class Refinement:
     num_particles: int = 8_000
     max_regions: int = 8
     check_order: bool = False
+    num_workers: int = 1
+    time_limit: float | None = None
+    num_retries: int = 0
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -95,88 +106,13 @@ class Refinement:
                 )
 
 
-class RefinedBelief(Belief):
-    r"""The posterior of all trials given the original prior.
-
-    .. math::
-        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)\, \hat L(\theta)}{Z}
-        + \epsilon\, p(\theta), \qquad \hat L(\theta) \approx
-        \prod_k p(x_k | \theta, \xi_k).
-
-    Args:
-        prior: The original prior p.
-        surrogate: The prior times the learned likelihood :math:`\hat L`.
-        particles: Importance sample of it, which gives Z and the proposal of draws.
-        defensive: The share :math:`\epsilon`.
-
-    Attributes:
-        histories: The simulations behind it, to go on from after a further trial.
-    """
-
-    label = "refined"
-    histories: HistoryRecord
-
-    def __init__(
-        self,
-        prior: Distribution,
-        surrogate: Surrogate,
-        particles: Particles,
-        *,
-        defensive: float,
-    ) -> None:
-        with forked_generators(0):  # the base class draws once to learn the dimension
-            super().__init__(prior)
-        self._surrogate = surrogate
-        self._defensive = defensive
-        self._proposal = particles.proposal
-        self._log_normalizer = particles.log_normalizer
-        # Draws are kept with probability weight / bound; a bound on all weights that
-        # keeps too few is lowered, at the cost of a thinner tail.
-        largest = float(particles.log_weight.max())
-        self._log_bound = min(largest, self._log_normalizer - np.log(MIN_ACCEPTANCE))
-
-    def _log_prob(self, theta: Tensor) -> Tensor:
-        coordinates = self._surrogate.coordinates
-        z = coordinates.to_z(theta)
-        log_prior = coordinates.log_prior(z) - coordinates.log_jacobian(z)
-        density = np.full(len(z), -np.inf)
-        inside = np.isfinite(log_prior)
-        log_likelihood = self._surrogate.log_likelihood(z[inside])
-        density[inside] = log_prior[inside] + np.logaddexp(
-            np.log1p(-self._defensive) + log_likelihood - self._log_normalizer,
-            np.log(self._defensive),
-        )
-        return torch.from_numpy(density)
-
-    def _sample(self, num_samples: int) -> Tensor:
-        seed = int(torch.randint(2**62, ()))
-        rng = np.random.default_rng(seed)
-        coordinates = self._surrogate.coordinates
-        num_prior = rng.binomial(num_samples, self._defensive)
-        kept = [coordinates.sample_prior(num_prior, rng)]
-        missing = num_samples - num_prior
-        acceptance = np.exp(self._log_normalizer - self._log_bound)
-        while missing > 0:
-            z = self._proposal.sample(int(1.1 * missing / acceptance) + 20, rng)
-            log_weight = self._surrogate.log_joint(z) - self._proposal.log_prob(z)
-            accepted = np.log(rng.random(len(z))) < log_weight - self._log_bound
-            kept.append(z[accepted][:missing])
-            missing -= len(kept[-1])
-        z = rng.permutation(np.concatenate(kept))
-        return coordinates.to_theta(z)
-
-
-#: Least share of draws that sampling keeps.
-MIN_ACCEPTANCE = 0.03
-
-
 def refine(
     simulator: Callable[..., Any],
     prior: Distribution,
     action: Tensor,
     x: Tensor,
     *,
-    start: Distribution | None = None,
+    start: Distribution | Sequence[Distribution] | None = None,
     past: HistoryRecord | None = None,
     settings: Refinement | None = None,
     seed: int,
@@ -191,13 +127,16 @@ def refine(
     ellipsoids around the sample. It ends when the residuals are pure noise and a stage
     changes nothing, or when the budget is spent.
 
+    A trial without a measurement counts by the probability of having none, one that was
+    partly observed by the numbers that were (:mod:`~sbi_active.inference.validity`).
+
     Args:
         simulator: ``simulator(theta, action)``; not kept in the result.
         prior: The original prior, with a support.
         action: Executed actions, shape (t, action_dim).
-        x: Their observed outcomes, shape (t, *x_shape), all finite.
-        start: Where else to look first, for example a chained belief. It adds
-            simulations and no weight, so it cannot bias.
+        x: Their observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
+        start: Where else to look first, for example a chained belief and the belief
+            before the last trial. It adds simulations and no weight, so it cannot bias.
         past: ``belief.histories`` of an earlier call whose trials are the first of
             these: what still lies in a region is simulated at the new actions only.
         settings: Budget and shares; None is ``Refinement()``.
@@ -207,8 +146,8 @@ def refine(
         The belief; ``belief.diagnostics`` says how far to trust it.
 
     Raises:
-        ValueError: If shapes do not fit, x is not finite, there is no trial, the
-            simulator is deterministic or almost never gives a measurement.
+        ValueError: If shapes do not fit, there is no trial, the simulator is
+            deterministic, or it almost never gives a measurement that a trial gave.
 
     References:
         Wood, Nature 2010; Price et al., J. Comp. Graph. Stat. 2018 (synthetic
@@ -227,19 +166,20 @@ def refine(
     prior = require_support(prior)
     settings = Refinement() if settings is None else settings
     action, observed = _trials(action, x)
+    hints = [] if start is None else start
+    hints = [hints] if isinstance(hints, Distribution) else [*hints]
     with single_thread():
         belief = _refine(
-            simulator, prior, action, observed, start, past, settings, seed
+            simulator, prior, action, observed, hints, past, settings, seed
         )
         if settings.check_order:
-            swapped = observed.reshape(len(action), -1)[::-1].reshape(-1)
             other_seed = derive_seed(seed, "reversed")
             other = _refine(
                 simulator,
                 prior,
                 action.flip(0),
-                swapped,
-                start,
+                observed[::-1],
+                hints,
                 None,
                 settings,
                 other_seed,
@@ -253,36 +193,42 @@ def _refine(
     prior: Distribution,
     action: Tensor,
     observed: Array,
-    start: Distribution | None,
+    hints: Sequence[Distribution],
     past: HistoryRecord | None,
     settings: Refinement,
     seed: int,
 ) -> RefinedBelief:
     rng = np.random.default_rng(derive_seed(seed, "refine"))
     coordinates = PriorCoordinates(prior, rng)
-    histories = Histories(simulator, action, observed, coordinates, seed, past)
+    engine = {
+        "num_workers": settings.num_workers,
+        "time_limit": settings.time_limit,
+        "num_retries": settings.num_retries,
+    }
+    histories = Histories(simulator, action, observed, coordinates, seed, past, engine)
 
     regions = [whole_space(coordinates.dim)]
-    if start is not None:
+    for hint in hints:
         with forked_generators(derive_seed(seed, "start")):
-            draws = coordinates.to_z(start.sample(torch.Size([1_000])).float())
+            draws = coordinates.to_z(hint.sample(torch.Size([1_000])).float())
         regions.append(around(draws[coordinates.inside(draws)]))
     base: Proposal = PriorProposal(coordinates)
     first: Proposal | None = None
     course = Course(budget=settings.num_histories)
     num_forced = 1
     while True:
-        stage_size = _stage_size(settings, len(histories), coordinates.dim)
+        stage_size = _stage_size(settings, histories.num_drawn)
         _simulate_stage(histories, regions, stage_size, settings, rng)
-        next_size = _stage_size(settings, len(histories), coordinates.dim)
+        next_size = _stage_size(settings, histories.num_drawn)
         is_last = next_size < MIN_STAGE
         fits = [histories.regress(region) for region in regions]
         regressions = [fit for fit in fits if fit is not None]
         if not regressions:
             raise ValueError(
-                "expected simulations with a measurement; got NaN in "
-                f"{int((~histories.valid).sum())} of {len(histories)} histories; do "
-                "check the simulator at the executed actions, or the prior"
+                "expected simulations with a measurement, since trials had one; got "
+                f"none or NaN in {histories.num_drawn - int(histories.valid.sum())} of "
+                f"{histories.num_drawn} histories; do check the simulator at the "
+                "executed actions, or the prior"
             )
         surrogate = Surrogate(coordinates, regressions, not is_last)
         particles, _ = population_monte_carlo(
@@ -317,10 +263,11 @@ def _refine(
     diagnostics = diagnose(
         course,
         num_simulations=histories.num_simulations,
-        share_invalid=float((~histories.valid).mean()),
+        share_invalid=histories.share_invalid,
         num_trials=len(action),
         rng=rng,
     )
+    check_outcomes(diagnostics, surrogate, stage.draws, histories)
     # The residuals have served the diagnostics and would only weigh on the pickle.
     empty = np.zeros((0, observed.size))
     slim = [replace(r, residual=empty, standardized=empty) for r in regressions]
@@ -328,10 +275,18 @@ def _refine(
     belief = RefinedBelief(prior, surrogate, particles, defensive=settings.defensive)
     belief.diagnostics = diagnostics
     belief.histories = histories.record()
+    if histories.num_missing:
+        warnings.warn(
+            f"{histories.num_missing} of {histories.num_simulations} simulations of "
+            "the refinement are missing, by faults of the simulator; the histories "
+            "they belong to were left out",
+            MissingRowsWarning,
+            stacklevel=3,
+        )
     return belief
 
 
-def _stage_size(settings: Refinement, used: int, dim: int) -> int:
+def _stage_size(settings: Refinement, used: int) -> int:
     share = settings.first_share if used == 0 else settings.stage_share
     size = max(int(share * settings.num_histories), MIN_STAGE)
     left = settings.num_histories - used
@@ -347,9 +302,13 @@ def _simulate_stage(
     rng: np.random.Generator,
 ) -> None:
     """Bring a stage's regions to their numbers, past histories first."""
-    is_first = len(histories) == 0
+    is_first = histories.num_drawn == 0
     num_places = size - max(int(settings.replicate_share * size), 12)
-    counts = np.diff(np.linspace(0, num_places, len(regions) + 1).astype(int))
+    shares = np.full(len(regions), 1 / len(regions))
+    if is_first and len(regions) > 2:  # the overview keeps half of the stage
+        shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
+    bounds = num_places * np.concatenate([[0.0], shares.cumsum()])
+    counts = np.diff(np.round(bounds, 6).astype(int))
     for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
         # The first stage's first region is the whole space, seen from the prior.
         is_overview = is_first and k == 0
@@ -371,10 +330,4 @@ def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Array]:
             f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; do stack "
             "the trials along axis 0"
         )
-    observed = x.double().cpu().numpy().reshape(-1)
-    if not np.isfinite(observed).all():
-        raise ValueError(
-            f"expected finite x; got {int((~np.isfinite(observed)).sum())} NaN or "
-            "infinite values; do leave out trials without a measurement"
-        )
-    return action.float().cpu(), observed
+    return action.float().cpu(), x.double().cpu().numpy().reshape(len(x), -1)

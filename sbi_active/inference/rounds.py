@@ -44,6 +44,7 @@ def round_rows(
     x_shape: torch.Size | None,
     action_dim: int | None,
     exclude_invalid: bool,
+    may_be_invalid: bool = False,
 ) -> RoundRows:
     """Return the rows of a round, or say what is wrong with them.
 
@@ -54,7 +55,9 @@ def round_rows(
         prior: Gives theta_dim and the support.
         x_shape: Shape of earlier outcomes; None takes that of these.
         action_dim: Of earlier actions; None takes that of these.
-        exclude_invalid: Drop rows without a measurement.
+        exclude_invalid: Drop rows in which a number is missing.
+        may_be_invalid: Whether it is plausible that no row has a measurement, as under
+            a belief from trials that had none.
 
     Raises:
         ValueError: If shapes do not fit, theta leaves the support, or no row is valid.
@@ -79,8 +82,9 @@ def round_rows(
     x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape)
     action = action_rows(action, action_dim, num_rows=len(theta))
     rows = RoundRows(theta, x, action)
-    invalid = ~x.flatten(1).isfinite().all(-1)
-    if bool(invalid.all()):
+    present = x.flatten(1).isfinite()
+    invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
+    if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
         raise ValueError(
             f"expected at least one simulation with a measurement; got {len(x)} of "
             f"{len(x)} invalid (NaN or inf); do check the simulator at theta = "

@@ -9,7 +9,10 @@ In a region the stacked outcomes of all trials are modeled as
 with f a basis in the region's own coordinates u, S the covariance of the residuals,
 which holds the noise and what the basis misses, and h the leverage, by which the
 likelihood widens where simulations are few. Regressing x on theta asks nothing of
-where the simulations lie, so there is no proposal to correct for.
+where the simulations lie, so there is no proposal to correct for. Numbers that were
+not observed have no part in it, and the probability of what each trial's outcome was,
+a measurement or none, is a further factor
+(:mod:`~sbi_active.inference.validity`).
 
 References:
     Wood, Nature 2010 (synthetic likelihood); Schafer & Strimmer, Stat. Appl. Genet.
@@ -25,8 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.inference.basis import Basis
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.regions import Region, nearest_region
+from sbi_active.inference.validity import TrialOutcome
 
 __all__ = ["LocalRegression", "NoiseEstimate", "Surrogate", "estimate_noise"]
 
@@ -38,49 +43,6 @@ GAIN = 0.005  # nats an outcome that a larger basis must save
 MAX_WAVES = 120  # random Fourier features
 WAVE_LENGTHS = (1.0, 0.5, 0.25)  # in half-widths of the region
 FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise
-
-
-@dataclass(frozen=True)
-class Basis:
-    """Monomials up to a degree, and random cosines.
-
-    Attributes:
-        degree: Of the monomials.
-        frequency: Shape (d, w), w = 0 for none.
-        phase: Shape (w,).
-    """
-
-    degree: int
-    frequency: Array
-    phase: Array
-
-    @staticmethod
-    def polynomial(degree: int, dim: int) -> Basis:
-        """Return a basis without cosines."""
-        return Basis(degree, np.zeros((dim, 0)), np.zeros(0))
-
-    @staticmethod
-    def waves(length: float, dim: int, num: int) -> Basis:
-        """Return quadratics and cosines (Rahimi & Recht, NeurIPS 2007)."""
-        rng = np.random.default_rng(7)  # any fixed directions will do
-        frequency = rng.standard_normal((dim, num)) / length
-        return Basis(2, frequency, rng.uniform(0, 2 * np.pi, num))
-
-    def __call__(self, u: Array) -> Array:
-        """Return features, shape (n, p), of coordinates, shape (n, d)."""
-        monomials = [np.ones(len(u))]
-        last = [(0, monomials[0])]
-        for _ in range(self.degree):
-            last = [
-                (j, column * u[:, j])
-                for first, column in last
-                for j in range(first, u.shape[1])
-            ]
-            monomials += [column for _, column in last]
-        features = np.stack(monomials, 1)
-        if self.phase.size == 0:
-            return features
-        return np.concatenate([features, np.cos(u @ self.frequency + self.phase)], 1)
 
 
 @dataclass(frozen=True)
@@ -119,7 +81,10 @@ class LocalRegression:
         root: :math:`R^{-1}` of F = Q R, so that h = |f R^{-1}|^2, shape (p, p).
         log_volume: log det L.
         precision: Factor that makes the inverse of the sample covariance unbiased.
-        log_valid: Log share of simulations in the region with a measurement.
+        outcomes: Probability of a measurement, or of none, of each trial in which
+            simulations do not all agree.
+        used: Which outcomes were observed, shape (q,); all others have no coefficient
+            and no residual.
         roughness: Share of the variance of some outcome that a cubic misses.
         ratio: Residual over noise variance, mean over outcomes.
         excess: The same with chance removed: above 1 means misfit.
@@ -134,7 +99,8 @@ class LocalRegression:
     root: Array
     log_volume: float
     precision: float
-    log_valid: float
+    outcomes: tuple[TrialOutcome, ...]
+    used: NDArray[np.bool_]
     roughness: float
     ratio: float
     excess: float
@@ -155,7 +121,8 @@ class LocalRegression:
         *,
         noise: NoiseEstimate,
         num_trials: int,
-        log_valid: float,
+        outcomes: tuple[TrialOutcome, ...] = (),
+        used: NDArray[np.bool_] | None = None,
     ) -> LocalRegression | None:
         """Fit the basis with the smallest generalized cross-validation score.
 
@@ -163,13 +130,17 @@ class LocalRegression:
             region: Where the simulations lie.
             z: Their coordinates, shape (n, d).
             x: Their outcomes less the observed ones, shape (n, q).
-            noise: Noise in the region.
+            noise: Noise in the region, of the outcomes in use.
             num_trials: Trials stacked in q.
-            log_valid: Log share with a measurement.
+            outcomes: Whether trials gave a measurement.
+            used: Outcomes that were observed, shape (q,); None is all.
 
         Returns:
             The regression; None where simulations are too few.
         """
+        used = np.ones(x.shape[1], dtype=bool) if used is None else used
+        trial = np.repeat(np.arange(num_trials), x.shape[1] // num_trials)[used]
+        x = x[:, used]
         n, q = x.shape
         u = region.scaled(z)
         scale = np.sqrt(noise.variance)
@@ -190,7 +161,7 @@ class LocalRegression:
             residual = x - features @ coefficient
             variance = ((residual / scale) ** 2).sum(0) / (n - p) + 1e-12
             score = np.log(variance).sum() + q * np.log(n / (n - p))
-            if not is_wave:
+            if not is_wave and q > 0:
                 missed = (residual**2).sum(0) / (n - p) - noise.variance
                 roughness = float((missed / x.var(0).clip(noise.variance)).max())
             if best is None or score < best[0] - GAIN * q:
@@ -202,23 +173,24 @@ class LocalRegression:
         ratio = (residual**2).sum(0) / freedom / noise.variance
         excess = _excess(ratio, freedom, noise.num_pairs)
         covariance, precision = _covariance(
-            residual, freedom, noise.variance, num_trials, excess <= MISFIT
+            residual, freedom, noise.variance, trial, excess <= MISFIT
         )
         factor = np.linalg.cholesky(covariance)
         inverse = np.linalg.inv(factor)
         return LocalRegression(
             region=region,
             basis=basis,
-            coefficient=coefficient @ inverse.T,
+            coefficient=_spread(coefficient @ inverse.T, used),
             root=root,
             log_volume=float(np.log(np.diag(factor)).sum()),
             precision=precision,
-            log_valid=log_valid,
+            outcomes=outcomes,
+            used=used,
             roughness=roughness,
-            ratio=float(ratio.mean()),
+            ratio=float(ratio.mean()) if q > 0 else 1.0,
             excess=excess,
-            residual=residual @ inverse.T,
-            standardized=residual / np.sqrt(np.diag(covariance)),
+            residual=_spread(residual @ inverse.T, used),
+            standardized=_spread(residual / np.sqrt(np.diag(covariance)), used),
             whitening=inverse,
         )
 
@@ -245,9 +217,9 @@ class LocalRegression:
         """
         if not self.has_misfit:
             return 1.0
-        n, q = self.residual.shape
+        n = len(self.residual)
         square = (self.residual**2).sum(1) * n / (n - len(self.root))
-        return float(max(CAUTION, square.max() / chi2.ppf(0.9, q)))
+        return float(max(CAUTION, square.max() / chi2.ppf(0.9, self.used.sum())))
 
     def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
         """Return the log likelihood of the observation, shape (n,).
@@ -257,10 +229,13 @@ class LocalRegression:
             caution: Factor of the variance.
         """
         error, widening = self.whitened(z)
-        q = error.shape[1]
+        q = int(self.used.sum())
         square = (error**2).sum(1) * self.precision / (widening * caution)
         log_volume = self.log_volume + 0.5 * q * np.log(2 * np.pi * widening * caution)
-        return self.log_valid - 0.5 * square - log_volume
+        log_likelihood = -0.5 * square - log_volume
+        for outcome in self.outcomes:
+            log_likelihood = log_likelihood + outcome.log_prob(z)
+        return log_likelihood
 
 
 @dataclass(frozen=True)
@@ -309,7 +284,7 @@ def _candidates(dim: int, num_rows: int) -> list[Basis]:
 
 def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
     variance = (residual**2).sum(0) / (len(residual) - len(root))
-    return float((variance / noise.variance).max())
+    return float((variance / noise.variance).max(initial=0.0))
 
 
 def _excess(ratio: Array, freedom: int, num_pairs: int) -> float:
@@ -319,6 +294,8 @@ def _excess(ratio: Array, freedom: int, num_pairs: int) -> float:
     one is missed; each less what chance alone reaches.
     """
     q = len(ratio)
+    if q == 0:
+        return 0.0
     deviation = np.sqrt(2 / freedom + 2 / max(num_pairs, 1))
     mean = ratio.mean() - 3 * deviation / np.sqrt(q)
     largest = ratio.max() / (1 + (2 + 0.3 * np.log(q)) * deviation)
@@ -329,7 +306,7 @@ def _covariance(
     residual: Array,
     freedom: int,
     noise_variance: Array,
-    num_trials: int,
+    trial: NDArray[np.intp],
     independent: bool,
 ) -> tuple[Array, float]:
     r"""Return the residuals' covariance, shrunk, and the factor of its inverse.
@@ -337,18 +314,27 @@ def _covariance(
     Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`,
     apart within a trial and across trials. Noise does not correlate across trials,
     which are independent given theta; misfit does.
+
+    Args:
+        residual: Shape (n, q).
+        freedom: Rows less coefficients.
+        noise_variance: Shape (q,).
+        trial: Of each outcome, shape (q,).
+        independent: Whether there is no misfit.
     """
     q = residual.shape[1]
+    if q == 0:
+        return np.zeros((0, 0)), 1.0
     deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise_variance)
     standardized = residual / deviation
     correlation = standardized.T @ standardized / freedom
-    within = np.kron(np.eye(num_trials), np.ones((q // num_trials,) * 2)) > 0
+    within = trial[:, None] == trial
     diagonal = np.eye(q, dtype=bool)
     across = 1.0 if independent else _shrinkage(correlation[~within], freedom)
     shrunk = _shrinkage(correlation[within & ~diagonal], freedom)
     correlation = np.where(within, correlation, (1 - across) * correlation)
     correlation = np.where(diagonal, 1.0, (1 - shrunk) * correlation)
-    size = q if across < 1 else q // num_trials
+    size = q if across < 1 else int(np.bincount(trial).max())
     free = 1 + (size - 1) * (1 - shrunk) ** 2
     precision = max((freedom - free - 1) / freedom, 0.2)
     return correlation * np.outer(deviation, deviation), precision
@@ -359,3 +345,12 @@ def _shrinkage(correlation: Array, freedom: int) -> float:
         return 1.0
     variance = (1 - correlation**2) ** 2 / freedom
     return float(min(1.0, variance.sum() / max((correlation**2).sum(), 1e-300)))
+
+
+def _spread(columns: Array, used: NDArray[np.bool_]) -> Array:
+    """Return columns (n, used) at their places among all, (n, q), zero elsewhere."""
+    if used.all():
+        return columns
+    full = np.zeros((len(columns), len(used)))
+    full[:, used] = columns
+    return full

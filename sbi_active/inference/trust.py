@@ -159,7 +159,6 @@ def diagnose(
     negentropy, is_gaussian = _noise_shape(live, rng)
     is_gaussian &= not _has_hard_edges(course.stages)
     correlation, is_independent = _trial_correlation(live, num_trials)
-    valid = float(np.exp(min((fit.log_valid for fit in live), default=0.0)))
     ratio = max((fit.ratio for fit in live), default=np.inf)
 
     assumptions: dict[str, tuple[bool, float, str]] = {
@@ -207,12 +206,6 @@ def diagnose(
             float(dim),
             "there are {:.0f} parameters, and local polynomials are known to serve up "
             "to 6; do check against a belief of a trained network",
-        ),
-        "mostly_valid": (
-            valid > 0.8,
-            valid,
-            "only {:.0%} of the simulations near the belief have a measurement, and "
-            "the edge of the region where they do is coarse; do raise num_histories",
         ),
     }
     warnings = [
@@ -367,8 +360,11 @@ def _trial_correlation(
         freedom = n - len(fit.root)
         correlation = fit.standardized.T @ fit.standardized / freedom
         apart = np.kron(np.eye(num_trials), np.ones((q // num_trials,) * 2)) == 0
+        apart &= np.outer(fit.used, fit.used)
         excess += (correlation[apart] ** 2 - 1 / freedom).sum()
         count += int(apart.sum())
+    if count == 0:
+        return 0.0, True
     correlation = max(excess / count, 0.0) ** 0.5
     has_misfit = any(fit.has_misfit for fit in fits)  # which correlates as well
     return float(correlation), correlation < CORRELATED or has_misfit

@@ -25,8 +25,8 @@ def rows(n=1_000, prior=PRIOR):
     return theta, simulator(theta, action), action
 
 
-def trained(density_estimator=SMALL, prior=PRIOR, n=1_000, **train):
-    theta, x, action = rows(n, prior)
+def trained(density_estimator=SMALL, prior=PRIOR, n=1_000, data=None, **train):
+    theta, x, action = rows(n, prior) if data is None else data
     inference = ASBI(prior, density_estimator, show_progress_bars=False)
     inference.append_simulations(theta, x, action=action).train(**train)
     return inference
@@ -148,8 +148,41 @@ def test_invalid_rows_are_kept_by_ours_and_dropped_for_sbi_s():
     assert len(inference.get_simulations()[0]) == int((theta[:, 0] <= 1).sum())
     with pytest.warns(UserWarning, match="Maximum number of epochs"):
         inference.train(max_num_epochs=1)
-    with pytest.raises(ValueError, match="expected an outcome with a measurement"):
-        inference.update(torch.full((2,), torch.nan), action=torch.ones(1))
+    before = inference.belief
+    with pytest.warns(UserWarning, match="has never seen an outcome like"):
+        belief = inference.update(torch.full((2,), torch.nan), action=torch.ones(1))
+    assert belief.label == "unchanged"
+    draws = belief.sample((10,))
+    assert torch.equal(belief.log_prob(draws), before.log_prob(draws))
+
+
+def test_the_posterior_takes_outcomes_without_a_measurement():
+    """x is missing where theta_1 > 1, its second number alone where theta_2 > 1."""
+    theta, x, action = rows(3_000)
+    complete = x.clone()
+    x[theta[:, 0] > 1] = torch.nan
+    x[theta[:, 1] > 1, 1] = torch.nan
+    posterior = trained(SMALL, data=(theta, x, action)).build_posterior()
+    none, part = torch.full((2,), torch.nan), torch.tensor([0.3, torch.nan])
+    draws = posterior.sample((500,), x=none, action=torch.ones(1))
+    assert float(draws[:, 0].mean()) > 0.8  # E[theta_1 | theta_1 > 1] = 1.53
+    draws = posterior.sample((500,), x=part, action=torch.ones(1))
+    assert float(draws[:, 1].mean()) > 0.8
+    both = torch.stack([part, torch.tensor([0.3, 0.1]), none])
+    batched = posterior.sample_batched((400,), x=both, action=torch.ones(3, 1))
+    assert (batched.mean(0)[:, 1] > 0.8).tolist() == [True, False, False]
+    at = [{"x": row, "action": torch.ones(1)} for row in both]
+    single = torch.stack([posterior.log_prob(draws[:5], **one) for one in at], 1)
+    batch = posterior.log_prob_batched(
+        draws[:5, None].expand(5, 3, 2), both, torch.ones(3, 1)
+    )
+    assert torch.allclose(batch, single, atol=1e-4)
+    best = posterior.map(num_iter=5, num_to_optimize=5, **at[2])
+    assert float(best.reshape(-1)[0]) > 0.5
+    # the same network, had it seen complete rows alone, says so
+    other = trained(SMALL, data=(theta, complete, action)).build_posterior()
+    with pytest.warns(UserWarning, match="has never seen an outcome like this"):
+        other.sample((2,), **at[2])
 
 
 def test_images_pass_through_an_embedding():

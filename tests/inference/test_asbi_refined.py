@@ -1,13 +1,14 @@
 """Updates with a simulator: the posterior of all trials from the original prior."""
 
 import pickle
+import warnings
 
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, Refinement
-from sbi_active.inference import ChainedBelief, Observation
+from sbi_active.inference import ChainedBelief, Observation, asbi, refine
 from sbi_active.inference.comparison import compare, compare_orders
 from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator
@@ -83,12 +84,60 @@ def test_same_seed_same_belief():
     assert not torch.equal(beliefs[0].log_prob(theta), beliefs[2].log_prob(theta))
 
 
-def test_invalid_trials_are_left_out_and_counted():
+def hides(theta, action):
+    """No measurement where the first parameter is above .5."""
+    return torch.where(theta[:, :1] > 0.5, torch.nan, simulator(theta, action))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_invalid_trials_count_whatever_their_place(first):
+    """Known to 1 / sqrt(15) around .35 by measurements; above .5, by one without."""
+    measured = [Observation(t.action, torch.tensor([0.4, -0.7])) for t in TRIALS[:1]]
     invalid = Observation(torch.tensor([1.0]), torch.full((2,), torch.nan))
-    belief = ASBI(PRIOR).update_all([*TRIALS, invalid], simulator, seed=0)
-    assert belief.diagnostics["trials_left_out"] == 1
-    with pytest.raises(ValueError, match="expected a trial with a measurement"):
-        ASBI(PRIOR).update_all([invalid], simulator)
+    trials = [invalid, *measured] if first else [*measured, invalid]
+    # Contradictory but for chance: measurements say below .5, the other above.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        inference = ASBI(PRIOR)
+        belief = inference.update_all([invalid], hides, seed=0)
+    assert float((belief.sample((2_000,))[:, 0] > 0.5).float().mean()) > 0.99
+    both = inference.update_all(trials, hides, seed=0)
+    assert not both.diagnostics["trustworthy"]  # no parameter explains both
+
+
+def test_an_invalid_trial_no_simulation_explains_changes_nothing():
+    invalid = Observation(torch.tensor([1.0]), torch.full((2,), torch.nan))
+    trials = [*TRIALS, invalid]
+    belief = ASBI(PRIOR).update_all(trials, simulator, refinement=SETTINGS, seed=0)
+    assert divergence(belief, exact(TRIALS)) < 0.06
+    assert belief.diagnostics["probability_of_outcome"] == [1, 1, 1, 0]
+    assert "the simulator lacks a way to fail" in belief.diagnostics["warnings"][-1]
+
+
+def test_a_lost_network_does_not_lose_the_posterior_of_earlier_trials():
+    """The belief before a trial is looked at first, however wrong the network is."""
+    inference = ASBI(PRIOR, MixtureDensity(hidden_features=(16,), num_iterations=50))
+    inference.update_all(TRIALS[:2], simulator, refinement=SETTINGS, seed=0)
+    starts = []
+    previous = inference.belief
+
+    def spy(*args, **kwargs):
+        starts.extend(kwargs["start"])
+        return refine(*args, **kwargs)
+
+    wrong = MultivariateNormal(torch.tensor([2.0, 2.0]), 0.01 * torch.eye(2))
+    theta, action = wrong.sample((500,)), 3 * torch.rand(500, 1)
+    x = simulator(theta, action)
+    inference.append_simulations(theta, x, action=action, belief=previous).train()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(asbi, "refine", spy)
+        belief = inference.update(
+            TRIALS[2].x, action=TRIALS[2].action, simulator=simulator,
+            refinement=SETTINGS, seed=0,
+        )  # fmt: skip
+    assert starts[-1] is previous
+    assert isinstance(starts[0], ChainedBelief)
+    assert divergence(belief, exact(TRIALS)) < 0.06
 
 
 class _Network:

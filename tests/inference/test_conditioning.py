@@ -314,7 +314,8 @@ def test_outcomes_without_a_measurement():
     condition = torch.cat([x, action], 1)
     net = MixtureDensity(hidden_features=(16,)).build(theta, condition, 1)
     assert net.baseline_kind != "none"
-    assert net.knows_invalid
+    assert net.knows(condition[:1])
+    assert net.knows(condition[5:6])
     assert net.log_prob(theta, condition).isfinite().all()
     assert net.sample(torch.Size([3]), condition[:20]).isfinite().all()
     _, frames = net.conditioning(condition[:1])  # no measurement: the belief itself

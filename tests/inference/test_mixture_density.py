@@ -91,7 +91,8 @@ def test_missing_outcomes_are_something_to_condition_on():
     x = torch.where(theta > 0, torch.nan, torch.randn(2_000, 1))
     condition = torch.cat([x, x, torch.rand(2_000, 1)], 1)
     net = MixtureDensity(hidden_features=(32,))(theta, condition)
-    assert net.knows_invalid
+    assert net.knows(torch.tensor([[torch.nan, torch.nan, 0.0]]))
+    assert not net.knows(torch.tensor([[0.0, 0.0, torch.nan]]))
     assert net._masked_columns == [0]  # the columns go missing together: one mask
     train_mixture_density(
         net,

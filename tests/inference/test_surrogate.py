@@ -19,7 +19,7 @@ def regress(curve, *, noise: float = 0.1, q: int = 3, num_trials: int = 1):
     pairs = noise * rng.standard_normal((2, 80, q))
     estimate = estimate_noise(pairs[0], pairs[1], np.ones(q))
     fit = LocalRegression.fit(
-        whole_space(2), z, x, noise=estimate, num_trials=num_trials, log_valid=0.0
+        whole_space(2), z, x, noise=estimate, num_trials=num_trials
     )
     assert fit is not None
     return fit, weight
@@ -64,7 +64,5 @@ def test_too_few_rows_give_nothing():
     rng = np.random.default_rng(0)
     z, x = rng.standard_normal((15, 2)), rng.standard_normal((15, 1))
     noise = estimate_noise(x[:5], x[5:10], np.ones(1))
-    fit = LocalRegression.fit(
-        whole_space(2), z, x, noise=noise, num_trials=1, log_valid=0.0
-    )
+    fit = LocalRegression.fit(whole_space(2), z, x, noise=noise, num_trials=1)
     assert fit is None

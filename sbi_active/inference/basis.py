@@ -1,0 +1,56 @@
+"""Features in which a region's outcomes are regressed on the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Basis"]
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Monomials up to a degree, and random cosines.
+
+    Attributes:
+        degree: Of the monomials.
+        frequency: Shape (d, w), w = 0 for none.
+        phase: Shape (w,).
+    """
+
+    degree: int
+    frequency: Array
+    phase: Array
+
+    @staticmethod
+    def polynomial(degree: int, dim: int) -> Basis:
+        """Return a basis without cosines."""
+        return Basis(degree, np.zeros((dim, 0)), np.zeros(0))
+
+    @staticmethod
+    def waves(length: float, dim: int, num: int) -> Basis:
+        """Return quadratics and cosines (Rahimi & Recht, NeurIPS 2007)."""
+        rng = np.random.default_rng(7)  # any fixed directions will do
+        frequency = rng.standard_normal((dim, num)) / length
+        return Basis(2, frequency, rng.uniform(0, 2 * np.pi, num))
+
+    def __call__(self, u: Array) -> Array:
+        """Return features, shape (n, p), of coordinates, shape (n, d)."""
+        monomials = [np.ones(len(u))]
+        last = [(0, monomials[0])]
+        for _ in range(self.degree):
+            last = [
+                (j, column * u[:, j])
+                for first, column in last
+                for j in range(first, u.shape[1])
+            ]
+            monomials += [column for _, column in last]
+        features = np.stack(monomials, 1)
+        if self.phase.size == 0:
+            return features
+        return np.concatenate([features, np.cos(u @ self.frequency + self.phase)], 1)

@@ -1,0 +1,149 @@
+"""Campaigns whose trials, or simulators, give no measurement."""
+
+import os
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    MixtureDensity,
+    Refinement,
+)
+from sbi_active.seeding import row_normals
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+ACTIONS = DiscreteActions([0.5, 1.0, 2.0])
+OPTIONS = CampaignOptions(
+    num_simulations=500,
+    num_samples=100,
+    density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=150),
+    refinement=Refinement(num_histories=400),
+)
+
+
+def falls_off(theta, action):
+    """Falls off the table where theta times action is above .8."""
+    x = theta * action + 0.1 * torch.randn_like(theta)
+    return torch.where(theta * action > 0.8, torch.nan, x)
+
+
+def campaign(simulator=falls_off, method="nsbi", **changes):
+    options = replace(OPTIONS, **changes)
+    return Campaign(simulator, PRIOR, ACTIONS, method=method, options=options)
+
+
+def test_each_kind_of_outcome_counts():
+    """Above .4 by one trial, below .8 by another, .6 by a measurement."""
+    c = campaign()
+    c.tell(status="invalid", action=[2.0])
+    assert float(c.update().mean) == pytest.approx(0.7, abs=0.03)
+    assert c.belief.label == "refined"
+    assert c.belief.diagnostics["share_invalid"] > 0.2
+    c.tell([0.62], action=[1.0])
+    mean = float(c.update().mean)
+    assert mean == pytest.approx(0.62, abs=0.05)
+    c.tell(status="missing", action=[1.0])
+    assert float(c.update().mean) == mean
+
+
+def test_a_campaign_of_invalid_trials_alone():
+    c = campaign()
+    for action in (2.0, 1.0):
+        assert c.tell([torch.nan], action=[action]).status == "invalid"
+        c.update()
+    draws = c.belief.sample((2_000,))
+    assert float((draws > 0.8).float().mean()) > 0.97
+    assert float(draws.mean()) == pytest.approx(0.9, abs=0.02)
+
+
+def test_numbers_told_with_an_invalid_trial_are_no_measurement():
+    c = campaign()
+    assert c.tell([3.0], status="invalid", action=[2.0]).x.isnan().all()
+
+
+@pytest.mark.parametrize("refined", [True, False])
+def test_a_partly_observed_outcome_counts(refined):
+    def two(theta, action):
+        x = torch.cat([theta * action, theta], 1)
+        x = x + 0.1 * torch.randn_like(x)
+        lost = torch.rand(len(x), 1) < torch.tensor([0.0, 0.4])
+        return torch.where(lost, torch.nan, x)
+
+    c = campaign(two, refine=refined)
+    trial = c.tell([0.6, torch.nan], action=[2.0])
+    assert trial.status == "ok"
+    # Deviation .1 / 2 by the first number alone; the network is a small one.
+    assert float(c.update().mean) == pytest.approx(0.3, abs=0.03 if refined else 0.1)
+
+
+def test_an_outcome_the_network_never_saw_is_said():
+    c = campaign(lambda t, a: t * a + 0.1 * torch.randn_like(t), refine=False)
+    c.tell(status="invalid", action=[1.0])
+    with pytest.warns(UserWarning, match="has never seen an outcome like"):
+        belief = c.update()
+    assert c.history[0].information_gained == pytest.approx(0, abs=1e-6)
+    assert belief.label == "unchanged"
+
+
+def raises_now_and_then(theta, action, seeds):
+    if bool((seeds % 40 == 0).any()):
+        raise RuntimeError("licence server")
+    return theta * action + 0.1 * row_normals(seeds, 1)
+
+
+def test_missing_rows_are_counted():
+    c = campaign(raises_now_and_then, method="asbi")
+    with pytest.warns(UserWarning, match="are missing"):
+        c.run(lambda action: 0.5 * action, num_rounds=1)
+    trial = c.history[0]
+    # One in 40, of training and refinement (the design does its own account).
+    assert 0 < trial.num_missing < 0.1 * trial.num_simulations
+    assert abs(float(c.belief.mean) - 0.5) < 0.1
+
+
+class Faulty:
+    """Raises on 5 % of the rows, hangs on 1 %, NaN on 10 %, once ends its process."""
+
+    def __init__(self, marker):
+        self.marker = str(marker)
+
+    def __call__(self, theta, action, seeds):
+        kind = seeds % 100
+        if bool((kind == 50).any()) and not os.path.exists(self.marker):
+            open(self.marker, "w").close()
+            os._exit(1)
+        if bool((kind < 5).any()):
+            raise RuntimeError("licence server")
+        if bool((kind == 5).any()):
+            time.sleep(60)
+        x = theta * action + 0.1 * row_normals(seeds, 1)
+        return torch.where(((kind >= 10) & (kind < 20))[:, None], torch.nan, x)
+
+
+@pytest.mark.slow
+def test_a_faulty_simulator_completes_a_campaign(tmp_path):
+    c = campaign(
+        Faulty(tmp_path / "killed"),
+        num_simulations=300,
+        refinement=Refinement(num_histories=300),
+        num_workers=2,
+        time_limit=0.05,
+    )
+    with pytest.warns(UserWarning, match="are missing"):
+        c.run(lambda action: 0.6 * action, num_rounds=2)
+    assert (tmp_path / "killed").exists()
+    for trial in c.history:
+        # 6 % of the rows, and 3 times its Monte Carlo error.
+        share = trial.num_missing / trial.num_simulations
+        assert abs(share - 0.06) < 3 * (0.06 / trial.num_simulations) ** 0.5 + 0.01
+    diagnostics = c.belief.diagnostics
+    assert 0.05 < diagnostics["share_invalid"] < 0.15
+    assert diagnostics["num_missing"] > 0
+    assert float(c.belief.mean) == pytest.approx(0.6, abs=0.1)
+    assert len(c.state.processed) == 2
