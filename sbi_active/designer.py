@@ -1,112 +1,36 @@
-"""Choose the next action by expected information gain, or at random."""
+"""Choose the next action by expected information gain."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import ActionSpace
+from sbi_active.design import Design, action_name
+from sbi_active.eligibility import discrete, excluded_note, reaches
 from sbi_active.information_gain import (
     CandidateSimulations,
     InformationGainEstimator,
+    ModelIndexGain,
+    ParameterGain,
+    RivalPredictive,
+    RivalSampler,
 )
 from sbi_active.information_gain.automatic import (
     choose_estimator,
     disagreements,
     find_estimator,
 )
-from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.candidates import CandidateSampler
 from sbi_active.information_gain.race import Race, paired_errors, standard_error
-from sbi_active.seeding import forked_generators
+from sbi_active.random_designer import RandomDesigner
 from sbi_active.threads import single_thread
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 __all__ = ["Design", "InformationGainDesigner", "RandomDesigner"]
-
-
-@dataclass(frozen=True)
-class Design:
-    """The chosen action and the estimates behind the choice.
-
-    Attributes:
-        action: The chosen action, shape (action_dim,).
-        candidates: All candidates, shape (a, action_dim).
-        expected_information_gain: Estimates on simulations that had no part in the
-            choice, nats, shape (a,); NaN for a random choice.
-        standard_error: Of each estimate, shape (a,).
-        difference_standard_error: Of each estimate's difference to the chosen
-            candidate's, on common random numbers, shape (a,); zero at the chosen one.
-        probability_best: Probability that a candidate has the largest expectation of
-            the estimate, given the simulations, shape (a,).
-        probability_valid: Share of simulations with a measurement, shape (a,).
-        bound: Side of the information that the estimates lie on.
-        index: Which candidate was chosen.
-        num_simulations: Simulations spent.
-        name: Name of the action, with its unit.
-        estimator: Class that estimated.
-        num_samples: Simulations of each candidate, shape (a,). Candidates that were
-            eliminated early have fewer.
-        stopped: Why no further simulations were run: "leader separated", "difference
-            negligible" or "budget spent".
-        notes: What to know: estimators that failed a check or disagree.
-    """
-
-    action: Tensor
-    candidates: Tensor
-    expected_information_gain: Tensor
-    standard_error: Tensor
-    difference_standard_error: Tensor
-    probability_best: Tensor
-    probability_valid: Tensor
-    bound: Bound
-    index: int
-    num_simulations: int
-    name: str = "action"
-    estimator: str = "none"
-    num_samples: Tensor = field(default_factory=lambda: torch.empty(0).long())
-    stopped: str = "at random"
-    notes: tuple[str, ...] = ()
-
-    def __repr__(self) -> str:
-        action = ", ".join(f"{v:g}" for v in self.action.tolist())
-        if self.expected_information_gain.isnan().all():
-            return f"Design(action [{action}], at random)"
-        gain = float(self.expected_information_gain[self.index])
-        error = float(self.standard_error[self.index])
-        return f"Design(action [{action}], EIG {gain:.2f} +- {error:.2f} nats)"
-
-    def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the expected information gain of the candidates with two errors.
-
-        Args:
-            ax: Where to draw; None makes a figure.
-
-        Returns:
-            The axes.
-        """
-        import matplotlib.pyplot as plt
-
-        ax = plt.subplots()[1] if ax is None else ax
-        scalar = self.candidates.shape[1] == 1
-        place = self.candidates[:, 0] if scalar else torch.arange(len(self.candidates))
-        gain, error = self.expected_information_gain, self.standard_error
-        ax.errorbar(
-            place.numpy(), gain.numpy(), 2 * error.numpy(), fmt="o-", ms=4, capsize=2
-        )
-        ax.axvline(float(place[self.index]), ls=":", color="k", label="chosen")
-        ax.set_xlabel(self.name if scalar else "candidate")
-        note = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}
-        ax.set_ylabel(f"EIG{note[self.bound]} [nats]")
-        ax.legend()
-        return ax
 
 
 class InformationGainDesigner:
@@ -163,7 +87,7 @@ class InformationGainDesigner:
                 f"expected num_samples >= 8, half to choose and half to report; got "
                 f"{num_samples}; do use about 1000"
             )
-        self.actions = _discrete(actions)
+        self.actions = discrete(actions)
         self.num_samples = num_samples
         self.estimator = estimator
         self.eliminate = eliminate
@@ -172,19 +96,31 @@ class InformationGainDesigner:
     def select(
         self,
         model: Any,
-        simulator: Callable[..., Any],
+        simulator: Callable[..., Any] | None = None,
         *,
         belief: Distribution | None = None,
+        target: str | Sequence[str] = "theta",
+        min_probability_valid: float = 0.0,
         budget: int | None = None,
         seed: int | None = None,
     ) -> Design:
-        """Return the action that tells most about the parameters.
+        """Return the action that tells most about the target.
 
         Args:
             model: What the estimator needs, for :class:`PosteriorGain` anything with
-                ``log_posterior(theta, x, action)``; None where it needs nothing.
-            simulator: ``simulator(theta, action)``.
+                ``log_posterior(theta, x, action)``; None where it needs nothing. For
+                the target "model" the rivals, a sequence of
+                :class:`~sbi_active.information_gain.RivalPredictive`.
+            simulator: ``simulator(theta, action)``; not used for the target "model".
             belief: Distribution of the parameters; None is ``model.belief``.
+            target: "theta", all parameters; one or several names of the simulator's
+                parameters, the others being nuisances
+                (:class:`~sbi_active.information_gain.ParameterGain`); or "model", the
+                index of the rivals
+                (:class:`~sbi_active.information_gain.ModelIndexGain`). The estimates of
+                the latter two are lower bounds.
+            min_probability_valid: Candidates that give a measurement less often, by
+                the share of the first simulations, are not chosen; 0 excludes none.
             budget: Simulations in all; None is ``num_samples`` a candidate.
             seed: Of the simulations; None draws one from torch's global generator.
 
@@ -193,14 +129,9 @@ class InformationGainDesigner:
 
         Raises:
             ValueError: If there is no belief, the budget is below 8 a candidate, the
-                simulator is deterministic, or the estimator needs a model.
+                simulator is deterministic, the estimator needs a model, the target is
+                unknown, or no candidate is valid often enough.
         """
-        belief = getattr(model, "belief", None) if belief is None else belief
-        if belief is None:
-            raise ValueError(
-                "expected belief=, the distribution of the parameters; got none, and "
-                "the model has none; do pass the belief of this round"
-            )
         num_actions = len(self.actions)
         budget = self.num_samples * num_actions if budget is None else budget
         if budget < 8 * num_actions:
@@ -209,36 +140,43 @@ class InformationGainDesigner:
                 "do allow more simulations or fewer candidates"
             )
         seed = int(torch.randint(2**62, ())) if seed is None else seed
-        sampler = CandidateSampler(simulator, belief, self.actions.values, seed)
-        estimator = find_estimator(self.estimator)
+        sampler, estimator, belief = self._prepare(
+            model, simulator, belief, target, seed
+        )
         replicates = estimator is None or estimator.needs_noise
-        active = torch.arange(num_actions)
         size = max(8, self.num_samples // (2 if self.eliminate else 1))
         size = min(size, budget // num_actions) // 4 * 4
-        first = sampler.draw(size, active, replicates=replicates)
+        first = sampler.draw(size, torch.arange(num_actions), replicates=replicates)
         notes: list[str] = []
         if estimator is None:
             estimator, notes = choose_estimator(model, first)
-        elif estimator.needs_model and model is None:
-            raise ValueError(
-                f"expected a model for {type(estimator).__name__}; got None; do pass "
-                "the trained posterior, or estimator='auto'"
-            )
         else:
             notes = estimator.problems(first)
+        notes += estimator.remarks(first)
         replicates &= estimator.needs_noise
         halves = _halves(first)
         if not replicates:
             halves = [half.unpaired() for half in halves]
+        num_valid, num_counted = first.num_valid()
+        eligible = reaches(num_valid / num_counted, min_probability_valid)
+        notes += excluded_note(eligible, min_probability_valid)
 
         gains = [[torch.empty(0)] * num_actions for _ in range(2)]
-        while True:
+
+        def estimate(index: Tensor, halves: list[CandidateSimulations]) -> None:
             for half, gain in zip(halves, gains, strict=True):
                 with single_thread():
                     contributions = estimator(model, half, belief)
-                for index, row in zip(active.tolist(), contributions, strict=True):
-                    gain[index] = row
-            race = Race.run([gains[0][index] for index in active], seed)
+                for a, row in zip(index.tolist(), contributions, strict=True):
+                    gain[a] = row
+
+        active, excluded = (torch.nonzero(e)[:, 0] for e in (eligible, ~eligible))
+        if len(excluded):  # estimated once, never chosen
+            estimate(excluded, [half.candidates(excluded) for half in halves])
+            halves = [half.candidates(active) for half in halves]
+        while True:
+            estimate(active, halves)
+            race = Race.run([gains[0][a] for a in active], seed)
             keep = race.in_reach
             spent = 2 * len(halves[0].theta) * (2 if replicates else 1)
             more = min(
@@ -252,96 +190,109 @@ class InformationGainDesigner:
             if stop is not None:
                 break
             active = active[keep]
-            wave = _halves(sampler.draw(more, active, replicates=replicates))
+            drawn = sampler.draw(more, active, replicates=replicates)
+            for count, new in zip(
+                (num_valid, num_counted), drawn.num_valid(), strict=True
+            ):
+                count[active] += new
             halves = [
                 half.candidates(keep).join(new)
-                for half, new in zip(halves, wave, strict=True)
+                for half, new in zip(halves, _halves(drawn), strict=True)
             ]
 
-        contributions = torch.stack([gains[0][index] for index in active])
+        contributions = torch.stack([gains[0][a] for a in active])
         with single_thread():
             notes += disagreements(estimator, model, halves[0], belief, contributions)
         chosen = int(active[race.leader])
         report = gains[1]
-        gain = torch.stack([row.mean() for row in report])
+        both = [torch.cat(rows) for rows in zip(*gains, strict=True)]
+        probability_best = torch.zeros(num_actions, dtype=torch.float64)
+        probability_best[eligible] = Race.run(
+            [row for row, e in zip(both, eligible.tolist(), strict=True) if e], seed
+        ).probability_best
+        samples = [(2 if replicates else 1) * len(row) for row in both]
         return Design(
             action=self.actions.values[chosen],
             candidates=self.actions.values,
-            expected_information_gain=gain,
+            expected_information_gain=torch.stack([row.nanmean() for row in report]),
             standard_error=torch.stack([standard_error(row) for row in report]),
             difference_standard_error=paired_errors(report, chosen),
-            probability_best=Race.run(
-                [torch.cat(rows) for rows in zip(*gains, strict=True)], seed
-            ).probability_best,
-            probability_valid=first.x.flatten(2).isfinite().any(-1).double().mean(1),
+            probability_best=probability_best,
+            probability_valid=num_valid / num_counted.double(),
             bound=estimator.bound,
             index=chosen,
             num_simulations=sampler.num_drawn,
-            name=_name(self.actions),
+            name=action_name(self.actions),
             estimator=type(estimator).__name__,
-            num_samples=torch.tensor(
-                [
-                    (2 if replicates else 1) * (len(c) + len(r))
-                    for c, r in zip(*gains, strict=True)
-                ]
-            ),
+            num_samples=torch.tensor(samples),
             stopped=stop,
             notes=tuple(notes),
         )
 
-
-class RandomDesigner:
-    """Choose an action uniformly at random, the design of NSBI and NLHI.
-
-    Args:
-        actions: The action space.
-    """
-
-    def __init__(self, actions: ActionSpace) -> None:
-        self.actions = _discrete(actions)
-
-    def select(
+    def _prepare(
         self,
-        model: Any = None,
-        simulator: Callable[..., Any] | None = None,
-        *,
-        belief: Distribution | None = None,
-        seed: int | None = None,
-    ) -> Design:
-        """Return a random action; model, simulator and belief are not used."""
-        with forked_generators(seed):
-            chosen = int(torch.randint(len(self.actions), ()))
-        unknown = torch.full((len(self.actions),), torch.nan, dtype=torch.float64)
-        return Design(
-            action=self.actions.values[chosen],
-            candidates=self.actions.values,
-            expected_information_gain=unknown,
-            standard_error=unknown,
-            difference_standard_error=unknown,
-            probability_best=unknown,
-            probability_valid=unknown,
-            bound="none",
-            index=chosen,
-            num_simulations=0,
-            name=_name(self.actions),
-            num_samples=torch.zeros(len(self.actions)).long(),
+        model: Any,
+        simulator: Callable[..., Any] | None,
+        belief: Distribution | None,
+        target: str | Sequence[str],
+        seed: int,
+    ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None, Any]:
+        """Return what draws outcomes, the estimator (None: by checks), and belief."""
+        if target != "theta" and self.estimator != "auto":
+            raise ValueError(
+                f"expected estimator='auto' for target={target!r}, whose estimator is "
+                f"its own; got {self.estimator!r}; do leave out estimator="
+            )
+        if target == "model":
+            if not isinstance(model, Sequence):
+                raise ValueError(
+                    "expected a sequence of rivals for target='model'; got "
+                    f"{type(model).__name__}; do pass objects with probability and "
+                    "predict(action, num_samples, seed)"
+                )
+            rivals: Sequence[RivalPredictive] = model
+            sampler = RivalSampler(rivals, self.actions.values, seed)
+            return sampler, ModelIndexGain(sampler.probability), None
+        if simulator is None:
+            raise ValueError(
+                "expected a simulator; got None; do pass the one that the belief's "
+                "parameters belong to"
+            )
+        belief = getattr(model, "belief", None) if belief is None else belief
+        if belief is None:
+            raise ValueError(
+                "expected belief=, the distribution of the parameters; got none, and "
+                "the model has none; do pass the belief of this round"
+            )
+        if target == "theta":
+            estimator = find_estimator(self.estimator)
+        else:
+            estimator = ParameterGain(_parameters(target, simulator))
+        if estimator is not None and estimator.needs_model and model is None:
+            raise ValueError(
+                f"expected a model for {type(estimator).__name__}; got None; do pass "
+                "the trained posterior, or estimator='auto'"
+            )
+        sampler = CandidateSampler(simulator, belief, self.actions.values, seed)
+        return sampler, estimator, belief
+
+
+def _parameters(target: str | Sequence[str], simulator: Any) -> list[int]:
+    """Return the places of parameters by name."""
+    names = getattr(simulator, "parameter_names", None)
+    if not names:
+        raise ValueError(
+            f"expected a simulator with parameter_names for target={target!r}; got "
+            "none; do build SimulatorModel(fn, parameter_names=[...])"
         )
-
-
-def _discrete(actions: ActionSpace) -> DiscreteActions:
-    if not isinstance(actions, DiscreteActions):
-        raise TypeError(
-            f"expected DiscreteActions; got {type(actions).__name__}; do list the "
-            "candidates, DiscreteActions(values)"
+    wanted = [target] if isinstance(target, str) else list(target)
+    unknown = [name for name in wanted if name not in names]
+    if unknown or not wanted:
+        raise ValueError(
+            f"expected target 'theta', 'model' or names among {list(names)}; got "
+            f"{target!r}; do choose one or more of these"
         )
-    return actions
-
-
-def _name(actions: DiscreteActions) -> str:
-    if actions.action_dim > 1:
-        return "action"
-    unit = actions.units[0]
-    return actions.names[0] + (f" [{unit}]" if unit else "")
+    return [list(names).index(name) for name in wanted]
 
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:

@@ -132,6 +132,106 @@ def test_invalid_outcomes_count():
     assert design.action.tolist() == [1.0]
 
 
+def falls_off(theta, action):
+    """A measurement with a probability that falls with the push; some are partial."""
+    x = simulator(theta, action)
+    x[torch.rand(len(x)) < 0.5, 1] = torch.nan  # partly observed: a measurement
+    lost = torch.rand(len(x), 1) < 0.3 * action
+    return x.masked_fill(lost, torch.nan)
+
+
+def test_a_measurement_that_is_too_improbable_excludes_an_action():
+    designer = InformationGainDesigner(
+        ACTIONS, num_samples=2_000, estimator="posterior"
+    )
+
+    class Model(ExactModel):
+        def log_posterior(self, theta, x, action):
+            known = x.isfinite()
+            log_q = super().log_posterior(theta, x.nan_to_num(), action)
+            return torch.where(known.all(1), log_q, PRIOR.log_prob(theta))
+
+    free = designer.select(Model(), falls_off, seed=0)
+    exact = 1 - 0.3 * VALUES
+    error = (exact * (1 - exact) / free.num_samples).sqrt()
+    assert ((free.probability_valid - exact).abs() <= 4 * error).all()
+    safe = designer.select(Model(), falls_off, min_probability_valid=0.6, seed=0)
+    assert free.action.tolist() == [2.0]  # negative control
+    assert safe.action.tolist() == [1.0]
+    assert safe.probability_best[3] == 0
+    assert safe.probability_best.sum() == pytest.approx(1.0)
+    assert safe.expected_information_gain.isfinite().all()
+    (note,) = safe.notes
+    assert note.startswith("1 of 4 candidates excluded: a measurement is less probable")
+    only_hard = InformationGainDesigner(
+        DiscreteActions([1.5, 2.0]), num_samples=400, estimator="posterior"
+    )
+    with pytest.raises(ValueError, match=r"at least 0.9; got 0\.5\d* at most"):
+        only_hard.select(Model(), falls_off, min_probability_valid=0.9, seed=0)
+
+
+def test_a_random_choice_can_avoid_actions_that_fail():
+    designer = RandomDesigner(ACTIONS)
+
+    def select(seed):
+        return designer.select(
+            None, falls_off, belief=PRIOR, min_probability_valid=0.6, seed=seed
+        )
+
+    designs = [select(seed) for seed in range(40)]
+    chosen = {float(design.action) for design in designs}
+    assert chosen == {0.0, 0.5, 1.0}
+    exact = 1 - 0.3 * VALUES
+    distance = (designs[0].probability_valid - exact).abs()
+    assert (distance <= 4 * (exact * (1 - exact) / 200).sqrt()).all()
+    assert designs[0].num_simulations == 800
+    with pytest.raises(ValueError, match="got no simulator"):
+        designer.select(belief=PRIOR, min_probability_valid=0.5)
+    with pytest.raises(ValueError, match="got no belief"):
+        designer.select(None, falls_off, min_probability_valid=0.5)
+
+
+def test_named_parameters_are_the_target():
+    """The first action tells about one parameter, the second about the other."""
+
+    def one_at_a_time(theta, action):
+        gain = torch.tensor([8.0, 2.0])
+        return torch.where(action > 0.5, gain * theta, gain.flip(0) * theta).gather(
+            1, (action > 0.5).long()
+        )
+
+    model = SimulatorModel(
+        one_at_a_time, noise=GaussianNoise(1.0), parameter_names=["mass", "friction"]
+    )
+    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=400)
+
+    def select(target):
+        return designer.select(None, model, belief=PRIOR, target=target, seed=0)
+
+    mass, friction = select("mass"), select(["friction"])
+    assert (mass.action.tolist(), friction.action.tolist()) == ([0.0], [1.0])
+    assert (mass.estimator, mass.bound) == ("ParameterGain", "lower")
+    exact = torch.tensor([0.5 * torch.log1p(torch.tensor(4.0)), 0.0]).double()
+    for design, values in ((mass, exact), (friction, exact.flip(0))):
+        error = design.standard_error
+        gain = design.expected_information_gain
+        assert (gain < values + 3 * error + 0.01).all()
+        assert (gain > values - 0.15 - 3 * error).all()
+    both = select(["mass", "friction"])
+    assert (both.expected_information_gain > exact.max() - 0.3).all()
+    with pytest.raises(
+        ValueError, match=r"names among \['mass', 'friction'\]; got 'm'"
+    ):
+        select("m")
+    with pytest.raises(ValueError, match="expected a simulator with parameter_names"):
+        designer.select(None, simulator, belief=PRIOR, target="mass")
+    nested = InformationGainDesigner(ACTIONS, estimator="nested")
+    with pytest.raises(ValueError, match="expected estimator='auto' for target='mass'"):
+        nested.select(None, model, belief=PRIOR, target="mass")
+    with pytest.raises(ValueError, match="expected a simulator; got None"):
+        designer.select(None, belief=PRIOR)
+
+
 def six_numbers(theta, action):
     mean = action * theta
     return torch.cat([mean, 2 * mean, mean], 1) + torch.randn(len(theta), 6)

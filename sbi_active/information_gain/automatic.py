@@ -15,6 +15,7 @@ from sbi_active.information_gain.base import (
 from sbi_active.information_gain.entropy import EntropyGain
 from sbi_active.information_gain.nested import NestedGain
 from sbi_active.information_gain.posterior import PosteriorGain
+from sbi_active.information_gain.race import standard_error
 
 __all__ = [
     "ESTIMATORS",
@@ -81,11 +82,6 @@ def choose_estimator(
     for option in options:
         problems = option.problems(simulations)
         if not problems:
-            if isinstance(option, NestedGain) and simulations.noise is None:
-                notes.append(
-                    "noise not declared: it and the mean are learned from pairs, which "
-                    "can be off by 1 nat where x varies fast with theta"
-                )
             return option, notes
         notes += [f"{type(option).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
@@ -97,7 +93,7 @@ def disagreements(
     estimator: InformationGainEstimator,
     model: Any,
     simulations: CandidateSimulations,
-    belief: Distribution,
+    belief: Distribution | None,
     gain: Tensor,
 ) -> list[str]:
     """Compare an estimator with the others that apply.
@@ -123,8 +119,8 @@ def disagreements(
         rows = simulations.unpaired() if not other.needs_noise else simulations
         contributions = other(model, rows, belief)[:, : gain.shape[1]]
         difference = contributions - gain
-        error = difference.std(1) / difference.shape[1] ** 0.5
-        mean = difference.mean(1)
+        error = torch.stack([standard_error(row) for row in difference])
+        mean = difference.nanmean(1)
         apart = mean.abs() > DISAGREEMENT + 4 * error
         if not bool(apart.any()):
             continue

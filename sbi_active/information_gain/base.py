@@ -28,6 +28,9 @@ class CandidateSimulations:
         mean: Noise-free outcomes, as x; None where the noise is not declared.
         noise: The declared noise around the mean.
         replicate: Second outcomes at the same parameters, as x; None for none.
+        missing: Rows lost to a fault that has nothing to do with the parameters, shape
+            (a, n), bool, the replicate's included; None for none. They are ignored,
+            unlike outcomes without a measurement, whose NaN is information.
     """
 
     theta: Tensor
@@ -36,14 +39,45 @@ class CandidateSimulations:
     mean: Tensor | None = None
     noise: NoiseModel | None = None
     replicate: Tensor | None = None
+    missing: Tensor | None = None
+
+    @property
+    def counted(self) -> Tensor:
+        """Rows that are not missing, shape (a, n), bool."""
+        if self.missing is None:
+            return torch.ones(self.x.shape[:2]).bool()
+        return ~self.missing
 
     @property
     def complete(self) -> Tensor:
         """Outcomes without any NaN, shape (a, n), bool; their replicates as well."""
-        complete = self.x.flatten(2).isfinite().all(-1)
-        if self.replicate is not None:
-            complete &= self.replicate.flatten(2).isfinite().all(-1)
-        return complete
+        return self.completeness == 1
+
+    @property
+    def completeness(self) -> Tensor:
+        """Share of a row's outcomes, x and replicate, without NaN, shape (a, n)."""
+        parts = [part.flatten(2).isfinite().all(-1) for part in self.outcomes()]
+        return torch.stack(parts).double().mean(0) * self.counted
+
+    @property
+    def partly_observed(self) -> Tensor:
+        """Outcomes of which some numbers are present, shape (a, n), bool."""
+        present = [part.flatten(2).isfinite() for part in self.outcomes()]
+        partly = [part.any(-1) & ~part.all(-1) for part in present]
+        return torch.stack(partly).any(0) & self.counted
+
+    def num_valid(self) -> tuple[Tensor, Tensor]:
+        """Return how many outcomes have a measurement, and of how many, both (a,).
+
+        A partly observed outcome has one; missing rows are not counted.
+        """
+        parts = [part.flatten(2).isfinite().any(-1) for part in self.outcomes()]
+        valid = (torch.stack(parts) & self.counted).sum((0, 2))
+        return valid, len(parts) * self.counted.sum(1)
+
+    def outcomes(self) -> list[Tensor]:
+        """Return x and, where there are any, replicates."""
+        return [self.x] if self.replicate is None else [self.x, self.replicate]
 
     def rows(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return theta, x and action with one row a pair, a * n rows each."""
@@ -56,25 +90,26 @@ class CandidateSimulations:
 
     def candidates(self, index: Tensor) -> CandidateSimulations:
         """Return some candidates, index (k,)."""
-        parts = {name: part[index] for name, part in self._outcomes().items()}
+        parts = {name: part[index] for name, part in self._parts().items()}
         return replace(self, action=self.action[index], **parts)
 
     def samples(self, rows: slice) -> CandidateSimulations:
         """Return some of the simulations of every candidate."""
-        parts = {name: part[:, rows] for name, part in self._outcomes().items()}
+        parts = {name: part[:, rows] for name, part in self._parts().items()}
         return replace(self, theta=self.theta[rows], **parts)
 
     def join(self, other: CandidateSimulations) -> CandidateSimulations:
         """Return these and further simulations of the same candidates."""
-        more = other._outcomes()
+        more = other._parts()
         parts = {
             name: torch.cat([part, more[name]], 1)
-            for name, part in self._outcomes().items()
+            for name, part in self._parts().items()
         }
         return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
 
-    def _outcomes(self) -> dict[str, Tensor]:
-        parts = {"x": self.x, "mean": self.mean, "replicate": self.replicate}
+    def _parts(self) -> dict[str, Tensor]:
+        names = ("x", "mean", "replicate", "missing")
+        parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 
     def unpaired(self) -> CandidateSimulations:
@@ -82,7 +117,9 @@ class CandidateSimulations:
         if self.replicate is None:
             return self
         x = torch.cat([self.x, self.replicate], 1)
-        return CandidateSimulations(self.theta.repeat(2, 1), self.action, x)
+        missing = None if self.missing is None else self.missing.repeat(1, 2)
+        theta = self.theta.repeat(2, 1)
+        return CandidateSimulations(theta, self.action, x, missing=missing)
 
 
 class InformationGainEstimator(ABC):
@@ -99,17 +136,21 @@ class InformationGainEstimator(ABC):
     needs_model: bool = True
 
     def __call__(
-        self, model: Any, simulations: CandidateSimulations, belief: Distribution
+        self,
+        model: Any,
+        simulations: CandidateSimulations,
+        belief: Distribution | None,
     ) -> Tensor:
         r"""Return the contribution of every simulation; their mean is the estimate.
 
         Args:
             model: What was learned, see the estimator.
             simulations: Fresh simulations, not those the model was trained on.
-            belief: Density of theta in the simulations.
+            belief: Density of theta in the simulations; None where an estimator has no
+                use for it.
 
         Returns:
-            Shape (a, n), nats, float64.
+            Shape (a, n), nats, float64; NaN for missing rows.
 
         Raises:
             ValueError: If shapes do not fit, or the noise is neither declared nor
@@ -130,7 +171,8 @@ class InformationGainEstimator(ABC):
                 "fn, or simulate every theta twice"
             )
         with torch.no_grad():
-            return self._contributions(model, simulations, belief).double()
+            gain = self._contributions(model, simulations, belief).double()
+        return gain.masked_fill(~simulations.counted, torch.nan)
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
         """Return what speaks against the estimator on these simulations.
@@ -143,8 +185,16 @@ class InformationGainEstimator(ABC):
         """
         return []
 
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
+        """Return what to know of an estimate from these simulations.
+
+        Args:
+            simulations: As in a call.
+        """
+        return []
+
     @abstractmethod
     def _contributions(
-        self, model: Any, simulations: CandidateSimulations, belief: Distribution
+        self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
         """Return the contributions, shape (a, n)."""

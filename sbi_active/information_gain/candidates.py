@@ -11,11 +11,12 @@ from torch.distributions import Distribution
 
 from sbi_active.information_gain.base import CandidateSimulations
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
-from sbi_active.simulation import SimulatorModel, require_noise, simulate
+from sbi_active.simulation import Outcome, SimulatorModel, require_noise, simulate
 
 __all__ = ["CandidateSampler"]
 
 FEW = 16  # rows to look at a simulator
+RETRIED = 64  # rows without a measurement to simulate again: was it luck
 
 
 class CandidateSampler:
@@ -67,23 +68,53 @@ class CandidateSampler:
         self.num_drawn += len(rows[0]) * (2 if paired else 1)
         shape = (len(action), num)
 
-        def run(simulator: Callable[..., Any], key: str) -> Tensor:
+        def run(simulator: Callable[..., Any], key: str) -> tuple[Tensor, Tensor]:
             seed = derive_seed(self.seed, key, self._num_waves)
-            x = simulate(simulator, *rows, seed=seed).x
-            return x.reshape(*shape, *x.shape[1:])
+            drawn = simulate(simulator, *rows, seed=seed)
+            x = drawn.x.reshape(*shape, *drawn.x.shape[1:])
+            return x, (drawn.status == Outcome.MISSING).reshape(shape)
 
         if self.declared:
             assert isinstance(self.simulator, SimulatorModel)
             noise = self.simulator.noise
             assert noise is not None
-            mean = run(self.simulator.mean, "x")
+            mean, missing = run(self.simulator.mean, "x")
+            if self._num_waves == 1 and self._lost_by_luck(rows, mean.flatten(0, 1)):
+                self.declared = False
+                return self.draw(num_samples, candidates, replicates=replicates)
             seeds = row_seeds(derive_seed(self.seed, "noise", self._num_waves), num)
             seeds = seeds.repeat(len(action))  # the same noise for all candidates
             x = noise.sample(mean.flatten(0, 1), seeds).float().reshape(mean.shape)
-            return CandidateSimulations(theta, action, x, mean, noise)
-        x = run(self.simulator, "x")
-        again = run(self.simulator, "again") if paired else None
-        return CandidateSimulations(theta, action, x, replicate=again)
+            return CandidateSimulations(
+                theta, action, x, mean, noise, missing=_if_any(missing)
+            )
+        x, missing = run(self.simulator, "x")
+        again = None
+        if paired:
+            again, lost = run(self.simulator, "again")
+            missing |= lost
+        return CandidateSimulations(
+            theta, action, x, replicate=again, missing=_if_any(missing)
+        )
+
+    def _lost_by_luck(self, rows: tuple[Tensor, Tensor], mean: Tensor) -> bool:
+        """Simulate rows without a measurement again: is there one this time.
+
+        Then presence is random given the parameters, and only replicates tell how much.
+        """
+        present = mean.flatten(1).isfinite()
+        lost = torch.nonzero(~present.all(1))[:, 0]
+        if len(lost) == 0:
+            return False
+        lost = lost[:: -(-len(lost) // RETRIED)]
+        self.num_drawn += len(lost)
+        assert isinstance(self.simulator, SimulatorModel)
+        theta, action = (part[lost] for part in rows)
+        seed = derive_seed(self.seed, "retry")
+        again = simulate(self.simulator.mean, theta, action, seed=seed)
+        known = again.status != Outcome.MISSING
+        same = again.x.flatten(1).isfinite() == present[lost]
+        return not bool(same[known].all())
 
     def _probe(self) -> bool:
         """Look at a few rows: is there noise, and is the declared mean reproducible."""
@@ -100,5 +131,8 @@ class CandidateSampler:
         model = self.simulator
         if not isinstance(model, SimulatorModel) or model.noise is None:
             return False
-        first, second = run(model.mean, "first"), run(model.mean, "second")
-        return bool(torch.equal(first.nan_to_num(), second.nan_to_num()))
+        return model.is_deterministic(theta, action)
+
+
+def _if_any(missing: Tensor) -> Tensor | None:
+    return missing if bool(missing.any()) else None

@@ -15,7 +15,11 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
-from sbi_active.information_gain.missing import presence_information
+from sbi_active.information_gain.presence import (
+    presence_information,
+    presence_notes,
+    presence_problems,
+)
 from sbi_active.seeding import forked_generators
 
 __all__ = ["EntropyGain", "conditional_entropy", "with_control"]
@@ -48,15 +52,17 @@ class EntropyGain(InformationGainEstimator):
     parameters and the log of its variances quadratic in them, fitted to pairs of
     outcomes at the same theta; :meth:`problems` tests normality.
 
-    Where numbers of x are missing,
+    Where outcomes lack numbers,
 
     .. math::
         I(\theta; x) \ge I(\theta; v) + P(\text{complete})\,
         I(\theta; x \mid \text{complete}),
 
-    with v what is present; only the values of outcomes with some numbers missing are
-    left out. A conditional entropy given completeness is that of the noise: exact where
-    completeness is a function of theta.
+    with v what is present, see
+    :func:`~sbi_active.information_gain.presence.presence_information`; equal where
+    outcomes are complete or empty, as only the numbers of partly observed ones are left
+    out. Given completeness, theta follows the belief conditioned on it, and the noise
+    is taken to be what it is without.
 
     Args:
         num_neighbors: k; more have less variance and more bias at edges.
@@ -81,21 +87,24 @@ class EntropyGain(InformationGainEstimator):
     ) -> Tensor:
         gain = presence_information(simulations)
         entropy, surprise = conditional_entropy(simulations)
-        for a, rows in enumerate(simulations.complete):
-            if int(rows.sum()) <= max(self.num_neighbors, simulations.x[a, 0].numel()):
-                continue  # too few measurements: what is present still counts
-            log_density = -nearest_neighbor_entropy(
-                simulations.x[a, rows].flatten(1).double(), self.num_neighbors
-            )
-            if simulations.replicate is not None:
-                log_density = 0.5 * log_density - 0.5 * nearest_neighbor_entropy(
-                    simulations.replicate[a, rows].flatten(1).double(),
-                    self.num_neighbors,
+        outcomes = simulations.outcomes()
+        for x in outcomes:
+            complete = x.flatten(2).isfinite().all(-1) & simulations.counted
+            for a, rows in enumerate(complete):
+                few = int(rows.sum()) <= max(self.num_neighbors, x[a, 0].numel())
+                if few or bool(entropy[a, rows].isnan().any()):
+                    continue  # too few measurements: what is present still counts
+                log_density = -nearest_neighbor_entropy(
+                    x[a, rows].flatten(1).double(), self.num_neighbors
                 )
-            gain[a, rows] += with_control(
-                -log_density - entropy[a, rows], surprise[a, rows] - entropy[a, rows]
-            )
+                gain[a, rows] += with_control(
+                    -log_density - entropy[a, rows],
+                    surprise[a, rows] - entropy[a, rows],
+                ) / len(outcomes)
         return gain
+
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
+        return presence_notes(simulations)
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
         r"""Test by pairs whether undeclared noise is Gaussian.
@@ -105,8 +114,9 @@ class EntropyGain(InformationGainEstimator):
         """
         if int(simulations.complete.sum(1).max()) < FEW:
             return [f"fewer than {FEW} complete outcomes a candidate"]
+        problems = presence_problems(simulations)
         if simulations.noise is not None or simulations.replicate is None:
-            return []
+            return problems
         pooled = [
             standardized_pairs(simulations, a, rows)[0].T.flatten()
             for a, rows in enumerate(simulations.complete)
@@ -116,8 +126,11 @@ class EntropyGain(InformationGainEstimator):
         excess = float((z**4).mean() / (z**2).mean() ** 2 - 3)
         limit = max(SIGNIFICANT * (24 / len(z)) ** 0.5, MAX_KURTOSIS)
         if abs(excess) <= limit:
-            return []
-        return [f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}"]
+            return problems
+        return [
+            *problems,
+            f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}",
+        ]
 
 
 def nearest_neighbor_entropy(x: Tensor, num_neighbors: int) -> Tensor:
@@ -146,7 +159,8 @@ def nearest_neighbor_entropy(x: Tensor, num_neighbors: int) -> Tensor:
 def conditional_entropy(simulations: CandidateSimulations) -> tuple[Tensor, Tensor]:
     r"""Return the noise's entropy and surprise, :math:`-\log p(x_i | \theta_i)`.
 
-    Without declared noise both are the entropy, :math:`H(x | \theta_i)`.
+    Without declared noise both are the entropy, :math:`H(x | \theta_i)`, with what the
+    pair i adds to its estimate; NaN where pairs are too few.
 
     Args:
         simulations: With declared noise or replicates.
@@ -157,10 +171,15 @@ def conditional_entropy(simulations: CandidateSimulations) -> tuple[Tensor, Tens
     mean, noise = simulations.mean, simulations.noise
     shape = simulations.x.shape[:2]
     if mean is None or noise is None:
-        entropy = torch.zeros(shape, dtype=torch.float64)
+        entropy = torch.full(shape, torch.nan, dtype=torch.float64)
+        share = simulations.completeness.mean(1)
         for a, rows in enumerate(simulations.complete):
             if int(rows.sum()) > simulations.x[a, 0].numel() + 1:
-                entropy[a, rows] = standardized_pairs(simulations, a, rows)[1]
+                z, entropy[a] = standardized_pairs(simulations, a, rows)
+                # the noise is estimated: of mean zero, so that errors include it
+                square = torch.linalg.solve(z.T @ z / len(z), z.T)
+                influence = 0.5 * ((z.T * square).sum(0) - z.shape[1])
+                entropy[a, rows] += share[a] / rows.double().mean() * influence
         return entropy, entropy
     mean = mean.flatten(0, 1).double()
     surprise = -noise.log_prob(simulations.x.flatten(0, 1), mean)
@@ -179,28 +198,34 @@ def standardized_pairs(
     :math:`\log \sigma_c^2(\theta)` is quadratic where a regression of the log squares
     on theta is significant, else constant.
 
+    Args:
+        simulations: With replicates.
+        index: Of the candidate.
+        rows: Pairs to fit to, shape (n,), bool.
+
     Returns:
-        Standardized differences, shape (n, d), and the entropies, shape (n,).
+        Standardized differences of the pairs, and the entropies at all parameters,
+        shape (n,).
     """
     assert simulations.replicate is not None
     difference = simulations.x[index, rows] - simulations.replicate[index, rows]
     difference = difference.flatten(1).double() / 2**0.5
     n, d = difference.shape
-    theta = simulations.theta[rows].double()
-    z = (theta - theta.mean(0)) / theta.std(0).clamp_min(1e-30)
-    features = torch.cat([torch.ones(n, 1).double(), z, z**2], 1)
+    theta = simulations.theta.double()
+    z = (theta - theta[rows].mean(0)) / theta[rows].std(0).clamp_min(1e-30)
+    everywhere = torch.cat([torch.ones(len(z), 1).double(), z, z**2], 1)
+    features = everywhere[rows]
     scale = difference.square().mean(0).clamp_min(1e-60).sqrt()
     log_square = (difference / scale).square().clamp_min(1e-12).log()
     log_square = log_square - log_square.mean(0)
+    half = torch.zeros(len(theta), d, dtype=torch.float64)
     freedom = features.shape[1] - 1
     if n > 5 * freedom:
-        fitted = features @ torch.linalg.lstsq(features, log_square).solution
-        chi_square = fitted.square().sum(0) / LOG_SQUARE_VARIANCE
+        slope = torch.linalg.lstsq(features, log_square).solution
+        chi_square = (features @ slope).square().sum(0) / LOG_SQUARE_VARIANCE
         limit = freedom + 5 * math.sqrt(2 * freedom)  # homogeneous unless it is clear
-        half = 0.5 * torch.where(chi_square > limit, fitted, 0.0)
-    else:
-        half = torch.zeros_like(log_square)
-    standardized = difference / half.exp()
+        half = 0.5 * torch.where(chi_square > limit, everywhere @ slope, 0.0)
+    standardized = difference / half[rows].exp()
     scale = standardized.square().mean(0).clamp_min(1e-60).sqrt()
     standardized = standardized / scale
     correlation = standardized.T @ standardized / n

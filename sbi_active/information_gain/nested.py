@@ -2,7 +2,6 @@ r"""Information gain by nested Monte Carlo, local draws through an emulator."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -13,24 +12,24 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
+from sbi_active.information_gain.completeness import completeness
 from sbi_active.information_gain.emulator import MeanEmulator
 from sbi_active.information_gain.entropy import (
     EntropyGain,
     conditional_entropy,
     with_control,
 )
-from sbi_active.information_gain.missing import presence_information
+from sbi_active.information_gain.evidence import Evidence, log_belief
+from sbi_active.information_gain.presence import (
+    presence_information,
+    presence_notes,
+    presence_problems,
+)
 from sbi_active.information_gain.smoothing import declare, fill
-from sbi_active.seeding import forked_generators
-from sbi_active.simulation import GaussianNoise, NoiseModel
+from sbi_active.simulation import NoiseModel
 
 __all__ = ["NestedGain"]
 
-DEGREES = 6  # of freedom of the Student-t proposals; even
-WIDER = 1.2  # than the linearized posterior
-ENOUGH = 50  # effective draws of the belief that need no local ones
-DEFENSE = 4  # every fourth local draw is close to theta_i itself ...
-CLOSER = 0.2  # ... at this share of the posterior's width, lest all others miss
 FEW = 20  # outcomes too few for an emulator
 MAX_MISSED = 0.5  # of the numbers of x, by smoothing, more than by the noise
 PAIRS = 5  # for each number of x, to estimate its noise
@@ -67,8 +66,10 @@ class NestedGain(InformationGainEstimator):
     Gaussian noise of one covariance a candidate, and an outcome smooth in theta. The
     estimate is then the information of the learned model.
 
-    Where an outcome has missing numbers, the noise-free ones decide which parameters
-    can give complete outcomes, elsewhere the nearest simulation does.
+    Where outcomes lack numbers, those that are complete are compared under the belief
+    given completeness. The noise-free outcomes decide which parameters give complete
+    ones, and elsewhere the nearest simulation does; where completeness is random given
+    the parameters, its probability is a logistic function fitted to all simulations.
 
     Args:
         num_local: l.
@@ -90,6 +91,7 @@ class NestedGain(InformationGainEstimator):
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
     ) -> Tensor:
         gain = presence_information(simulations)
+        chances = completeness(simulations)
         if simulations.noise is None:
             simulations, _ = declare(simulations)
         mean, noise = _declared(simulations)
@@ -102,18 +104,19 @@ class NestedGain(InformationGainEstimator):
         )
         slopes = emulator.slope(emulator.knots)
         q = filled.shape[-1]
-        for a, rows in enumerate(simulations.complete):
+        for a, complete in enumerate(chances):
+            rows = complete.share > 0
             if int(rows.sum()) < FEW:
                 continue
-            evidence = _Evidence(
+            evidence = Evidence(
                 emulator=emulator,
                 columns=slice(a * q, (a + 1) * q),
                 mean=mean[a].double(),
                 scale=scale[a],
-                possible=mean[a].flatten(1).isfinite().all(1),
+                complete=complete,
                 noise=noise,
                 belief=belief,
-                log_belief=_log_density(belief, emulator, emulator.knots),
+                log_belief=log_belief(belief, emulator, emulator.knots),
             )
             log_p = evidence(
                 simulations.x[a].double(),
@@ -121,11 +124,20 @@ class NestedGain(InformationGainEstimator):
                 torch.nonzero(rows)[:, 0],
                 self.num_local,
             )
-            log_p -= rows.double().mean().log()  # given completeness
-            gain[a, rows] += with_control(
+            log_p -= complete.log_probability
+            gain[a, rows] += complete.share[rows] * with_control(
                 -log_p - entropy[a, rows], surprise[a, rows] - entropy[a, rows]
             )
         return gain
+
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
+        notes = presence_notes(simulations)
+        if simulations.noise is None:
+            notes.append(
+                "noise not declared: it and the mean are learned from pairs, which can "
+                "be off by 1 nat where x varies fast with theta"
+            )
+        return notes
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
         """Compare leave-one-out errors of emulator or smoothing with the noise.
@@ -150,123 +162,13 @@ class NestedGain(InformationGainEstimator):
         f = filled / noise_scale(simulations)[:, None]
         error = MeanEmulator.fit(theta, f.transpose(0, 1).flatten(1)).error
         share = float((error.abs() > MAX_ERROR).double().mean())
+        problems = presence_problems(simulations)
         if share <= MAX_SHARE:
-            return []
-        return [f"the emulator misses {share:.0%} of outcomes by more than the noise"]
-
-
-class _Evidence:
-    """The log evidence of outcomes of one candidate, log p(x_i)."""
-
-    def __init__(
-        self,
-        *,
-        emulator: MeanEmulator,
-        columns: slice,
-        mean: Tensor,
-        scale: Tensor,
-        possible: Tensor,
-        noise: NoiseModel,
-        belief: Distribution,
-        log_belief: Tensor,
-    ) -> None:
-        self.emulator, self.columns = emulator, columns
-        self.mean, self.scale, self.possible = mean, scale, possible
-        self.noise, self.belief, self.log_belief = noise, belief, log_belief
-        self.knots = emulator.knots
-
-    def __call__(
-        self, x: Tensor, slope: Tensor, rows: Tensor, num_local: int
-    ) -> Tensor:
-        """Return log evidences with Jensen's bias removed, shape (rows,)."""
-        m = int(self.possible.numel()) - 1
-        parts = []
-        with forked_generators(0):  # the same base draws for all candidates
-            for some in rows.split(BLOCK):
-                shared = self._shared(x, some)
-                log_p, variance = _log_mean(shared, m, m)
-                poor = torch.nonzero(~(variance + 1 / m <= 1 / ENOUGH))[:, 0]
-                if len(poor):
-                    i = some[poor]
-                    terms = self._with_local(x[i], slope[i], i, shared[poor], num_local)
-                    log_p[poor], variance[poor] = _log_mean(terms, m, m + num_local)
-                parts.append(log_p + 0.5 * variance)
-        return torch.cat(parts)
-
-    def _shared(self, x: Tensor, rows: Tensor) -> Tensor:
-        """Log density p(x_i | theta_j), -inf for j = i, shape (rows, n)."""
-        mean = torch.where(self.possible.reshape(-1, *[1] * (x.ndim - 1)), self.mean, 0)
-        log_term = _pairwise(self.noise, x[rows], mean)
-        log_term[:, ~self.possible] = -torch.inf
-        log_term[torch.arange(len(rows)), rows] = -torch.inf
-        return log_term
-
-    def _with_local(
-        self, x: Tensor, slope: Tensor, i: Tensor, shared: Tensor, num_local: int
-    ) -> Tensor:
-        """Log terms of the sum of simulations and local draws, shape (i, n + l)."""
-        location, factor = self._linearized(x, slope, i)
-        n, d = location.shape
-        ratio = math.log(num_local / (len(self.knots) - 1))
-        step = _student((n, num_local, d)) @ factor.mT
-        near = (torch.arange(num_local) % DEFENSE == 0)[:, None]
-        start = self.knots[i][:, None]
-        z = torch.where(near, start + CLOSER * step, location[:, None] + step)
-        flat = z.flatten(0, 1)
-        log_b = _log_density(self.belief, self.emulator, flat).reshape(n, num_local)
-        if not bool(self.possible.all()):
-            nearest = torch.cdist(flat, self.knots).argmin(1)
-            log_b[~self.possible[nearest].reshape(n, num_local)] = -torch.inf
-        inside = torch.nonzero(log_b.flatten().isfinite())[:, 0]
-        mean = self.emulator(flat[inside], self.columns) * self.scale
-        outcome = x.repeat_interleave(num_local, 0)[inside]
-        local = torch.full((n * num_local,), -torch.inf).double()
-        local[inside] = self.noise.log_prob(outcome, mean.reshape(outcome.shape))
-        local = local.reshape(n, num_local)
-        log_t = self._log_proposal(z, location, i, factor)
-        local = local - torch.nn.functional.softplus(
-            ratio + torch.where(log_b.isfinite(), log_t - log_b, 0.0)
-        )
-        log_t = self._log_proposal(self.knots, location, i, factor)
-        shared = shared - torch.nn.functional.softplus(ratio + log_t - self.log_belief)
-        return torch.cat([shared, local], 1)
-
-    def _log_proposal(
-        self, z: Tensor, location: Tensor, i: Tensor, factor: Tensor
-    ) -> Tensor:
-        """Log density of the local draws, shape (i, k)."""
-        mode = _log_student(z - location[:, None], factor)
-        near = _log_student(z - self.knots[i][:, None], CLOSER * factor)
-        return torch.logaddexp(
-            mode + math.log(1 - 1 / DEFENSE), near - math.log(DEFENSE)
-        )
-
-    def _linearized(self, x: Tensor, slope: Tensor, i: Tensor) -> tuple[Tensor, Tensor]:
-        """Location and lower factor of the posterior given x, one step from theta_i.
-
-        The belief enters as the Gaussian of its draws' moments. A step is kept where
-        it does not raise the misfit.
-        """
-        z, d = self.knots[i], self.knots.shape[1]
-        center = self.knots.mean(0)
-        spread = torch.cov(self.knots.T).reshape(d, d) + 1e-9 * torch.eye(d)
-        prior = torch.linalg.inv(spread)
-
-        def misfit(z: Tensor, residual: Tensor) -> Tensor:
-            offset = z - center
-            return residual.square().sum(1) + (offset @ prior * offset).sum(1)
-
-        residual = (x - self.mean[i]).flatten(1) / self.scale
-        precision = slope.mT @ slope + prior
-        gradient = (slope.mT @ residual[..., None])[..., 0] - (z - center) @ prior
-        moved = z + torch.linalg.solve(precision, gradient[..., None])[..., 0]
-        after = x.flatten(1) / self.scale - self.emulator(moved, self.columns)
-        better = misfit(moved, after) < misfit(z, residual)
-        location = torch.where(better[:, None], moved, z)
-        covariance = torch.linalg.inv(precision)
-        return location, WIDER * torch.linalg.cholesky(
-            0.5 * (covariance + covariance.mT)
-        )
+            return problems
+        return [
+            *problems,
+            f"the emulator misses {share:.0%} of outcomes by more than the noise",
+        ]
 
 
 def noise_scale(simulations: CandidateSimulations) -> Tensor:
@@ -282,57 +184,3 @@ def _declared(simulations: CandidateSimulations) -> tuple[Tensor, NoiseModel]:
     assert simulations.mean is not None
     assert simulations.noise is not None
     return simulations.mean, simulations.noise
-
-
-def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
-    """Log density of every x (n, ...) at every mean (k, ...), shape (n, k)."""
-    if isinstance(noise, GaussianNoise):  # one product of matrices
-        sd = noise.sd.expand(x.shape[1:]).flatten()
-        log_peak = -(sd.log() + 0.5 * math.log(2 * math.pi)).sum()
-        square = torch.cdist(x.flatten(1) / sd, mean.flatten(1) / sd).square_()
-        return log_peak - 0.5 * square
-    n, k = len(x), len(mean)
-    paired = noise.log_prob(
-        x.repeat_interleave(k, 0), mean.repeat(n, *[1] * (x.ndim - 1))
-    )
-    return paired.reshape(n, k)
-
-
-def _log_density(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tensor:
-    """Log density of the belief in the emulator's coordinates, shape (n,)."""
-    theta = emulator.parameters(z).float()
-    try:
-        inside = belief.support.check(theta)  # type: ignore[union-attr]
-    except NotImplementedError:
-        inside = torch.ones(len(theta)).bool()
-    log_b = torch.full((len(z),), -torch.inf).double()
-    if bool(inside.any()):
-        log_b[inside] = belief.log_prob(theta[inside]).double()
-    return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
-
-
-def _log_mean(log_term: Tensor, m: int, num: int) -> tuple[Tensor, Tensor]:
-    """Log of the sum over m, and its variance from num draws; over the last axis."""
-    top = log_term.amax(-1, keepdim=True)
-    top = torch.where(top.isfinite(), top, 0.0)
-    weight = (log_term - top).exp_()
-    first, second = weight.sum(-1), torch.linalg.vecdot(weight, weight)
-    return top[:, 0] + first.log() - math.log(m), second / first.square() - 1 / num
-
-
-def _student(shape: tuple[int, ...]) -> Tensor:
-    uniform = torch.rand(*shape[:-1], DEGREES // 2, dtype=torch.float64)
-    chi_square = -2 * torch.log1p(-uniform).sum(-1, keepdim=True)
-    normal = torch.randn(shape, dtype=torch.float64)
-    return normal * (DEGREES / chi_square).sqrt()
-
-
-def _log_student(offset: Tensor, factor: Tensor) -> Tensor:
-    """Log density at offsets (n, k, d) with lower factors (n, d, d)."""
-    d = offset.shape[-1]
-    inverse = torch.linalg.inv(factor)
-    square = (offset @ inverse.mT).square().sum(-1)
-    norm = math.lgamma((DEGREES + d) / 2) - math.lgamma(DEGREES / 2)
-    norm -= 0.5 * d * math.log(DEGREES * math.pi)
-    log_det = inverse.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-    return norm + log_det - 0.5 * (DEGREES + d) * torch.log1p(square / DEGREES)

@@ -44,17 +44,18 @@ class Race:
         """Compare candidates.
 
         Args:
-            contributions: One tensor a candidate, shape (n,), the first rows common.
+            contributions: One tensor a candidate, shape (n,), the first rows common;
+                NaN where a row is missing.
             seed: Of the draws behind the probabilities.
         """
         longest = max(map(len, contributions))
         generator = torch.Generator().manual_seed(derive_seed(seed, "best"))
         weights = torch.randn(longest, DRAWS, generator=generator, dtype=torch.float64)
-        mean = torch.stack([row.mean() for row in contributions])
+        mean = torch.stack([row.nanmean() for row in contributions])
         draws = torch.stack(
             [
-                row.mean() + (row - row.mean()) @ weights[: len(row)] / len(row)
-                for row in contributions
+                m + (row - m).nan_to_num(0.0) @ weights[: len(row)] / _count(row)
+                for m, row in zip(mean, contributions, strict=True)
             ]
         )
         best = torch.bincount(draws.argmax(0), minlength=len(contributions))
@@ -82,5 +83,10 @@ def paired_errors(contributions: list[Tensor], chosen: int) -> Tensor:
 
 
 def standard_error(contributions: Tensor) -> Tensor:
-    """Standard error of the mean of contributions, shape (n,)."""
-    return contributions.std() / len(contributions) ** 0.5
+    """Standard error of the mean of contributions, shape (n,), NaN where missing."""
+    known = contributions[contributions.isfinite()]
+    return known.std() / len(known) ** 0.5
+
+
+def _count(contributions: Tensor) -> int:
+    return int(contributions.isfinite().sum())

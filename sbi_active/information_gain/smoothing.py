@@ -51,20 +51,25 @@ def declare(simulations: CandidateSimulations) -> tuple[CandidateSimulations, Te
     assert simulations.replicate is not None
     theta, complete = simulations.theta.double(), simulations.complete
     x, again = (
-        torch.where(complete[..., None], part.flatten(2).double(), torch.nan)
+        torch.where(
+            part.flatten(2).isfinite().all(-1, keepdim=True),
+            part.flatten(2).double(),
+            torch.nan,
+        )
         for part in (simulations.x, simulations.replicate)
     )
     num_actions, n, q = x.shape
-    difference = ((x - again) / 2**0.5).nan_to_num()
+    difference = torch.where(complete[..., None], (x - again) / 2**0.5, 0.0)
     share = complete.sum(1).clamp_min(1)[:, None, None]
     floor = (FLOAT32 * x.abs().nan_to_num().amax(1)).square() + 1e-300
     covariance = difference.mT @ difference / share + torch.diag_embed(floor)
     factor = torch.linalg.cholesky(covariance)
-    average = fill(theta, 0.5 * (x + again)).mT
+    average = fill(theta, torch.stack([x, again]).nanmean(0)).mT
     white = torch.linalg.solve_triangular(factor, average, upper=False).mT
     f, square = _smooth(theta, white.transpose(0, 1).flatten(1))
     mean = f.reshape(n, num_actions, q).transpose(0, 1)
-    mean = torch.where(complete[..., None], mean, torch.nan)
+    known = (simulations.completeness > 0)[..., None]
+    mean = torch.where(known, mean, torch.nan)
     with forked_generators(0, "smoothing"):
         x = mean + torch.randn(n, q, dtype=torch.float64)
     declared = replace(

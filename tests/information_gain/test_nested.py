@@ -69,14 +69,14 @@ def test_bias_falls_with_local_draws():
 
 
 def test_any_noise_model_will_do():
-    class Plain(NoiseModel):
+    class Plain(NoiseModel):  # no product of matrices for its pairwise densities
         inner = GaussianNoise(1.0)
 
-        def sample(self, mean, seeds=None):
-            return self.inner.sample(mean, seeds)
+        def sample(self, mean, seeds=None, **options):
+            return self.inner.sample(mean, seeds, **options)
 
-        def log_prob(self, x, mean):
-            return self.inner.log_prob(x, mean)
+        def log_prob(self, x, mean, **options):
+            return self.inner.log_prob(x, mean, **options)
 
     rows = declared(n=100)
     other = CandidateSimulations(rows.theta, ACTIONS, rows.x, rows.mean, Plain())

@@ -1,0 +1,106 @@
+"""What a designer returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions import DiscreteActions
+from sbi_active.information_gain.base import Bound
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["Design", "action_name"]
+
+
+@dataclass(frozen=True)
+class Design:
+    """The chosen action and the estimates behind the choice.
+
+    Attributes:
+        action: The chosen action, shape (action_dim,).
+        candidates: All candidates, shape (a, action_dim).
+        expected_information_gain: Estimates on simulations that had no part in the
+            choice, nats, shape (a,); NaN for a random choice.
+        standard_error: Of each estimate, shape (a,).
+        difference_standard_error: Of each estimate's difference to the chosen
+            candidate's, on common random numbers, shape (a,); zero at the chosen one.
+        probability_best: Probability that a candidate has the largest expectation of
+            the estimate, given the simulations, shape (a,); zero where a candidate is
+            excluded.
+        probability_valid: Share of the simulations of each candidate that gave a
+            measurement, partly observed ones included, shape (a,). Rows lost to a fault
+            do not count; NaN where nothing else is left.
+        bound: Side of the information that the estimates lie on.
+        index: Which candidate was chosen.
+        num_simulations: Simulations spent.
+        name: Name of the action, with its unit.
+        estimator: Class that estimated.
+        num_samples: Simulations of each candidate, shape (a,). Candidates that were
+            eliminated early have fewer.
+        stopped: Why no further simulations were run: "leader separated", "difference
+            negligible" or "budget spent".
+        notes: What to know: estimators that failed a check or disagree, where an
+            estimate is a bound, candidates that were excluded.
+    """
+
+    action: Tensor
+    candidates: Tensor
+    expected_information_gain: Tensor
+    standard_error: Tensor
+    difference_standard_error: Tensor
+    probability_best: Tensor
+    probability_valid: Tensor
+    bound: Bound
+    index: int
+    num_simulations: int
+    name: str = "action"
+    estimator: str = "none"
+    num_samples: Tensor = field(default_factory=lambda: torch.empty(0).long())
+    stopped: str = "at random"
+    notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        action = ", ".join(f"{v:g}" for v in self.action.tolist())
+        if self.expected_information_gain.isnan().all():
+            return f"Design(action [{action}], at random)"
+        gain = float(self.expected_information_gain[self.index])
+        error = float(self.standard_error[self.index])
+        return f"Design(action [{action}], EIG {gain:.2f} +- {error:.2f} nats)"
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Plot the expected information gain of the candidates with two errors.
+
+        Args:
+            ax: Where to draw; None makes a figure.
+
+        Returns:
+            The axes.
+        """
+        import matplotlib.pyplot as plt
+
+        ax = plt.subplots()[1] if ax is None else ax
+        scalar = self.candidates.shape[1] == 1
+        place = self.candidates[:, 0] if scalar else torch.arange(len(self.candidates))
+        gain, error = self.expected_information_gain, self.standard_error
+        ax.errorbar(
+            place.numpy(), gain.numpy(), 2 * error.numpy(), fmt="o-", ms=4, capsize=2
+        )
+        ax.axvline(float(place[self.index]), ls=":", color="k", label="chosen")
+        ax.set_xlabel(self.name if scalar else "candidate")
+        note = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}
+        ax.set_ylabel(f"EIG{note[self.bound]} [nats]")
+        ax.legend()
+        return ax
+
+
+def action_name(actions: DiscreteActions) -> str:
+    """Return the name of a scalar action with its unit."""
+    if actions.action_dim > 1:
+        return "action"
+    unit = actions.units[0]
+    return actions.names[0] + (f" [{unit}]" if unit else "")

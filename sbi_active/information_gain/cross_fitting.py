@@ -1,0 +1,75 @@
+"""Score held-out rows, and choose a member on rows that are not scored with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+__all__ = ["cross_fit", "patterns_of_numbers"]
+
+NUM_FOLDS = 4
+
+
+def cross_fit(
+    score: Callable[[Tensor, Tensor], Tensor], block: Tensor, weight: Tensor
+) -> Tensor:
+    r"""Return scores of every row by members fitted and chosen without it.
+
+    Args:
+        score: ``score(train, test)``, both of rows, gives the scores of the test rows
+            by each member fitted to the training rows, shape (members, test).
+        block: Number of the block that a row belongs to, shape (n,): rows of a block
+            share a fold.
+        weight: Of rows in the choice, shape (n,).
+
+    Returns:
+        Shape (n,). The member that scores a fold is the best on the other folds.
+    """
+    fold = block % NUM_FOLDS
+    held_out: Tensor | None = None
+    for k in range(NUM_FOLDS):
+        train, test = torch.nonzero(fold != k)[:, 0], torch.nonzero(fold == k)[:, 0]
+        if len(test) == 0:
+            continue
+        scores = score(train, test)
+        if held_out is None:
+            held_out = torch.zeros(len(scores), len(block), dtype=torch.float64)
+        held_out[:, test] = scores
+    assert held_out is not None
+    result = torch.empty(len(block), dtype=torch.float64)
+    for k in range(NUM_FOLDS):
+        others = (held_out * weight)[:, fold != k].sum(1)
+        result[fold == k] = held_out[int(others.argmax()), fold == k]
+    return result
+
+
+def patterns_of_numbers(
+    x: Tensor, counted: Tensor, smallest: int
+) -> list[tuple[Tensor, Tensor]]:
+    """Group outcomes by which of their numbers are present.
+
+    Args:
+        x: Shape (n, q), NaN where there is no number.
+        counted: Rows to group, shape (n,), bool.
+        smallest: Rows below which a pattern joins those without a number.
+
+    Returns:
+        Rows, shape (k,), and the numbers present, shape (p,), of each group; the groups
+        cover all counted rows.
+    """
+    rows = torch.nonzero(counted)[:, 0]
+    present = x[rows].isfinite()
+    patterns, label = torch.unique(present, dim=0, return_inverse=True)
+    groups, rest = [], []
+    for k, pattern in enumerate(patterns):
+        members = rows[label == k]
+        columns = torch.nonzero(pattern)[:, 0]
+        if len(columns) and len(members) >= smallest:
+            groups.append((members, columns))
+        else:
+            rest.append(members)
+    if rest:
+        groups.append((torch.cat(rest).sort().values, torch.empty(0).long()))
+    return groups

@@ -1,0 +1,109 @@
+"""Choose the next action at random."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.design import Design, action_name
+from sbi_active.eligibility import discrete, excluded_note, reaches
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import Outcome, simulate
+
+__all__ = ["RandomDesigner"]
+
+
+class RandomDesigner:
+    """Choose an action uniformly at random, the design of NSBI and NLHI.
+
+    Args:
+        actions: The action space.
+        num_samples: Simulations a candidate where ``min_probability_valid`` asks for
+            its share of measurements; otherwise nothing is simulated.
+    """
+
+    def __init__(self, actions: ActionSpace, *, num_samples: int = 200) -> None:
+        self.actions = discrete(actions)
+        self.num_samples = num_samples
+
+    def select(
+        self,
+        model: Any = None,
+        simulator: Callable[..., Any] | None = None,
+        *,
+        belief: Distribution | None = None,
+        min_probability_valid: float = 0.0,
+        seed: int | None = None,
+    ) -> Design:
+        """Return a random action.
+
+        Args:
+            model: Only its belief is used, see below.
+            simulator: ``simulator(theta, action)``; only used, and then needed, with
+                ``min_probability_valid``.
+            belief: Of the parameters, at which candidates are simulated; None is
+                ``model.belief``.
+            min_probability_valid: Candidates that give a measurement less often are
+                excluded; 0 excludes none.
+            seed: Of the choice and the simulations; None draws one from torch's global
+                generator.
+
+        Returns:
+            The design.
+
+        Raises:
+            ValueError: If a share of measurements is asked for without a simulator or a
+                belief, or no candidate reaches it.
+        """
+        num = len(self.actions)
+        unknown = torch.full((num,), torch.nan, dtype=torch.float64)
+        valid, num_simulations = unknown, 0
+        eligible = torch.ones(num).bool()
+        if min_probability_valid > 0:
+            belief = getattr(model, "belief", None) if belief is None else belief
+            if simulator is None or belief is None:
+                raise ValueError(
+                    "expected a simulator and a belief with min_probability_valid; got "
+                    f"{'no simulator' if simulator is None else 'no belief'}; do pass "
+                    "both, or leave min_probability_valid at 0"
+                )
+            seed = int(torch.randint(2**62, ())) if seed is None else seed
+            valid = self._probability_valid(simulator, belief, seed)
+            num_simulations = num * self.num_samples
+            eligible = reaches(valid, min_probability_valid)
+        with forked_generators(seed):
+            remaining = torch.nonzero(eligible)[:, 0]
+            chosen = int(remaining[int(torch.randint(len(remaining), ()))])
+        return Design(
+            action=self.actions.values[chosen],
+            candidates=self.actions.values,
+            expected_information_gain=unknown,
+            standard_error=unknown,
+            difference_standard_error=unknown,
+            probability_best=unknown,
+            probability_valid=valid,
+            bound="none",
+            index=chosen,
+            num_simulations=num_simulations,
+            name=action_name(self.actions),
+            num_samples=torch.full((num,), num_simulations // num).long(),
+            notes=excluded_note(eligible, min_probability_valid),
+        )
+
+    def _probability_valid(
+        self, simulator: Callable[..., Any], belief: Distribution, seed: int
+    ) -> Tensor:
+        """Share of measurements of each candidate, at the same parameters."""
+        n, values = self.num_samples, self.actions.values
+        with forked_generators(seed, "theta"):
+            theta = belief.sample(torch.Size([n]))
+        rows = theta.repeat(len(values), 1), values.repeat_interleave(n, 0)
+        drawn = simulate(simulator, *rows, seed=derive_seed(seed, "x"))
+        status = drawn.status.reshape(len(values), n)
+        counted = (status != Outcome.MISSING).sum(1)
+        return (status == Outcome.OK).sum(1).double() / counted
