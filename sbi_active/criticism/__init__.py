@@ -1,0 +1,38 @@
+"""The closed loop: find the residual, trace it to an effect, add it, report."""
+
+from sbi_active.criticism.augmented import AugmentedSimulator
+from sbi_active.criticism.criticism import Criticism, close_loop
+from sbi_active.criticism.effects import Context, Effect
+from sbi_active.criticism.generic import generic_effects
+from sbi_active.criticism.joint import JointPrior, joint_prior
+from sbi_active.criticism.report import Report
+from sbi_active.criticism.results import (
+    Detection,
+    Estimate,
+    Evaluation,
+    Evidence,
+    NextAction,
+    Residuals,
+    Tracing,
+)
+from sbi_active.criticism.trials import Trials
+
+__all__ = [
+    "AugmentedSimulator",
+    "Context",
+    "Criticism",
+    "Detection",
+    "Effect",
+    "Estimate",
+    "Evaluation",
+    "Evidence",
+    "JointPrior",
+    "NextAction",
+    "Report",
+    "Residuals",
+    "Tracing",
+    "Trials",
+    "close_loop",
+    "generic_effects",
+    "joint_prior",
+]

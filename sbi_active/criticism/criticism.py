@@ -1,0 +1,241 @@
+"""The closed loop, in one call or step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.augmented import AugmentedSimulator
+from sbi_active.criticism.detection import detect
+from sbi_active.criticism.effects import Effect
+from sbi_active.criticism.evaluation import evaluate_held_out, evaluate_left_out
+from sbi_active.criticism.formulas import guess
+from sbi_active.criticism.joint import joint_prior
+from sbi_active.criticism.next_action import choose_action
+from sbi_active.criticism.residuals import find_residuals
+from sbi_active.criticism.results import (
+    NONE,
+    SCATTER,
+    UNEXPLAINED,
+    Detection,
+    Evaluation,
+    NextAction,
+    Residuals,
+    Tracing,
+)
+from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.tracing import trace
+from sbi_active.criticism.trials import Trials
+from sbi_active.criticism.validation import digest, require_fitting, with_noise
+from sbi_active.simulation import SimulatorModel
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.report import Report
+
+__all__ = ["Criticism", "close_loop"]
+
+FEWEST_TRIALS = 4  # to leave one out
+CATCH_ALLS = (NONE, UNEXPLAINED, SCATTER)
+
+
+class Criticism:
+    r"""Compares a simulator with measured trials, step by step.
+
+    Each step is computed once and kept. Held-out trials are used by :meth:`evaluate`
+    alone.
+
+    Args:
+        model: The simulator, with its measurement noise. A random one without noise is
+            the draw itself, and has a synthetic likelihood; the noise of a
+            deterministic one without is estimated from repeated trials.
+        prior: Of its parameters.
+        trials: Measured trials.
+        effects: What the simulator may lack.
+        actions: The permitted actions, for what no action separates and for the next
+            one; None leaves both to the trials at hand.
+        seed: Of all draws.
+
+    Raises:
+        ValueError: If fewer than two trials can be fitted, shapes differ, an effect
+            does not vanish at its null or is named like a catch-all, or the simulator
+            is random and declares noise besides.
+
+    Example:
+        >>> import torch
+        >>> from sbi.utils import BoxUniform
+        >>> from torch.distributions import Normal
+        >>> from sbi_active import GaussianNoise, SimulatorModel
+        >>> noise = GaussianNoise(0.1)
+        >>> model = SimulatorModel(lambda theta, xi: theta * xi, noise=noise)
+        >>> bias = Effect(
+        ...     "bias", hook="observation", prior=Normal(0.0, 1.0), null=0.0,
+        ...     apply=lambda x, phi, action, context: x + phi,
+        ... )
+        >>> action = torch.linspace(-1, 1, 6)[:, None]
+        >>> trials = Trials(action, 2 * action + 1)
+        >>> prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
+        >>> Criticism(model, prior, trials, effects=[bias]).trace().verdict
+        'bias'
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        prior: Distribution,
+        trials: Trials,
+        *,
+        effects: Sequence[Effect] = (),
+        actions: ActionSpace | None = None,
+        seed: int = 0,
+    ) -> None:
+        model = with_noise(model, prior, trials)
+        self.model, self.prior, self.trials = model, prior, trials
+        self.effects, self.actions, self.seed = [*effects], actions, seed
+        require_fitting(model, prior, trials, self.effects, actions)
+        self.rivals = RivalSet(
+            model, prior, trials.fit, self.effects, actions=actions, seed=seed
+        )
+        #: Hash of the noise, the effects and all priors, as they were declared.
+        self.digest = digest(model, prior, self.effects)
+        self._residuals: Residuals | None = None
+        self._detection: Detection | None = None
+        self._tracing: Tracing | None = None
+
+    def residuals(self) -> Residuals:
+        """Return the residuals of the bare model."""
+        if self._residuals is None:
+            self._residuals = find_residuals(self.rivals)
+        return self._residuals
+
+    def detect(self) -> Detection:
+        """Return whether the bare model misses the data."""
+        if self._detection is None:
+            self._detection = detect(self.rivals)
+        return self._detection
+
+    def trace(self) -> Tracing:
+        """Return which effect the data point to."""
+        if self._tracing is None:
+            tracing = trace(self.rivals, self.detect(), actions=self.actions)
+            if tracing.verdict == UNEXPLAINED:
+                tracing = replace(tracing, guesses=guess(self.rivals))
+            self._tracing = tracing
+        return self._tracing
+
+    def add(
+        self, effects: Sequence[str] | None = None
+    ) -> tuple[SimulatorModel, Distribution]:
+        """Return the simulator with effects added, and its prior.
+
+        Args:
+            effects: Names; None takes those of the verdict.
+
+        Returns:
+            The augmented simulator, whose parameters are (theta, phi), and their prior.
+            Without effects, the bare simulator and its prior.
+        """
+        names = self.trace().chosen if effects is None else (*effects,)
+        unknown = [n for n in names if n not in self.rivals.effects]
+        if unknown:
+            raise ValueError(
+                f"expected effects among {', '.join(self.rivals.effects) or 'none'}; "
+                f"got {', '.join(unknown)}; do declare them in Criticism(effects=...)"
+            )
+        added = [self.rivals.effects[n] for n in names] + self.rivals.nuisances
+        if not added:
+            return self.model, self.prior
+        index = int(self.trials.index.max()) + 1
+        model = AugmentedSimulator(self.model, added, next_index=index)
+        return model, joint_prior(self.prior, added)
+
+    def next_action(self, actions: ActionSpace | None = None) -> NextAction:
+        """Return the action whose outcome tells most about which rival is right.
+
+        Args:
+            actions: None takes those of the constructor.
+        """
+        space = self.actions if actions is None else actions
+        if space is None:
+            raise ValueError(
+                "expected the permitted actions; got None; do give "
+                "next_action(actions) or Criticism(actions=...)"
+            )
+        return choose_action(self.rivals, self.trace(), space)
+
+    def evaluate(self) -> Evaluation | None:
+        """Return the error before and after, on held-out trials where there are any.
+
+        Otherwise each trial is predicted by models that were chosen and fitted without
+        it; None with fewer than four trials.
+        """
+        tracing, held_out = self.trace(), self.trials.held_out
+        if held_out is not None:
+            return evaluate_held_out(self.rivals, tracing, held_out)
+        if int(self.trials.valid.sum()) < FEWEST_TRIALS:
+            return None
+        return evaluate_left_out(self.trials.fit, self._fold)
+
+    def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
+        part = Criticism(
+            self.model, self.prior, trials, effects=self.effects, seed=self.seed
+        )
+        return part.rivals, trace(part.rivals, part.detect(), compare=False)
+
+    def report(self, *, evaluate: bool = True) -> Report:
+        """Return the report of all steps.
+
+        Args:
+            evaluate: Without held-out trials the error costs one verdict a trial; False
+                leaves it out.
+        """
+        from sbi_active.criticism.report import build_report
+
+        tracing = self.trace()
+        simulator, prior = self.add()
+        after = None
+        if tracing.verdict != NONE:
+            error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
+            after = find_residuals(self.rivals, names=tracing.chosen, error=error)
+        return build_report(
+            trials=self.trials,
+            residuals=self.residuals(),
+            residuals_after=after,
+            detection=self.detect(),
+            tracing=tracing,
+            simulator=simulator,
+            prior=prior,
+            evaluation=self.evaluate() if evaluate else None,
+            next_action=None if self.actions is None else self.next_action(),
+            actions=self.actions,
+            digest=self.digest,
+        )
+
+
+def close_loop(
+    model: SimulatorModel,
+    prior: Distribution,
+    trials: Trials,
+    *,
+    effects: Sequence[Effect] = (),
+    actions: ActionSpace | None = None,
+    seed: int = 0,
+    evaluate: bool = True,
+) -> Report:
+    """Find the residual, trace it to an effect, add it, and report the error.
+
+    Args:
+        model: As in :class:`Criticism`, like all others.
+        prior: Of the simulator's parameters.
+        trials: Measured trials.
+        effects: What the simulator may lack.
+        actions: The permitted actions.
+        seed: Of all draws.
+        evaluate: As in :meth:`Criticism.report`.
+    """
+    return Criticism(
+        model, prior, trials, effects=effects, actions=actions, seed=seed
+    ).report(evaluate=evaluate)

@@ -1,0 +1,72 @@
+"""Whether the bare model, refitted, misses the data."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from sbi_active.criticism.errors import log_sum_exp
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Detection, Evidence
+from sbi_active.criticism.rival_set import RivalSet
+
+__all__ = ["THRESHOLD", "detect"]
+
+#: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
+#: at any stopping time, with a probability of at most 1/20.
+THRESHOLD = float(np.log(20.0))
+#: Standard errors by which the Bayes factor must exceed the threshold.
+MARGIN = 2.0
+
+
+def detect(rivals: RivalSet) -> Detection:
+    r"""Return the Bayes factor of everything else against the bare model.
+
+    .. math::
+        \log B = \log \frac1m \sum_{k=1}^m Z_k - \log Z_0
+
+    over all effects, the residual process and noise inflation. Before an alarm, the
+    bare model's evidence is computed again by tempering, since a mode that the
+    least-squares search missed would be a false alarm.
+
+    Args:
+        rivals: The models.
+
+    References:
+        Ville, Etude critique de la notion de collectif (1939), for any stopping time.
+    """
+    others = [rivals.evidence((name,)) for name in rivals.effects]
+    others += [rivals.evidence(error=e) for e in (UNEXPLAINED, SCATTER)]
+    null = rivals.evidence()
+    first = null.log_evidence
+    log_b, error = bayes_factor(others, null)
+    check = None
+    if log_b - MARGIN * error > THRESHOLD:
+        check = rivals.tempered().log_evidence
+        null = rivals.evidence()
+        log_b, error = bayes_factor(others, null)
+    lower = log_b - MARGIN * error
+    freedom = max(len(rivals.measurements) - rivals.rival(()).dim, 1)
+    return Detection(
+        alarm=bool(lower > THRESHOLD),
+        log_bayes_factor=log_b,
+        standard_error=error,
+        lower=lower,
+        threshold=THRESHOLD,
+        chi_square=null.best_chi_square,
+        degrees_of_freedom=freedom,
+        p_value=float(chi2.sf(null.best_chi_square, freedom)),
+        null_log_evidence=first,
+        null_cross_check=check,
+    )
+
+
+def bayes_factor(others: list[Evidence], null: Evidence) -> tuple[float, float]:
+    """Return the log Bayes factor of an equal mixture, and its standard error."""
+    log_z = np.array([e.log_evidence for e in others])
+    total = log_sum_exp(log_z)
+    share = np.exp(log_z - total)
+    errors = np.array([e.standard_error for e in others])
+    errors = np.where(share > 0, errors, 0.0)
+    variance = (share**2 * errors**2).sum() + null.standard_error**2
+    log_b = total - np.log(len(others)) - null.log_evidence
+    return float(log_b), float(np.sqrt(variance))

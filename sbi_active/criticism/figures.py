@@ -1,0 +1,228 @@
+"""Figures of a report: residuals, probabilities of effects, error before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_before_after", "plot_probabilities", "plot_residuals"]
+
+BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
+MAX_ACTION_PANELS = 3
+LOGARITHMIC_FROM = 12.0  # standard deviations; larger residuals get a symlog axis
+METRICS = {
+    "rmse": "RMSE",
+    "energy score": "energy score",
+    "log predictive density": "log predictive density [nats]",
+    "coverage": "share inside the central 90 %",
+}
+
+
+def plot_residuals(
+    before: Residuals,
+    after: Residuals | None = None,
+    *,
+    action_labels: Sequence[str] | None = None,
+    channel_names: Sequence[str] | None = None,
+) -> Figure:
+    """Draw standardized residuals by action, trial, and channel or time.
+
+    Each model is refitted to all trials that may be fitted. The band is two standard
+    deviations of the predictive.
+
+    Args:
+        before: Of the bare model, the upper row.
+        after: Of the augmented one, the lower row; None where nothing was added.
+        action_labels: One an entry of the action, with its unit.
+        channel_names: One an entry of x without a time axis.
+
+    Returns:
+        The figure.
+    """
+    rows = [(before, "bare model", BEFORE)]
+    if after is not None:
+        rows.append((after, "with the effect", AFTER))
+    labels = action_labels or [f"action {i + 1}" for i in range(before.action.shape[1])]
+    shown = min(len(labels), MAX_ACTION_PANELS)
+    several = before.x[0].size > 1
+    columns = shown + 1 + several
+    figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
+    for line, (residuals, title, color) in zip(axes, rows, strict=True):
+        each = _entries(residuals.refitted)
+        for i in range(shown):
+            _scatter(line[i], residuals.action[:, i], each, color)
+            line[i].set_xlabel(labels[i])
+        _scatter(line[shown], residuals.index, each, color)
+        line[shown].set_xlabel("trial")
+        line[shown].xaxis.get_major_locator().set_params(integer=True)
+        if several:
+            _by_entry(line[-1], residuals, color, channel_names)
+        for ax in line:
+            _residual_axis(ax, each)
+        line[0].set_ylabel(f"{title}\nresidual [sd]", color=color)
+    return figure
+
+
+def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
+    """Draw the probability of every model, those of the credible set filled.
+
+    Sets of several effects with less than .01 are left out.
+
+    Args:
+        tracing: What the tracing found.
+        at_most: Bars, the most probable ones.
+
+    Returns:
+        The figure.
+    """
+    kept = [
+        (name, p)
+        for name, p in tracing.probabilities.items()
+        if p >= 0.01 or " + " not in name
+    ]
+    order = sorted(kept, key=lambda item: -item[1])[:at_most]
+    names = [name for name, _ in order][::-1]
+    values = [p for _, p in order][::-1]
+    figure, axes = _subplots(1, 1, width=6.0, height=0.5 + 0.26 * len(names))
+    ax = axes[0, 0]
+    inside = [name in tracing.credible_set for name in names]
+    ax.barh(
+        names,
+        values,
+        height=0.65,
+        color=[AFTER if i else "#d8dee3" for i in inside],
+    )
+    for y, value in enumerate(values):
+        text = f"{value:.2f}" if value >= 0.005 else "< .01"
+        ax.text(value + 0.01, y, text, va="center", fontsize=8, color="#333333")
+    ax.set(xlim=(0, 1.1), xlabel="posterior probability (filled: credible set)")
+    ax.set_xticks(np.linspace(0, 1, 6))
+    ax.tick_params(axis="y", length=0)
+    _plain(ax)
+    return figure
+
+
+def plot_before_after(evaluation: Evaluation) -> Figure:
+    """Draw every score of every scored trial before and after, paired.
+
+    Args:
+        evaluation: Scores on trials used neither to fit nor to choose.
+
+    Returns:
+        The figure.
+    """
+    metrics = [name for name in METRICS if name in evaluation.before]
+    figure, axes = _subplots(1, len(metrics), width=2.5, height=2.7)
+    for ax, name in zip(axes[0], metrics, strict=True):
+        pairs = np.stack([evaluation.before[name], evaluation.after[name]])
+        ax.plot([0, 1], pairs, color=FAINT, lw=0.8, alpha=0.7, zorder=1)
+        for x, values, color in ((0, pairs[0], BEFORE), (1, pairs[1], AFTER)):
+            ax.plot(np.full(len(values), x), values, ".", ms=5, color=color, alpha=0.6)
+        total = evaluation.table[evaluation.table["metric"] == name]
+        for x, when in ((0, "before"), (1, "after")):
+            ax.plot([x] * len(total), total[when], "k_", ms=22, mew=2, zorder=3)
+        positive = pairs[np.isfinite(pairs) & (pairs > 0)]
+        if name in ("rmse", "energy score"):
+            if _spread(positive) > 10:
+                _plain_log(ax)
+            else:
+                ax.set_ylim(bottom=0)
+        if name == "log predictive density" and _spread(-pairs[pairs < 0]) > 20:
+            ax.set_yscale("symlog", linthresh=10)
+        if name == "coverage":
+            ax.axhline(0.9, color="#333333", lw=0.8, ls=":")
+            ax.set_ylim(-0.04, 1.04)
+        ax.set(xlim=(-0.5, 1.5), xticks=[0, 1], xticklabels=["before", "after"])
+        ax.set_title(METRICS[name], fontsize=9)
+        _plain(ax)
+    return figure
+
+
+def _by_entry(
+    ax: Axes, residuals: Residuals, color: str, channel_names: Sequence[str] | None
+) -> None:
+    """Draw one line a trial over time, or points over the channels."""
+    each = _entries(residuals.refitted)
+    if residuals.times is not None:
+        length = residuals.x.shape[1]
+        times = np.broadcast_to(residuals.times, (len(each), length))
+        for time, z in zip(times, residuals.refitted, strict=True):
+            ax.plot(time, z.reshape(length, -1), color=color, lw=0.8, alpha=0.6)
+        ax.set_xlabel("time [s]")
+        return
+    num = each.shape[1]
+    _scatter_entries(ax, np.arange(num), each, color)
+    ax.set_xlabel("channel")
+    if channel_names is not None and len(channel_names) == num <= 12:
+        ax.set_xticks(range(num), channel_names, rotation=45, ha="right", fontsize=7)
+        ax.set_xlabel("")
+
+
+def _scatter(ax: Axes, place: Array, each: Array, color: str) -> None:
+    """Draw all entries of a trial at its place, and their root mean square."""
+    many = each.shape[1] > 1
+    ax.plot(place, each, ".", ms=3 if many else 7, alpha=0.45 if many else 0.9, c=color)
+
+
+def _scatter_entries(ax: Axes, place: Array, each: Array, color: str) -> None:
+    ax.plot(place, each.T, ".", ms=4, alpha=0.6, c=color)
+
+
+def _residual_axis(ax: Axes, each: Array) -> None:
+    ax.axhspan(-2, 2, color="#e9edf0", zorder=0)
+    ax.axhline(0, color="#555555", lw=0.8, zorder=0)
+    finite = each[np.isfinite(each)]
+    largest = max(float(np.abs(finite).max(initial=0.0)) * 1.15, 3.5)
+    if largest > LOGARITHMIC_FROM:
+        largest *= 1.4
+        ax.set_yscale("symlog", linthresh=2)
+        decades = 10.0 ** np.arange(1, np.floor(np.log10(largest)) + 1)
+        ticks = [*(-decades[::-1]), -2.0, 0.0, 2.0, *decades]
+        ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
+        ax.minorticks_off()
+    ax.set_ylim(-largest, largest)
+    _plain(ax)
+
+
+def _plain_log(ax: Axes) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _plain(ax: Axes) -> None:
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    ax.tick_params(labelsize=8)
+    ax.xaxis.label.set_fontsize(9)  # type: ignore[attr-defined]  # by its alias
+    ax.yaxis.label.set_fontsize(9)  # type: ignore[attr-defined]
+
+
+def _entries(z: Array) -> Array:
+    return z.reshape(len(z), -1)
+
+
+def _spread(values: Array) -> float:
+    return float(values.max() / values.min()) if values.size else 1.0
+
+
+def _subplots(
+    rows: int, columns: int, *, width: float, height: float
+) -> tuple[Figure, np.ndarray]:
+    # Not pyplot: figures of a report belong to no window and need no closing.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    make: Callable[..., np.ndarray] = figure.subplots
+    return figure, make(rows, columns, squeeze=False)

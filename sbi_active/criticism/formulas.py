@@ -1,0 +1,140 @@
+r"""Formula effects: guesses for what no declared effect explains.
+
+Each adds :math:`c\, g` to the noise-free output, with g one elementary function of an
+entry of the action or of the output itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Independent, StudentT
+
+from sbi_active.criticism.effects import Context, Effect
+from sbi_active.criticism.results import UNEXPLAINED
+from sbi_active.criticism.rival_set import RivalSet
+
+__all__ = ["formula_effects", "guess"]
+
+Array = NDArray[Any]
+
+#: Nats by which a formula must beat the residual process to be printed.
+MARGIN = 3.0
+#: Bound on exponents, so that a formula stays finite.
+LARGEST_EXPONENT = 20.0
+
+#: Degrees of freedom of a coefficient's prior: terms are often far from typical.
+TAIL = 3.0
+
+TERMS: dict[str, Callable[[Tensor], Tensor]] = {
+    "1": torch.ones_like,
+    "{}": lambda v: v,
+    "{}^2": lambda v: v**2,
+    "{}^3": lambda v: v**3,
+    "|{}|": torch.abs,
+    "|{}|^1.5": lambda v: v.abs() ** 1.5,
+    "step({})": lambda v: (v > 0).to(v.dtype),
+    "sign({})": torch.sign,
+    "sin({})": torch.sin,
+    "cos({})": torch.cos,
+    "exp({})": lambda v: v.clamp(max=LARGEST_EXPONENT).exp(),
+    "relu({})": torch.relu,
+}
+
+
+def formula_effects(rivals: RivalSet) -> list[Effect]:
+    """Return one effect a formula, with a prior that gives it the process's size.
+
+    A coefficient has a Student-t prior, its scale such that the term over the trials is
+    as large as the middle amplitude of the residual process: the geometric mean of the
+    noise and the spread of the prior predictive.
+
+    Args:
+        rivals: The models that the formulas compete with.
+    """
+    trials = rivals.trials
+    names = ["xi"]
+    if trials.action.shape[1] > 1:
+        names = [f"xi_{i + 1}" for i in range(trials.action.shape[1])]
+    sd = np.exp(np.mean([np.log(cell.sd) for cell in rivals.noise.cells], 0))
+    amplitude = float(np.median(np.sqrt(sd * np.maximum(rivals.spread, sd))))
+    if rivals.simulator.is_stochastic:
+        amplitude = float(np.median(rivals.spread))
+    found = []
+    for j, name in enumerate(names):
+        for pattern, g in TERMS.items():
+            if pattern == "1" and j:
+                continue
+            size = g(trials.action[:, j]).square().mean().sqrt()
+            if not bool(torch.isfinite(size)) or float(size) < 1e-9:
+                continue
+            found.append(
+                _effect(pattern.format(name), _of_action(g, j), amplitude / float(size))
+            )
+    x = trials.x[trials.x.isfinite()]
+    for pattern, g in TERMS.items():
+        if pattern == "1":
+            continue
+        size = g(x).square().mean().sqrt()
+        if bool(torch.isfinite(size)) and float(size) >= 1e-9:
+            found.append(
+                _effect(pattern.format("x"), _of_output(g), amplitude / float(size))
+            )
+    return found
+
+
+def guess(rivals: RivalSet) -> tuple[tuple[str, float], ...]:
+    """Return formulas that beat the residual process, best first.
+
+    Args:
+        rivals: The models; their evidence of "unexplained" is the bar.
+
+    Returns:
+        Formulas and their log evidence above that of the residual process, only those
+        more than 3 nats above; empty where there is none.
+    """
+    bar = rivals.evidence(error=UNEXPLAINED).log_evidence
+    effects = formula_effects(rivals)
+    others = RivalSet(
+        rivals.model,
+        rivals.prior,
+        rivals.trials,
+        [*effects, *rivals.nuisances],
+        actions=rivals.actions,
+        seed=rivals.seed,
+    )
+    gains = {e.name: others.evidence((e.name,)).log_evidence - bar for e in effects}
+    best = sorted(gains, key=gains.__getitem__)[::-1]
+    return tuple((name, gains[name]) for name in best if gains[name] > MARGIN)
+
+
+def _effect(name: str, apply: Any, scale: float) -> Effect:
+    return Effect(
+        name,
+        hook="observation",
+        prior=Independent(StudentT(TAIL, torch.zeros(1), torch.full((1,), scale)), 1),
+        null=0.0,
+        apply=apply,
+        family="formula",
+        describe="a guess, not declared",
+    )
+
+
+def _of_action(g: Callable[[Tensor], Tensor], entry: int) -> Any:
+    def apply(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+        term = phi[:, 0] * g(action[:, entry])
+        return x + term.reshape(-1, *[1] * (x.ndim - 1))
+
+    return apply
+
+
+def _of_output(g: Callable[[Tensor], Tensor]) -> Any:
+    def apply(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+        return x + phi[:, 0].reshape(-1, *[1] * (x.ndim - 1)) * g(x)
+
+    return apply

@@ -1,0 +1,165 @@
+"""Posterior predictive of a rival, in trials that it was or was not fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.errors import NoiseGrid, log_sum_exp
+from sbi_active.criticism.noise_grid import declared_noise
+from sbi_active.criticism.residual_process import ResidualProcess
+from sbi_active.criticism.rival import Rival
+from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.trial_simulator import TrialSimulator
+from sbi_active.criticism.trials import Trials
+from sbi_active.seeding import derive_seed, forked_generators
+
+__all__ = ["Prediction", "predict"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a rival predicts for measured numbers.
+
+    Attributes:
+        mean: Noise-free predictions, one a posterior draw, shape (n, N).
+        sd: Standard deviation of the error of each number given a draw, shape (n, N).
+        x: Draws with errors, shape (n, N).
+        log_density: Of the measurements, of each trial, shape (t,), nats.
+        trial: Trial of each number, shape (N,).
+        position: Of each number in the flattened x, shape (N,).
+    """
+
+    mean: Array
+    sd: Array
+    x: Array
+    log_density: Array
+    trial: Array
+    position: Array
+
+
+def predict(
+    rivals: RivalSet,
+    trials: Trials | None = None,
+    *,
+    names: tuple[str, ...] = (),
+    error: str | None = None,
+) -> Prediction:
+    """Return the posterior predictive of a rival.
+
+    Args:
+        rivals: The models; the rival is fitted to their trials.
+        trials: Trials to predict, taken as unseen; None takes those that were fitted,
+            with the residual process of "unexplained" conditioned on them.
+        names: Effects of the rival.
+        error: None, "unexplained" or "scatter".
+    """
+    name = rivals.evidence(names, error=error).name
+    rival, sample = rivals.rivals[name], rivals.samples[name]
+    rng = np.random.default_rng(derive_seed(rivals.seed, "predictive", name))
+    u = sample.draws(NUM_DRAWS, rng)
+    own_residual = rival.residual(u)[0]
+    target = rivals.trials if trials is None else trials
+    simulator = TrialSimulator(
+        rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")
+    )
+    m = simulator.measurements
+    theta, phi = rival.coordinates.split(u)
+    if trials is not None:
+        with forked_generators(rivals.seed, "fresh nuisances"):
+            for effect in rivals.nuisances:  # an unseen trial draws its own
+                fresh = effect.sample(NUM_DRAWS * len(target))
+                phi[effect.name] = fresh.reshape(NUM_DRAWS, len(target), -1)
+    mean, unit, _ = simulator.predict(theta, phi)
+    mean = np.where(np.isfinite(mean), mean, np.nanmean(mean, 0))
+    factor = simulator.noise_scale(phi, NUM_DRAWS)
+    factor = np.ones_like(mean) if factor is None else factor
+    factor = factor if unit is None else factor * unit
+    extra = np.zeros(len(m))
+    if isinstance(rival.error, ResidualProcess):
+        action = rivals.scaled_actions(target)
+        shift, extra = rival.error.condition(own_residual, m, action)
+        mean = mean + shift
+    noise = declared_noise(
+        rivals.model.noise, m, seed=derive_seed(rivals.seed, "noise")
+    )
+    cells, scales = _drawn_cells(rival, own_residual, rng)
+    errors, sd = _errors(noise, cells, scales, mean.shape, rng)
+    errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
+    errors = errors + extra * rng.normal(size=mean.shape)
+    density = []
+    for t in range(len(target)):
+        at = m.trial == t
+        residual = (m.x - mean)[:, at] / np.where(extra[at] > 0, 1.0, factor[:, at])
+        each = [
+            _log_density(noise, c, s, r, at, np.where(extra[at] > 0, w[at], 0.0))
+            for c, s, r, w in zip(cells, scales, residual, sd, strict=True)
+        ]
+        log_scale = np.where(extra[at] > 0, 0.0, np.log(factor[:, at])).sum(1)
+        density.append(log_sum_exp(np.array(each) - log_scale) - np.log(NUM_DRAWS))
+    return Prediction(
+        mean, sd, mean + errors, np.array(density, dtype=float), m.trial, m.position
+    )
+
+
+def _drawn_cells(
+    rival: Rival, residual: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return a cell and a scale of the noise for each draw, given its residual."""
+    grid = rival.error
+    if not isinstance(grid, NoiseGrid):
+        assert isinstance(grid, ResidualProcess)
+        cells, scales = grid.noise_posterior(residual, rng)
+        return cells, scales
+    joint = grid.joint(residual)
+    flat = joint.reshape(len(residual), -1)
+    gumbel = rng.gumbel(size=flat.shape)  # the maximum is a draw from softmax
+    best = np.argmax(flat + gumbel, axis=1)
+    cell, scale = np.unravel_index(best, joint.shape[1:])
+    return cell, grid.scales[scale]
+
+
+def _errors(
+    noise: NoiseGrid,
+    cells: Array,
+    scales: Array,
+    shape: tuple[int, ...],
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return errors along each trial, and their deviations, shape (n, N)."""
+    e = rng.normal(size=shape)
+    for i, cell in enumerate(cells):
+        df = noise.cells[cell].df
+        if np.isfinite(df):
+            e[i] = rng.standard_t(df, size=shape[1]) * np.sqrt((df - 2) / df)
+    rho = np.stack([noise.cells[c].rho for c in cells])
+    u = e
+    if rho.any():
+        u = np.empty_like(e)
+        u[:, 0] = e[:, 0]
+        for k in range(1, shape[1]):
+            step = np.sqrt(1 - rho[:, k] ** 2) * e[:, k]
+            u[:, k] = rho[:, k] * u[:, k - 1] + step
+    sd = np.stack([noise.cells[c].sd for c in cells]) * scales[:, None]
+    return u * sd, sd
+
+
+def _log_density(
+    noise: NoiseGrid, cell: int, scale: float, residual: Array, at: Array, wide: Array
+) -> float:
+    """Return the log density of one trial's residual given the cell of the noise."""
+    whole = noise.cells[cell]
+    if wide.any():  # beside the residual process, as independent numbers
+        log_p = -0.5 * (residual / wide) ** 2 - np.log(wide) - 0.5 * np.log(2 * np.pi)
+        return float(log_p.sum())
+    part = type(whole)(0.0, whole.sd[at], whole.rho[at], whole.df)
+    return float(
+        NoiseGrid([part], scales=np.array([scale])).log_likelihood(residual[None])[0]
+    )

@@ -1,0 +1,223 @@
+"""What each step of the closed loop finds, as plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import pandas as pd
+from numpy.typing import NDArray
+
+__all__ = [
+    "Detection",
+    "Estimate",
+    "Evaluation",
+    "Evidence",
+    "NextAction",
+    "Residuals",
+    "Tracing",
+]
+
+Array = NDArray[Any]
+
+#: What is no effect: the bare model, the residual process, and noise inflation.
+NONE, UNEXPLAINED, SCATTER = "none", "unexplained", "scatter"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residuals:
+    r"""Standardized residuals, :math:`(x - \mu) / s` under a posterior predictive.
+
+    Attributes:
+        action: Shape (t, action_dim).
+        index: Place of each trial, shape (t,).
+        times: Sample times, shape (k,) or (t, k); None without a time axis.
+        x: Observations, shape (t, *x_shape), NaN where masked.
+        mean: Posterior predictive mean of the model refitted to all trials, shape of x.
+        sd: Its standard deviation, noise included, shape of x.
+        refitted: (x - mean) / sd, shape of x.
+        prequential: The same with trial t predicted from the trials before it, the
+            first from the prior, shape of x.
+        correlation: Of neighboring noise errors along the time axis, posterior mean; 0
+            without a time axis.
+        noise: "declared", "estimated" (from repeats or the trajectories themselves), or
+            "stochastic" (the simulator is the draw).
+    """
+
+    action: Array
+    index: Array
+    times: Array | None
+    x: Array
+    mean: Array
+    sd: Array
+    refitted: Array
+    prequential: Array
+    correlation: float
+    noise: Literal["declared", "estimated", "stochastic"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    r"""Marginal likelihood of one model, :math:`\log Z = \log \int p(x|z) p(z) dz`.
+
+    Attributes:
+        name: "none", effects joined by " + ", "unexplained" or "scatter".
+        log_evidence: log Z, nats.
+        standard_error: Of log Z, Monte Carlo, nats.
+        effective_sample_size: Of the importance weights; the particles' number for
+            tempering.
+        engine: "least squares" (with importance sampling) or "tempering".
+        num_simulations: Trials simulated.
+        names: Of the coordinates (theta, phi).
+        draws: Posterior draws of (theta, phi), shape (m, dim).
+        best_chi_square: Smallest whitened residual sum of squares among the draws.
+    """
+
+    name: str
+    log_evidence: float
+    standard_error: float
+    effective_sample_size: float
+    engine: str
+    num_simulations: int
+    names: tuple[str, ...]
+    draws: Array
+    best_chi_square: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection:
+    r"""Whether the bare model, refitted, still misses the data.
+
+    Attributes:
+        alarm: True where ``lower`` exceeds ``threshold``.
+        log_bayes_factor: Of the equal-weight mixture of all effects and catch-alls
+            against the bare model, nats.
+        standard_error: Monte Carlo, nats.
+        lower: log_bayes_factor minus twice its standard error.
+        threshold: log 20.
+        chi_square: Smallest whitened residual sum of squares of the bare model.
+        degrees_of_freedom: Measurements less parameters.
+        p_value: Of that chi-square; anti-conservative where noise is estimated.
+        null_log_evidence: By least squares, nats.
+        null_cross_check: The same by tempering; None where no alarm was near.
+    """
+
+    alarm: bool
+    log_bayes_factor: float
+    standard_error: float
+    lower: float
+    threshold: float
+    chi_square: float
+    degrees_of_freedom: int
+    p_value: float
+    null_log_evidence: float
+    null_cross_check: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One effect as the data leave it.
+
+    Attributes:
+        name: Of the effect.
+        family: Of the effect.
+        units: Of phi.
+        describe: Its sentence, or "".
+        probability: Of the effect being the one that is missing, alone or with others.
+        log_bayes_factor: Of the effect alone against the bare model, nats.
+        mean: Of phi given the effect alone, shape (phi_dim,).
+        sd: Of phi given the effect alone, shape (phi_dim,).
+        effective_sample_size: Of its evidence.
+        engine: Of its evidence.
+        at_edge: phi lies at the edge of its prior.
+    """
+
+    name: str
+    family: str
+    units: str
+    describe: str
+    probability: float
+    log_bayes_factor: float
+    mean: Array
+    sd: Array
+    effective_sample_size: float
+    engine: str
+    at_edge: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracing:
+    """Which effect the data point to.
+
+    Attributes:
+        verdict: "none", "unexplained", "scatter", or effects joined by " + ".
+        chosen: Names of the effects of the verdict; empty for the other three.
+        probabilities: Posterior probability by "none", "unexplained", "scatter",
+            effect, and sets of effects that were tried (names joined by " + ").
+        inclusion: Probability that an effect belongs to the model, by effect.
+        credible_set: Smallest set of names with at least 90 % of the probability, most
+            probable first.
+        equivalent: Groups of names that no permitted action separates ("none" for an
+            effect that shows nowhere).
+        near: The same for the trials at hand alone; another action may separate them.
+        estimates: One an effect, most probable first.
+        evidences: Of every model tried, by name.
+        robust: Whether the verdict is that of effect priors a third and three times as
+            wide.
+        guesses: Formula effects, best first: (formula, log evidence above
+            "unexplained"), which is empty unless nothing declared explains the data.
+    """
+
+    verdict: str
+    chosen: tuple[str, ...]
+    probabilities: dict[str, float]
+    inclusion: dict[str, float]
+    credible_set: tuple[str, ...]
+    equivalent: tuple[frozenset[str], ...]
+    near: tuple[frozenset[str], ...]
+    estimates: tuple[Estimate, ...]
+    evidences: dict[str, Evidence]
+    robust: bool
+    guesses: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Error before and after, on trials used neither to fit nor to choose.
+
+    Attributes:
+        scheme: "held out", "leave one out" or "prequential".
+        trials: Positions of the scored trials, shape (s,).
+        before: By metric, one value a scored trial, shape (s,): "rmse", "energy score",
+            "log predictive density", "coverage" (share of entries in the central 90 %).
+        after: The same with the effects added.
+        table: Columns metric, before, after, ratio, low, high: RMSE over all scored
+            trials, means of the others, ratio after / before (difference for the log
+            density and the coverage), and its 90 % bootstrap interval, paired over
+            trials; NaN below 8 trials.
+        selected: Verdict of each fold, shape (s,).
+    """
+
+    scheme: Literal["held out", "leave one out", "prequential"]
+    trials: Array
+    before: dict[str, Array]
+    after: dict[str, Array]
+    table: pd.DataFrame
+    selected: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class NextAction:
+    """The action whose outcome tells most about which model is right.
+
+    Attributes:
+        action: Shape (action_dim,); None where nothing is to be gained.
+        candidates: Shape (a, action_dim).
+        information_gain: Lower bound on I(model; x | action) a candidate, nats.
+        separates: Names that remain in question.
+    """
+
+    action: Array | None
+    candidates: Array
+    information_gain: Array
+    separates: tuple[str, ...] = field(default_factory=tuple)

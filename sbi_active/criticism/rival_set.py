@@ -1,0 +1,275 @@
+"""All rivals over one set of trials, and their evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.augmented import AugmentedSimulator
+from sbi_active.criticism.effects import Effect
+from sbi_active.criticism.errors import ErrorModel
+from sbi_active.criticism.importance import ImportanceSample, importance_sample
+from sbi_active.criticism.least_squares import find_modes, probe_step
+from sbi_active.criticism.noise_grid import declared_noise, scattered
+from sbi_active.criticism.residual_process import ResidualProcess
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
+from sbi_active.criticism.rival import Rival
+from sbi_active.criticism.tempering import temper
+from sbi_active.criticism.trial_simulator import TrialSimulator
+from sbi_active.criticism.trials import Trials
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation import SimulatorModel
+
+__all__ = ["RivalSet"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 400
+#: Below this effective sample size importance sampling is not trusted.
+TOO_FEW = 30.0
+NUM_SPREAD = 200
+#: Searches that start at posteriors of smaller rivals.
+NUM_NEAR = 8
+
+
+class RivalSet:
+    """The bare model, its extensions by effects, and the catch-alls.
+
+    Args:
+        model: The bare simulator.
+        prior: Of its parameters.
+        trials: Those that may be fitted.
+        effects: Declared effects; of scope "trial" ones every rival has.
+        actions: The permitted ones, for the length scales of the residual process; None
+            takes the range of the trials.
+        seed: Of all draws.
+
+    Attributes:
+        effects: Effects of scope "campaign", by name.
+        noise: Distribution of the errors of the bare model.
+        spread: Deviation of the prior predictive, shape (N,).
+        step: Of finite differences.
+        is_smooth: Whether derivatives mean anything.
+        evidences: Of the rivals that were asked for, by name.
+        samples: Weighted samples behind them.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        prior: Distribution,
+        trials: Trials,
+        effects: Sequence[Effect],
+        *,
+        actions: ActionSpace | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
+        self.actions = actions
+        self.effects = {e.name: e for e in effects if e.scope == "campaign"}
+        self.nuisances = [e for e in effects if e.scope == "trial"]
+        augmented = AugmentedSimulator(
+            model, effects, next_index=int(trials.index.max()) + 1
+        )
+        self.simulator = TrialSimulator(
+            augmented, trials, seed=derive_seed(seed, "trials")
+        )
+        self.measurements = self.simulator.measurements
+        self.noise = declared_noise(
+            model.noise, self.measurements, seed=derive_seed(seed, "noise")
+        )
+        self.spread = self._prior_spread()
+        self.step, self.is_smooth = probe_step(
+            self.rival(()), seed=derive_seed(seed, "probe")
+        )
+        self.evidences: dict[str, Evidence] = {}
+        self.samples: dict[str, ImportanceSample] = {}
+        self.rivals: dict[str, Rival] = {}
+
+    def rival(self, names: Sequence[str], *, error: str | None = None) -> Rival:
+        """Return the simulator with some effects and an error model.
+
+        Args:
+            names: Of the effects.
+            error: None for the noise alone, "unexplained" or "scatter".
+        """
+        own = {None: self.noise, UNEXPLAINED: None, SCATTER: None}
+        model: ErrorModel | None = own[error]
+        if error == SCATTER:
+            model = scattered(self.noise)
+        elif error == UNEXPLAINED:
+            model = self.residual_process()
+        assert model is not None
+        parts = [*names, *([] if error is None else [error])]
+        return Rival(
+            " + ".join(parts) or NONE,
+            simulator=self.simulator,
+            prior=self.prior,
+            effects=[self.effects[name] for name in names],
+            nuisances=self.nuisances,
+            error=model,
+            spread=self.spread,
+        )
+
+    def residual_process(self) -> ResidualProcess:
+        """Return the noise with a smooth function of the action and time."""
+        if not hasattr(self, "_process"):
+            sd = np.exp(np.mean([np.log(cell.sd) for cell in self.noise.cells], 0))
+            self._process = ResidualProcess(
+                self.noise,
+                self.measurements,
+                action=self.scaled_actions(),
+                largest=float(np.median(self.spread / sd)),
+            )
+        return self._process
+
+    def scaled_actions(self, trials: Trials | None = None) -> Array:
+        """Return actions in ranges of the action space, those of the fit first.
+
+        Args:
+            trials: Further trials.
+        """
+        action = some = self.trials.action.numpy()
+        if self.actions is not None:
+            draws = self.actions.sample((256,), seed=0).double().numpy()
+            some = np.concatenate([draws, action])
+        width = np.ptp(some, axis=0)
+        if trials is not None:
+            action = np.concatenate([action, trials.action.numpy()])
+        return action / np.where(width > 0, width, 1.0)
+
+    def evidence(
+        self, names: Sequence[str] = (), *, error: str | None = None
+    ) -> Evidence:
+        """Return the evidence of one rival, computed once."""
+        rival = self.rival(names, error=error)
+        if rival.name not in self.evidences:
+            seed = derive_seed(self.seed, "evidence", rival.name)
+            before = self.simulator.num_simulations
+            sample, engine = self._estimate(rival, seed)
+            self._keep(rival, sample, engine, before, seed)
+        return self.evidences[rival.name]
+
+    def tempered(
+        self, names: Sequence[str] = (), *, error: str | None = None
+    ) -> Evidence:
+        """Return the evidence by tempering, and keep it where it is the larger.
+
+        A mode that the least-squares search missed is missing from its evidence, and
+        no effective sample size shows it.
+        """
+        rival = self.rival(names, error=error)
+        own = self.evidence(names, error=error)
+        seed = derive_seed(self.seed, "tempering", rival.name)
+        before = self.simulator.num_simulations
+        sample = temper(rival, seed=seed)
+        other = self._record(rival, sample, "tempering", before, seed)
+        both = float(np.hypot(own.standard_error, other.standard_error))
+        if other.log_evidence > own.log_evidence + 2 * both:
+            self.evidences[rival.name] = other
+            self.samples[rival.name] = sample
+        return other
+
+    def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
+        if not self.is_smooth:
+            return temper(rival, seed=seed), "tempering"
+        near = self._starts(rival, seed)
+        modes = find_modes(rival, step=self.step, seed=seed, near=near)
+        rng = np.random.default_rng(seed)
+        sample = importance_sample(rival, modes.proposal, rng=rng)
+        if sample.effective_sample_size >= TOO_FEW:
+            return sample, "least squares"
+        return temper(rival, seed=seed), "tempering"
+
+    def _starts(self, rival: Rival, seed: int) -> Array | None:
+        """Return points at posteriors of smaller rivals, the rest from the prior.
+
+        Those with one effect less are the parents; without effects, or behind a
+        catch-all, it is the bare model.
+        """
+        names = [e.name for e in rival.effects]
+        parents = [[n for n in names if n != left] for left in names] or [[]]
+        known = [p for p in parents if (" + ".join(p) or NONE) in self.rivals]
+        if not known or rival.name == NONE:
+            return None
+        rng = np.random.default_rng(seed)
+        parts = []
+        for own in known:
+            parent = self.rivals[" + ".join(own) or NONE]
+            each = max(NUM_NEAR // len(known), 1)
+            drawn = parent.coordinates.to_z(self.samples[parent.name].draws(each, rng))
+            z = rival.coordinates.to_z(rival.coordinates.sample(each, seed=seed))
+            shared, theta_dim = parent.columns(), parent.theta_dim
+            z[:, :theta_dim] = drawn[:, :theta_dim]
+            for name, place in rival.columns().items():
+                if name in shared:
+                    z[:, place] = drawn[:, shared[name]]
+            parts.append(rival.coordinates.from_z(z))
+        return np.concatenate(parts)
+
+    def _keep(
+        self,
+        rival: Rival,
+        sample: ImportanceSample,
+        engine: str,
+        before: int,
+        seed: int,
+    ) -> None:
+        self.evidences[rival.name] = self._record(rival, sample, engine, before, seed)
+        self.samples[rival.name] = sample
+        self.rivals[rival.name] = rival
+
+    def _record(
+        self,
+        rival: Rival,
+        sample: ImportanceSample,
+        engine: str,
+        before: int,
+        seed: int,
+    ) -> Evidence:
+        u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
+        best = sample.u[np.argsort(sample.weights)[-20:]]
+        joint = rival.coordinates.joint
+        theta_names = self.model.parameter_names
+        if theta_names is None:
+            theta_names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
+        names = [*theta_names, *[n for e in rival.effects for n in e.phi_names]]
+        own = sum(joint.sizes)
+        residual = rival.residual(best)[0]
+        square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
+        return Evidence(
+            name=rival.name,
+            log_evidence=sample.log_evidence,
+            standard_error=sample.standard_error,
+            effective_sample_size=sample.effective_sample_size,
+            engine=engine,
+            num_simulations=self.simulator.num_simulations - before,
+            names=(*names,),
+            draws=rival.coordinates.to_z(u)[:, :own],
+            best_chi_square=float(min(square)),
+        )
+
+    def _prior_spread(self) -> Array:
+        """Return the prior predictive's deviation of each number, shape (N,)."""
+        ones = np.ones(len(self.measurements))
+        rival = Rival(
+            "prior",
+            simulator=self.simulator,
+            prior=self.prior,
+            effects=(),
+            nuisances=self.nuisances,
+            error=self.noise,
+            spread=ones,
+        )
+        u = rival.coordinates.sample(NUM_SPREAD, seed=derive_seed(self.seed, "spread"))
+        mean, _, _ = self.simulator.predict(*rival.coordinates.split(u))
+        finite = np.isfinite(mean).any(0)
+        spread = np.zeros(len(self.measurements))
+        spread[finite] = np.nanstd(mean[:, finite], axis=0)
+        typical = np.median(spread[spread > 0]) if (spread > 0).any() else 1.0
+        return np.maximum(spread, 1e-3 * typical)

@@ -1,0 +1,246 @@
+"""Measured trials: actions, observations and what is known of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["Role", "Trials"]
+
+Role = Literal["fit", "held out"]
+
+
+class Trials:
+    r"""Measured trials.
+
+    Ragged observations are padded with NaN. NaN is masked; a trial of NaN alone is
+    *invalid*: the system ran and gave no measurement.
+
+    Args:
+        action: As commanded, shape (n, action_dim), or (n,) for scalar actions.
+        x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
+        role: "fit", or "held out" of everything that is fitted or chosen; one a
+            trial, or None for all "fit".
+        mask: True where x is a measurement, of the shape of x; None takes what is not
+            NaN.
+        index: Place of each trial in the order of execution, shape (n,); None counts
+            from 0.
+        sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
+        performed_at: When each trial was executed, in any unit, shape (n,).
+        repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
+            none; None takes trials of equal actions as repeats of the first.
+        covariates: Further numbers by name, shape (n,) each.
+
+    Raises:
+        ValueError: If shapes disagree, all trials are invalid, or held-out data have
+            no measurement.
+
+    Example:
+        >>> trials = Trials(torch.tensor([1.0, 2.0]), torch.tensor([0.3, 0.5]))
+        >>> len(trials), trials.action.shape, trials.x.shape
+        (2, torch.Size([2, 1]), torch.Size([2, 1]))
+    """
+
+    def __init__(
+        self,
+        action: Any,
+        x: Any,
+        *,
+        role: Sequence[Role] | None = None,
+        mask: Any = None,
+        index: Any = None,
+        sample_times: Any = None,
+        performed_at: Any = None,
+        repeat_of: Any = None,
+        covariates: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.action = _tensor(action)
+        if self.action.ndim == 1:
+            self.action = self.action[:, None]
+        self.x = _padded(x)
+        n = len(self.x)
+        if self.action.ndim != 2 or len(self.action) != n or n == 0:
+            raise ValueError(
+                "expected actions (n, action_dim) and x with as many rows; got "
+                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; do give one "
+                "action a trial"
+            )
+        if not bool(self.action.isfinite().all()):
+            raise ValueError(
+                "expected finite actions; got NaN or inf; do give each trial the "
+                "action that was commanded"
+            )
+        if self.x.ndim == 1:
+            self.x = self.x[:, None]
+        if mask is not None:
+            keep = torch.as_tensor(_padded(mask) == 1)
+            if keep.shape != self.x.shape:
+                raise ValueError(
+                    f"expected a mask of shape {tuple(self.x.shape)}, that of x; got "
+                    f"{tuple(keep.shape)}; do give one an entry of x"
+                )
+            self.x = self.x.where(keep, torch.nan)
+        self.x = self.x.where(self.x.isfinite(), torch.nan)
+        self.role = _roles(role, n)
+        self.index = self._rows("index", index, torch.arange(n))
+        self.performed_at = (
+            None
+            if performed_at is None
+            else self._rows("performed_at", performed_at, None)
+        )
+        self.sample_times = self._times(sample_times)
+        self.repeat_of = (
+            _repeats(self.action)
+            if repeat_of is None
+            else self._rows("repeat_of", repeat_of, None).long()
+        )
+        self.covariates = {
+            name: self._rows(name, value, None)
+            for name, value in (covariates or {}).items()
+        }
+        if not bool(self.valid.any()):
+            raise ValueError(
+                f"expected at least one valid trial; got {n} trials without a "
+                "measurement; do check x and mask for NaN"
+            )
+        lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
+        if lost:
+            raise ValueError(
+                f"expected measurements in the held-out trials; got NaN in trials "
+                f"{lost}; do hold out other trials"
+            )
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __repr__(self) -> str:
+        held = len(self.held_out_positions)
+        return (
+            f"Trials({len(self)} x {tuple(self.x.shape[1:])}, {held} held out, "
+            f"{int((~self.valid).sum())} invalid)"
+        )
+
+    def __getitem__(self, positions: Any) -> Trials:
+        return self.select(positions)
+
+    @property
+    def mask(self) -> Tensor:
+        """True where x is a measurement, of the shape of x."""
+        return self.x.isfinite()
+
+    @property
+    def valid(self) -> Tensor:
+        """Trials with a measurement, shape (n,), bool."""
+        return self.mask.flatten(1).any(-1)
+
+    @property
+    def held_out_positions(self) -> list[int]:
+        """Positions of the held-out trials."""
+        return [i for i, role in enumerate(self.role) if role == "held out"]
+
+    @property
+    def fit(self) -> Trials:
+        """The trials that may be fitted."""
+        return self._of("fit")
+
+    @property
+    def held_out(self) -> Trials | None:
+        """The held-out trials; None where there are none."""
+        return self._of("held out") if self.held_out_positions else None
+
+    def select(self, positions: Any) -> Trials:
+        """Return some trials, with their indices.
+
+        Args:
+            positions: A slice, positions, or a bool a trial.
+        """
+        at = torch.arange(len(self))[
+            positions if isinstance(positions, slice) else torch.as_tensor(positions)
+        ].reshape(-1)
+        new = {int(old): i for i, old in enumerate(at)}
+        times = self.sample_times
+        return Trials(
+            self.action[at],
+            self.x[at],
+            role=[self.role[i] for i in at],
+            index=self.index[at],
+            sample_times=times if times is None or times.ndim == 1 else times[at],
+            performed_at=None if self.performed_at is None else self.performed_at[at],
+            repeat_of=torch.tensor([new.get(int(self.repeat_of[i]), -1) for i in at]),
+            covariates={name: v[at] for name, v in self.covariates.items()},
+        )
+
+    def _of(self, role: Role) -> Trials:
+        positions = [i for i, r in enumerate(self.role) if r == role]
+        if not positions:
+            raise ValueError(
+                f"expected at least one trial of role {role!r}; got none of "
+                f"{len(self)}; do change role"
+            )
+        return self.select(positions)
+
+    def _rows(self, name: str, value: Any, default: Tensor | None) -> Tensor:
+        tensor = _tensor(default if value is None else value)
+        if tensor.shape != (len(self),):
+            raise ValueError(
+                f"expected {name} of shape ({len(self)},), one a trial; got "
+                f"{tuple(tensor.shape)}; do give one each"
+            )
+        return tensor
+
+    def _times(self, times: Any) -> Tensor | None:
+        if times is None:
+            return None
+        tensor = _padded(times)
+        k = self.x.shape[1]
+        if tensor.shape not in ((k,), (len(self), k)):
+            raise ValueError(
+                f"expected sample_times of shape ({k},) or ({len(self)}, {k}) for x of "
+                f"shape {tuple(self.x.shape)}; got {tuple(tensor.shape)}; do give one "
+                "an entry of x's first axis"
+            )
+        return tensor
+
+
+def _tensor(value: Any) -> Tensor:
+    return torch.as_tensor(np.asarray(value), dtype=torch.float64)
+
+
+def _padded(value: Any) -> Tensor:
+    """Return arrays stacked, shorter ones padded with NaN at their end."""
+    if isinstance(value, (Tensor, np.ndarray)) or np.isscalar(value):
+        return _tensor(value)
+    rows = [_tensor(row) for row in value]
+    if len({row.shape for row in rows}) <= 1:
+        return torch.stack(rows) if rows else torch.empty(0)
+    if len({row.shape[1:] for row in rows}) > 1 or any(r.ndim == 0 for r in rows):
+        raise ValueError(
+            "expected observations that differ in their first axis alone; got shapes "
+            f"{[tuple(row.shape) for row in rows]}; do give the same channels in each"
+        )
+    longest = max(len(row) for row in rows)
+    x = torch.full((len(rows), longest, *rows[0].shape[1:]), torch.nan).double()
+    for i, row in enumerate(rows):
+        x[i, : len(row)] = row
+    return x
+
+
+def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
+    roles: list[Role] = ["fit"] * n if role is None else [*role]
+    if len(roles) != n or not {*roles} <= {"fit", "held out"}:
+        raise ValueError(
+            f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "
+            "do give one each"
+        )
+    return roles
+
+
+def _repeats(action: Tensor) -> Tensor:
+    """Return the position of the first trial of the same action, -1 for itself."""
+    same = (action[:, None] == action[None]).all(-1)
+    first = same.int().argmax(-1)
+    return first.where(first != torch.arange(len(action)), torch.tensor(-1))

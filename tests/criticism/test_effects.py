@@ -1,0 +1,222 @@
+import math
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import HalfNormal, Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import (
+    AugmentedSimulator,
+    Effect,
+    generic_effects,
+    joint_prior,
+)
+from sbi_active.simulation import simulate
+
+PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
+ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
+
+
+def line(theta, action, curvature=0.0):
+    xi = action[:, 0]
+    return (theta[:, 0] + theta[:, 1] * xi + curvature * xi**2)[:, None]
+
+
+MODEL = SimulatorModel(line, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
+
+
+def effect(name="bias", **changes):
+    parts = {
+        "hook": "observation",
+        "prior": Normal(0.0, 1.0),
+        "null": 0.0,
+        "apply": lambda x, phi, action, context: x + phi,
+    }
+    return Effect(name, **(parts | changes))
+
+
+HOOKS = {
+    "action": effect("offset", hook="action", apply=lambda v, phi, a, c: v + phi),
+    "parameter": effect("aging", hook="parameter", apply=lambda v, phi, a, c: v + phi),
+    "dynamics": effect(
+        "curvature",
+        hook="dynamics",
+        apply=lambda v, phi, a, c: {**v, "curvature": phi[:, 0]},
+    ),
+    "observation": effect(),
+    "noise": effect(
+        "inflation",
+        hook="noise",
+        prior=HalfNormal(1.0),
+        apply=lambda sd, phi, a, c: sd * (1 + phi),
+    ),
+}
+#: The noise-free x of a = 0.5, b = -0.25 at the action 2 under phi = 0.4.
+EXPECTED = {
+    "action": 0.5 - 0.25 * 2.4,
+    "parameter": 0.9 + 0.15 * 2,
+    "dynamics": 0.5 - 0.25 * 2 + 0.4 * 4,
+    "observation": 0.5 - 0.25 * 2 + 0.4,
+    "noise": 0.5 - 0.25 * 2,
+}
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+def test_every_hook_changes_what_it_says(hook):
+    model = AugmentedSimulator(MODEL, [HOOKS[hook]])
+    theta = torch.tensor([[0.5, -0.25, 0.4]])
+    x = model.mean(theta, torch.tensor([[2.0]]))
+    assert x.item() == pytest.approx(EXPECTED[hook], abs=1e-6)
+    assert model.parameter_names == ["a", "b", HOOKS[hook].name]
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+def test_at_the_null_it_is_the_simulator(hook):
+    model = AugmentedSimulator(MODEL, [HOOKS[hook]])
+    theta, action = PRIOR.sample((50,)), ACTIONS.sample((50,), seed=0)
+    both = torch.cat([theta, torch.zeros(50, 1)], -1)
+    seeds = torch.arange(50)
+    torch.testing.assert_close(
+        model(both, action, seeds=seeds), MODEL(theta, action, seeds=seeds)
+    )
+
+
+def test_noise_effects_stretch_the_noise():
+    model = AugmentedSimulator(MODEL, [HOOKS["noise"]])
+    theta = torch.tensor([0.0, 0.0, 2.0]).repeat(4_000, 1)
+    x = model(theta, torch.zeros(4_000, 1), seeds=torch.arange(4_000))
+    # Standard error of a standard deviation of 0.3 from 4,000 draws: 0.3 / sqrt(8000).
+    assert float(x.std()) == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(8_000))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "size"),
+    [
+        (effect(null=0.5), "0.5"),
+        (effect(apply=lambda x, phi, a, c: x + phi + 0.25), "0.25"),
+    ],
+)
+def test_an_effect_that_does_not_vanish_is_named_with_its_size(wrong, size):
+    check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
+    with pytest.raises(ValueError, match=f"effect 'bias' to vanish.*up to {size}"):
+        AugmentedSimulator(MODEL, [wrong], check=check)
+
+
+def test_without_actions_the_first_call_compares():
+    model = AugmentedSimulator(MODEL, [effect(null=0.5)])
+    with pytest.raises(ValueError, match="vanish at its null"):
+        model.mean(torch.zeros(3, 3), torch.ones(3, 1))
+
+
+def test_a_null_at_infinity():
+    saturation = effect(
+        "saturation",
+        null=torch.inf,
+        prior=Independent(HalfNormal(torch.ones(1)), 1),
+        apply=lambda x, phi, a, c: phi * torch.tanh(x / phi),
+    )
+    check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
+    AugmentedSimulator(MODEL, [saturation], check=check)  # inf * tanh(0) is NaN
+
+
+def test_augmenting_twice_is_augmenting_with_both():
+    one = AugmentedSimulator(MODEL, [HOOKS["action"]])
+    two = AugmentedSimulator(one, [HOOKS["observation"]])
+    both = AugmentedSimulator(MODEL, [HOOKS["action"], HOOKS["observation"]])
+    prior = joint_prior(joint_prior(PRIOR, one.effects), [HOOKS["observation"]])
+    z, action = prior.sample((20,)), ACTIONS.sample((20,), seed=0)
+    assert two.base is MODEL
+    torch.testing.assert_close(two.mean(z, action), both.mean(z, action))
+
+
+def test_the_index_of_a_plain_call_is_the_next_trial():
+    drift = effect("drift", apply=lambda x, phi, a, c: x + phi * c.index[:, None])
+    model = AugmentedSimulator(MODEL, [drift], next_index=8)
+    x = model.mean(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 1))
+    assert x.item() == pytest.approx(4.0)
+    rows = model.evaluate(
+        torch.zeros(3, 2),
+        {"drift": torch.ones(3, 1)},
+        torch.zeros(3, 1),
+        index=torch.tensor([0.0, 1.0, 5.0]),
+    )
+    assert rows[:, 0].tolist() == [0.0, 1.0, 5.0]
+
+
+def test_the_joint_prior_is_the_product():
+    inflation = HOOKS["noise"]
+    joint = joint_prior(PRIOR, [HOOKS["observation"], inflation])
+    z = joint.sample((200,))
+    expected = PRIOR.log_prob(z[:, :2]) + Normal(0.0, 1.0).log_prob(z[:, 2])
+    expected = expected + HalfNormal(1.0).log_prob(z[:, 3])
+    torch.testing.assert_close(joint.log_prob(z), expected)
+    assert joint.event_shape == (4,)
+    outside = torch.tensor([[0.0, 2.0, 0.0, 1.0], [0.0, 0.0, 0.0, -1.0]])
+    assert joint.log_prob(outside).tolist() == [-math.inf, -math.inf]
+    assert joint.support.check(outside).tolist() == [False, False]
+    assert joint.mean.shape == joint.stddev.shape == (4,)
+
+
+def test_effects_of_a_trial_are_drawn_in_every_call_and_add_no_parameter():
+    release = effect("release", scope="trial", prior=Normal(0.0, 0.5))
+    model = AugmentedSimulator(MODEL, [release])
+    prior = joint_prior(PRIOR, [release])
+    theta = torch.zeros(2_000, 2)
+    x = simulate(model, theta, torch.zeros(2_000, 1), seed=0).x
+    assert prior.event_shape == (2,)
+    expected = math.hypot(0.5, 0.1)
+    assert float(x.std()) == pytest.approx(expected, abs=4 * expected / math.sqrt(4e3))
+
+
+def test_generic_effects_vanish_and_are_scaled_by_noise_and_actions():
+    effects = generic_effects(MODEL, ACTIONS, prior=PRIOR)
+    check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
+    AugmentedSimulator(MODEL, effects, check=check)
+    by_name = {e.name: e for e in effects}
+    assert {e.family for e in effects} == {"action", "observation"}
+    draws = by_name["bias"].sample(4_000)
+    assert float(draws.std()) == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(8_000))
+    draws = by_name["action offset"].sample(4_000)
+    assert float(draws.std()) == pytest.approx(0.2, abs=4 * 0.2 / math.sqrt(8_000))
+    assert "dead zone" in by_name
+    one_way = generic_effects(MODEL, DiscreteActions([1.0, 2.0]))
+    assert "dead zone" not in {e.name for e in one_way}
+
+
+def test_a_clock_offset_reads_the_trajectory_elsewhere():
+    times = torch.linspace(0, 2, 21)
+    model = SimulatorModel(
+        lambda theta, action: theta[:, :1] * times.to(theta),
+        noise=GaussianNoise(0.1),
+        sample_times=times,
+    )
+    clock = next(e for e in generic_effects(model, ACTIONS) if e.name == "clock offset")
+    x = AugmentedSimulator(model, [clock]).mean(
+        torch.tensor([[3.0, 0.05]]), torch.zeros(1, 1)
+    )
+    torch.testing.assert_close(x[0], 3 * (times + 0.05))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hook": "sensor"}, "expected a hook of action, parameter"),
+        ({"scope": "row"}, "expected scope 'campaign' or 'trial'"),
+        ({"null": torch.zeros(3)}, r"expected a null of shape \(1,\)"),
+        ({"name": "a + b"}, "expected a name without"),
+    ],
+)
+def test_bad_effects(changes, message):
+    with pytest.raises(ValueError, match=message):
+        effect(**changes)
+
+
+def test_distinct_names():
+    with pytest.raises(ValueError, match="got bias more than once"):
+        AugmentedSimulator(MODEL, [effect(), effect()])
+
+
+def test_generic_effects_need_a_size():
+    with pytest.raises(ValueError, match="expected a simulator with declared noise"):
+        generic_effects(SimulatorModel(line), ACTIONS)

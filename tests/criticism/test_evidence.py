@@ -1,0 +1,165 @@
+"""Evidence against closed forms: linear models with Gaussian priors and noise."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+from torch.distributions import Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism.errors import NoiseCell, NoiseGrid
+from sbi_active.criticism.measurements import Measurements
+from sbi_active.criticism.noise_grid import declared_noise
+from sbi_active.criticism.residual_process import ResidualProcess
+from sbi_active.criticism.rival_set import RivalSet
+
+PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
+ACTION = torch.linspace(-2, 2, 8)[:, None]
+X = torch.tensor([0.3, 1.4, -0.2, 0.8, 2.2, 1.1, 3.5, 2.9])[:, None]
+CURVE = Effect(
+    "curve",
+    hook="observation",
+    prior=Normal(0.0, 0.7),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi * action**2,
+)
+
+
+def line(theta, action):
+    return theta[:, :1] + theta[:, 1:2] * action
+
+
+def rivals(**keywords):
+    model = SimulatorModel(line, noise=GaussianNoise(0.5))
+    return RivalSet(
+        model,
+        PRIOR,
+        Trials(ACTION, X),
+        [CURVE],
+        actions=DiscreteActions(torch.linspace(-2, 2, 9)),
+        **keywords,
+    )
+
+
+def exact(columns, deviations, noise):
+    """Return log N(x; 0, B S B^T + noise^2 I)."""
+    design = np.stack(columns, 1) * np.array(deviations)
+    cov = design @ design.T + noise**2 * np.eye(len(X))
+    return multivariate_normal(np.zeros(len(X)), cov).logpdf(X[:, 0].numpy())
+
+
+XI = ACTION[:, 0].double().numpy()
+MODELS = {
+    (): exact([XI**0, XI], [2.0, 1.0], 0.5),
+    ("curve",): exact([XI**0, XI, XI**2], [2.0, 1.0, 0.7], 0.5),
+}
+
+
+@pytest.mark.parametrize("names", MODELS)
+def test_importance_sampling_gives_the_evidence(names):
+    evidence = rivals().evidence(names)
+    assert evidence.engine == "least squares"
+    assert evidence.standard_error < 0.1
+    assert evidence.log_evidence == pytest.approx(
+        MODELS[names], abs=4 * evidence.standard_error
+    )
+
+
+@pytest.mark.parametrize("names", MODELS)
+def test_tempering_gives_the_evidence(names):
+    evidence = rivals().tempered(names)
+    assert evidence.log_evidence == pytest.approx(
+        MODELS[names], abs=4 * evidence.standard_error
+    )
+
+
+def test_the_posterior_is_the_exact_one():
+    evidence = rivals().evidence()
+    design = np.stack([XI**0, XI], 1)
+    precision = design.T @ design / 0.25 + np.diag([0.25, 1.0])
+    mean = np.linalg.solve(precision, design.T @ X[:, 0].double().numpy() / 0.25)
+    sd = np.sqrt(np.diag(np.linalg.inv(precision)))
+    # Two hundred effective draws at least, of the four hundred that are kept.
+    error = 4 * sd / np.sqrt(200)
+    assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
+    assert np.all(np.abs(evidence.draws.std(0) - sd) < error)
+
+
+def test_the_same_seed_gives_the_same_evidence():
+    a, b, c = (rivals(seed=s).evidence().log_evidence for s in (1, 1, 2))
+    assert a == b
+    assert a != c
+
+
+def test_scatter_sums_out_the_inflation():
+    evidence = rivals().evidence(error="scatter")
+    factors = 1 + 2.5 * np.abs(np.random.default_rng(0).normal(size=4_000))
+    each = [exact([XI**0, XI], [2.0, 1.0], 0.5 * f) for f in factors]
+    expected = np.logaddexp.reduce(each) - np.log(len(each))
+    # Fourteen quantiles stand for the half-normal factor.
+    assert evidence.log_evidence == pytest.approx(expected, abs=0.1)
+
+
+def test_the_residual_process_is_a_gaussian_of_the_stated_covariance():
+    trials = Trials(ACTION, X)
+    m = Measurements.of(trials)
+    noise = declared_noise(GaussianNoise(0.5), m)
+    action = ACTION.double().numpy() / 4
+    process = ResidualProcess(noise, m, action=action, largest=20.0, lengths=(0.3,))
+    r = X[:, 0].double().numpy()
+    kernel = np.exp(-0.5 * ((action - action.T) / 0.3) ** 2)
+    each = [
+        multivariate_normal(np.zeros(8), 0.25 * (a**2 * kernel + np.eye(8))).logpdf(r)
+        for a in np.geomspace(1, 20, 10)
+    ]
+    expected = np.logaddexp.reduce(each) - np.log(10)
+    # Directions below 1e-5 of the variance are left out.
+    assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)
+
+
+def test_the_process_interpolates_what_it_was_conditioned_on():
+    trials = Trials(ACTION, X)
+    m = Measurements.of(trials)
+    noise = declared_noise(GaussianNoise(0.05), m)
+    action = ACTION.double().numpy() / 4
+    process = ResidualProcess(noise, m, action=action, largest=100.0)
+    wave = np.sin(3 * action[:, 0])
+    mean, sd = process.condition(wave[None], m, np.concatenate([action, action]))
+    np.testing.assert_allclose(mean[0], wave, atol=0.1)
+    assert np.all(sd < 0.1)
+
+
+TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
+
+
+def test_correlated_noise_is_a_gaussian_of_exponential_covariance():
+    x = torch.tensor([[0.1, 0.4, torch.nan, 0.2, -0.3], [1.0, 0.9, 0.5, 0.4, 0.2]])
+    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
+    sd = np.full(len(m), 0.7)
+    cell = NoiseCell.of(m, sd=sd, correlation_time=0.4)
+    expected = 0.0
+    for t in range(2):
+        at = m.trial == t
+        gap = np.abs(m.time[at][:, None] - m.time[at])
+        cov = 0.49 * np.exp(-gap / 0.4)
+        expected += multivariate_normal(np.zeros(at.sum()), cov).logpdf(m.x[at])
+    got = NoiseGrid([cell]).log_likelihood(m.x[None])[0]
+    assert got == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_time_axis_leaves_the_correlation_open():
+    x = torch.zeros(2, 5)
+    without = Measurements.of(Trials([0.0, 1.0], x))
+    with_times = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
+    noise = GaussianNoise(1.0)
+    assert len(declared_noise(noise, without).cells) == 1
+    grid = declared_noise(noise, with_times)
+    assert len(grid.cells) > 10
+    assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
+
+
+def test_noise_without_size_is_refused():
+    m = Measurements.of(Trials([0.0, 1.0], [0.0, 1.0]))
+    with pytest.raises(ValueError, match="expected measurement noise with a standard"):
+        declared_noise(GaussianNoise(0.0), m)

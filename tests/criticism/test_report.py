@@ -1,0 +1,330 @@
+"""The report from its parts: what is printed when, and what the page contains."""
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism.report import build_report, find_warnings
+from sbi_active.criticism.results import (
+    Detection,
+    Estimate,
+    Evaluation,
+    Evidence,
+    NextAction,
+    Residuals,
+    Tracing,
+)
+from sbi_active.criticism.trials import Trials
+
+NAMES = ["drag", "tilt", "bias"]
+SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
+
+
+def evidence(name: str, log_evidence: float) -> Evidence:
+    rng = np.random.default_rng(0)
+    names = ("mu_1", "mu_2") if name == "none" else ("mu_1", "mu_2", name)
+    return Evidence(
+        name=name,
+        log_evidence=log_evidence,
+        standard_error=0.05,
+        effective_sample_size=312.0,
+        engine="least squares",
+        num_simulations=7_000,
+        names=names,
+        draws=0.3 + 0.01 * rng.normal(size=(400, len(names))),
+        best_chi_square=40.0,
+    )
+
+
+def estimate(name: str, probability: float, **changes) -> Estimate:
+    made = Estimate(
+        name=name,
+        family="dynamics",
+        units="1/m",
+        describe="a force against the speed" if name == "drag" else "",
+        probability=probability,
+        log_bayes_factor=9.4,
+        mean=np.array([0.123]),
+        sd=np.array([0.011]),
+        effective_sample_size=312.0,
+        engine="least squares",
+        at_edge=False,
+    )
+    return replace(made, **changes)
+
+
+def tracing(verdict: str = "drag", **changes) -> Tracing:
+    probabilities = {"none": 0.004, "unexplained": 0.01, "scatter": 0.001}
+    probabilities |= {"drag": 0.81, "tilt": 0.125, "bias": 0.05}
+    chosen = (verdict,) if verdict in NAMES else ()
+    made = Tracing(
+        verdict=verdict,
+        chosen=chosen,
+        probabilities=probabilities,
+        inclusion={"drag": 0.81, "tilt": 0.125, "bias": 0.05},
+        credible_set=("drag", "tilt"),
+        equivalent=(),
+        near=(),
+        estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
+        evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
+        robust=True,
+    )
+    return replace(made, **changes)
+
+
+def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Residuals:
+    rng = np.random.default_rng(1)
+    z = size * rng.normal(size=(num, *shape))
+    return Residuals(
+        action=np.array(SHUFFLED[:num])[:, None],
+        index=np.arange(num, dtype=float),
+        times=times,
+        x=z + 2,
+        mean=np.full_like(z, 2.0),
+        sd=np.ones_like(z),
+        refitted=z,
+        prequential=1.5 * z,
+        correlation=0.8 if times is not None else 0.0,
+        noise="declared",
+    )
+
+
+def evaluation(num: int = 8) -> Evaluation:
+    rng = np.random.default_rng(2)
+    before = {
+        "rmse": 0.05 + 0.02 * rng.random(num),
+        "energy score": 0.03 + 0.01 * rng.random(num),
+        "log predictive density": -20 - 5 * rng.random(num),
+        "coverage": np.round(rng.random(num) * 6) / 6,
+    }
+    after = {
+        "rmse": before["rmse"] / 5,
+        "energy score": before["energy score"] / 4,
+        "log predictive density": before["log predictive density"] + 35,
+        "coverage": np.full(num, 5 / 6),
+    }
+    enough = num >= 8
+    rows = []
+    for name in before:
+        b, a = before[name].mean(), after[name].mean()
+        ratio = a - b if name in ("log predictive density", "coverage") else a / b
+        ends = (0.9 * ratio, 1.1 * ratio) if enough else (np.nan, np.nan)
+        rows.append((name, b, a, ratio, *ends))
+    columns = pd.Index(["metric", "before", "after", "ratio", "low", "high"])
+    return Evaluation(
+        scheme="held out",
+        trials=np.arange(num, dtype=float),
+        before=before,
+        after=after,
+        table=pd.DataFrame(rows, columns=columns),
+    )
+
+
+def trials(action=SHUFFLED[:8]) -> Trials:
+    return Trials(torch.tensor(action), torch.randn(len(action), 6))
+
+
+def report(**changes):
+    noise = GaussianNoise(0.005)
+    parts = {
+        "trials": trials(),
+        "residuals": residuals(size=6.0),
+        "residuals_after": residuals(),
+        "detection": Detection(
+            alarm=True,
+            log_bayes_factor=8.2,
+            standard_error=0.1,
+            lower=8.0,
+            threshold=float(np.log(20)),
+            chi_square=180.4,
+            degrees_of_freedom=46,
+            p_value=1e-16,
+            null_log_evidence=-3.0,
+            null_cross_check=-3.1,
+        ),
+        "tracing": tracing(),
+        "evaluation": evaluation(),
+        "next_action": NextAction(
+            action=np.array([3.0]),
+            candidates=np.array([[1.0], [3.0]]),
+            information_gain=np.array([0.1, 0.41]),
+            separates=("drag", "tilt"),
+        ),
+        "simulator": SimulatorModel(
+            lambda theta, action: theta[:, :1] * torch.ones(1, 6), noise=noise
+        ),
+        "prior": BoxUniform(torch.zeros(3), torch.ones(3)),
+        "actions": DiscreteActions([1.0, 3.0], names=["speed"], units=["m/s"]),
+        "digest": "sha256:0123456789abcdef",
+    }
+    return build_report(**(parts | changes))
+
+
+def test_the_verdict_is_in_the_first_line():
+    first = str(report()).splitlines()[0]
+    assert first == "Verdict: drag (P = 0.81)"
+
+
+def test_the_verdict_line_says_what_limits_it():
+    made = report(
+        tracing=tracing(
+            robust=False,
+            equivalent=(frozenset({"drag", "bias"}),),
+        )
+    )
+    assert str(made).splitlines()[0] == (
+        "Verdict: drag (P = 0.81), not robust to its prior; no permitted action tells "
+        "it from bias"
+    )
+
+
+def test_a_guess_is_called_a_guess_from_three_nats_on():
+    unsure = report(tracing=tracing("unexplained", guesses=(("c xi^2", 2.9),)))
+    assert unsure.guess is None
+    assert "guess" not in str(unsure)
+    sure = report(tracing=tracing("unexplained", guesses=(("c xi^2", 3.1),)))
+    assert sure.guess == "c xi^2"
+    assert "a guess, not declared: c xi^2" in str(sure).splitlines()[0]
+
+
+def test_scatter_is_no_cause():
+    text = str(report(tracing=tracing("scatter"), residuals_after=None))
+    assert text.startswith("Verdict: scatter")
+    assert "which is no cause" in text
+
+
+def test_before_after_has_its_columns_and_intervals():
+    table = report().before_after
+    assert [*table.columns] == ["metric", "before", "after", "ratio", "interval"]
+    rmse = table.set_index("metric").loc["rmse"]
+    assert rmse["ratio"] == pytest.approx(rmse["after"] / rmse["before"])
+    assert rmse["interval"] == pytest.approx((0.9 * rmse["ratio"], 1.1 * rmse["ratio"]))
+
+
+def test_few_scored_trials_have_no_interval_and_say_so():
+    made = report(evaluation=evaluation(5))
+    assert made.before_after["interval"].isna().all()
+    assert "Below 8 trials" in str(made)
+    assert "Below 8 trials" not in str(report())
+
+
+def test_parameters_stand_before_and_after():
+    table = report().parameters.set_index("parameter")
+    assert [*table.index] == ["mu_1", "mu_2", "drag"]
+    assert np.isnan(table.loc["drag", "before"])
+    assert table.loc["drag", "after"] == pytest.approx(0.3, abs=4 * 0.01 / 20)
+
+
+def test_nothing_more_to_do_is_a_stop():
+    still = replace(report().next_action, action=None)
+    assert (
+        "Stop: no permitted action tells more about which model is right than 0.410"
+        in str(report(next_action=still))
+    )
+    assert "speed [m/s] = 3: at least 0.41 nats between drag, tilt" in str(report())
+
+
+WARNED = {
+    "noise undeclared": {"residuals": replace(residuals(), noise="estimated")},
+    "fewer than 5 trials": {"trials": trials(SHUFFLED[:4])},
+    "drift aliased": {"trials": trials([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])},
+    "at its prior's edge": {
+        "tracing": tracing(estimates=(estimate("drag", 0.8, at_edge=True),))
+    },
+    "chosen for information": {"designed": True},
+    "not robust to its prior": {"tracing": tracing(robust=False)},
+    "does not extrapolate": {"tracing": tracing("unexplained")},
+    "exploratory": {"exploratory": True},
+}
+
+
+@pytest.mark.parametrize("words", [*WARNED])
+def test_each_warning_has_its_case(words):
+    arguments = {
+        "trials": trials(),
+        "residuals": residuals(),
+        "tracing": tracing(),
+    }
+    assert find_warnings(**arguments) == ()
+    found = find_warnings(**(arguments | WARNED[words]))
+    assert len([w for w in found if words in w]) == 1
+    assert f"- {found[0]}" in str(report(**WARNED[words]))
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to and whether its elements are closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.images: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.images += [values["src"]] if tag == "img" else []
+        assert "href" not in values
+        assert tag != "script"
+        if tag not in ("img", "meta"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_self_contained():
+    page = Page()
+    page.feed(report().to_html())
+    assert page.open == []
+    assert len(page.images) == 3
+    assert all(source.startswith("data:image/png;base64,") for source in page.images)
+
+
+def test_names_are_escaped_on_the_page():
+    formula = "c |xi|^1.5 <x>"
+    made = report(tracing=tracing("unexplained", guesses=((formula, 4.0),)))
+    page = made.to_html()
+    assert "&lt;x&gt;" in page
+    assert formula not in page
+
+
+def test_markdown_tables_have_as_many_cells_as_headings():
+    made = report(tracing=tracing(probabilities={"a|b": 0.6, "drag": 0.4}))
+    text = re.sub(r"\\\|", "", made.to_markdown())
+    blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
+    assert len(blocks) == 4
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+
+
+def test_save_writes_the_page_and_every_figure(tmp_path):
+    made = report()
+    page = made.save(tmp_path / "out")
+    names = {path.name for path in page.parent.iterdir()}
+    pictures = {"residuals.png", "probabilities.png", "before_after.png"}
+    assert names == {"report.txt", "report.md", "report.html"} | pictures
+    linked = re.findall(r"\]\((.+?)\)", (page.parent / "report.md").read_text())
+    assert {*linked} == pictures
+
+
+@pytest.mark.parametrize("shape", [(1,), (6,), (50,), (20, 2)])
+def test_residual_panels_by_kind_of_observation(shape):
+    times = np.linspace(0, 2, shape[0]) if shape[0] > 6 else None
+    made = report(
+        residuals=residuals(shape, size=40.0, times=times),
+        residuals_after=residuals(shape, times=times),
+    )
+    from sbi_active.criticism.figures import plot_residuals
+
+    figure = plot_residuals(made.residuals, made.residuals_after)
+    labels = [ax.get_xlabel() for ax in figure.axes]
+    last = {(1,): [], (6,): ["channel"]}.get(shape, ["time [s]"])
+    assert labels == 2 * ["action 1", "trial", *last]
+    largest = np.abs(made.residuals.refitted).max()
+    assert figure.axes[0].get_ylim()[1] > largest

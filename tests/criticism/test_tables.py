@@ -1,0 +1,155 @@
+"""The benchmark's tables, from rows whose scores are known."""
+
+import argparse
+import json
+
+import pytest
+
+from benchmarks.criticism import tables
+from benchmarks.criticism.worlds import get_world
+
+
+def row(case: int, effects: str, verdict: str, strength: float, **changes) -> dict:
+    stated = changes.pop("probabilities", {verdict: 0.9, "none": 0.1})
+    made = {
+        "case": str(case),
+        "effects": effects,
+        "strengths": "1.5",
+        "correlation": "0",
+        "lambda": str(strength),
+        "support": "",
+        "verdict": verdict,
+        "probabilities": json.dumps(stated),
+        "credible_set": json.dumps([verdict]),
+        "formula": "",
+        "rmse_before": "2.0",
+        "rmse_after": "1.0",
+        "rmse_oracle": "0.8",
+        "coverage_before": "0.5",
+        "coverage_after": "0.875",
+        "cpu_seconds": "3.0",
+        "trial_simulations": "70000",
+        "failure": "",
+    }
+    return made | changes
+
+
+def table(name: str, rows: dict[str, list[dict]], world: str = "A") -> str:
+    found = {(kind, False): these for kind, these in rows.items()}
+    return "\n".join(tables.summary(name, get_world(world), found))
+
+
+def test_a_false_alarm_is_any_verdict_on_clean_data():
+    rows = [row(i, "none", "none", 0.0) for i in range(19)]
+    rows.append(row(19, "none", "drift", 0.0))
+    text = table("loop", {"clean": rows})
+    assert "false alarms 0.050 (1/20)" in text
+    assert "case 19: drift" in text
+
+
+def test_power_and_tracing_count_equivalents_as_one():
+    rows = [
+        row(0, "bias", "action offset", 100.0),
+        row(1, "drift", "drift", 50.0),
+        row(2, "quadratic", "none", 40.0),
+        row(3, "gain", "none", 0.0),
+        row(4, "noise inflation", "scatter", 0.0),
+        row(5, "quadratic", "drift", 15.0, probabilities={"drift": 1.0}),
+    ]
+    text = table("loop", {"library": rows})
+    assert "lambda in 25-inf: 0.667 (2/3)" in text
+    assert "missed case 2 (lambda 40)" in text
+    assert "lambda in 10-25: 1.000 (1/1)" in text
+    assert "lambda in 0-10: 0.000 (0/1)" in text
+    assert "top-1 1.000 (2/2)" in text
+    assert "called scatter 1.000 (1/1)" in text
+    assert "RMSE after/before, detected sets: median 0.50" in text
+    assert "RMSE after/oracle: median 1.250" in text
+
+
+def test_second_place_counts_for_top_2_alone():
+    stated = {"none": 0.5, "drift": 0.3, "quadratic": 0.2}
+    rows = [row(0, "quadratic", "drift", 90.0, probabilities=stated)]
+    text = table("loop", {"library": rows})
+    assert "top-1 0.000 (0/1)" in text
+    assert "top-2 1.000 (1/1)" in text
+    assert "quadratic 1.5 called drift" in text
+
+
+def test_failures_are_counted_apart():
+    rows = [row(0, "none", "none", 0.0), row(1, "none", "", 0.0, failure="ValueError")]
+    text = table("loop", {"clean": rows})
+    assert "failed 1: ValueError" in text
+    assert "false alarms 0.000 (0/1)" in text
+
+
+def test_calibration_needs_both_kinds():
+    clean = [row(0, "none", "none", 0.0, probabilities={"none": 0.9, "drift": 0.1})]
+    rows = {"clean": clean, "library": [row(1, "bias", "drift", 50.0)]}
+    text = table("loop", rows)
+    assert "covers 0.500 (1/2)" in text
+    assert "mean stated mass 0.900" in text
+    assert "calibration" not in table("loop", {"clean": clean})
+
+
+def test_the_right_formula_and_an_alias_are_told_apart():
+    rows = [
+        row(0, "quadratic", "unexplained", 90.0, formula="xi^2"),
+        row(1, "quadratic", "unexplained", 90.0, formula="|xi|"),
+        row(2, "drift", "quadratic", 90.0),
+    ]
+    text = table("open", {"removed": rows})
+    assert "says so (lambda > 25) 0.667 (2/3)" in text
+    assert "names the formula (lambda > 25) 0.500 (1/2)" in text
+    near = [row(0, "power", "quadratic", 30.0), row(1, "sine", "quadratic", 30.0)]
+    text = table("open", {"outside": near})
+    assert "no alias in the library 0.000 (0/1)" in text
+    assert "near-aliases 1.000 (1/1)" in text
+
+
+def test_a_pair_is_exact_or_not():
+    rows = [
+        row(0, "tilt + speed gain", "speed gain + tilt", 90.0, support="60"),
+        row(1, "tilt + speed gain", "tilt", 90.0, support="60"),
+        row(2, "tilt + speed gain", "tilt + camera bias", 90.0, support="3"),
+    ]
+    text = table("pairs", {"pair": rows}, "B")
+    assert "> 25) 0.500 (1/2)" in text
+    assert "false inclusion 0.333 (1/3)" in text
+
+
+def test_chosen_actions_are_compared_at_random_s_last_top_1():
+    rows = []
+    for trials in (3, 4, 5, 6):
+        for policy, reached in (("random", 6), ("chosen", 4)):
+            hit = {
+                "trials": str(trials),
+                "policy": policy,
+                "top": str(trials >= reached),
+            }
+            rows.append(row(0, "tilt", "tilt", 90.0, **hit))
+    text = table("active", {"library": rows}, "B")
+    assert "top-1 at 6 trials is reached with 4 chosen ones (0.67)" in text
+
+
+@pytest.mark.parametrize("kind", ["clean", "library"])
+def test_correlated_errors_are_listed_by_correlation(kind):
+    effects = "none" if kind == "clean" else "tilt"
+    rows = [
+        row(i, effects, "tilt", 90.0, correlation=str(rho))
+        for i, rho in enumerate((0.0, 0.0, 0.9))
+    ]
+    text = table("correlation", {kind: rows}, "C")
+    assert "rho 0: " in text
+    assert "(2/2)" in text.split("rho 0: ")[1].splitlines()[0]
+    assert "(1/1)" in text.split("rho 0.9: ")[1].splitlines()[0]
+
+
+def test_every_table_has_a_summary_of_each_of_its_kinds():
+    from benchmarks.criticism import run
+
+    for name, kinds in run.TABLES.items():
+        for kind in kinds:
+            assert (name, kind) in tables.SUMMARIES
+    asked = argparse.Namespace(table="correlation", kind=None, independent=False)
+    assert len([*run.settings(asked)]) == 4

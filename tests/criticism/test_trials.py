@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+import torch
+
+from sbi_active.criticism import Trials
+from sbi_active.criticism.measurements import Measurements
+
+
+def test_ragged_trajectories_are_padded_and_masked():
+    trials = Trials([1.0, 2.0], [np.arange(3.0), np.arange(5.0)])
+    assert trials.x.shape == (2, 5)
+    assert trials.mask.sum(1).tolist() == [3, 5]
+
+
+def test_a_mask_hides_numbers():
+    x = torch.ones(2, 3)
+    mask = torch.tensor([[True, False, True], [False, False, False]])
+    trials = Trials([1.0, 2.0], x, mask=mask)
+    assert trials.valid.tolist() == [True, False]
+    assert trials.mask.tolist() == mask.tolist()
+
+
+def test_roles_split_and_keep_indices():
+    trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=["fit", "held out", "fit"])
+    assert trials.fit.index.tolist() == [0.0, 2.0]
+    assert trials.held_out is not None
+    assert trials.held_out.action.tolist() == [[2.0]]
+    assert trials[1:].role == ["held out", "fit"]
+
+
+def test_repeats_are_found_and_follow_a_selection():
+    trials = Trials([1.0, 2.0, 1.0], [1.0, 2.0, 3.0])
+    assert trials.repeat_of.tolist() == [-1, -1, 0]
+    assert trials[[2, 0]].repeat_of.tolist() == [1, -1]
+
+
+def test_measurements_skip_gaps_within_a_trajectory_alone():
+    x = torch.tensor([[1.0, torch.nan, 3.0], [4.0, 5.0, 6.0]])
+    trials = Trials([0.0, 1.0], x, sample_times=[0.0, 0.5, 2.0])
+    m = Measurements.of(trials)
+    assert m.x.tolist() == [1, 3, 4, 5, 6]
+    assert m.gap.tolist() == [np.inf, 2.0, np.inf, 0.5, 1.5]
+    assert m.trial.tolist() == [0, 0, 1, 1, 1]
+
+
+def test_measurements_order_channels_before_times():
+    x = torch.arange(12.0).reshape(2, 3, 2)  # trial, time, channel
+    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=[0.0, 1.0, 2.0]))
+    assert m.x[:6].tolist() == [0, 2, 4, 1, 3, 5]
+    assert m.x.tolist() == x.flatten()[m.position].tolist()
+    assert np.isinf(m.gap).sum() == 4
+    assert m.channel[:6].tolist() == [0, 0, 0, 1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "keywords", "message"),
+    [
+        (([1.0, 2.0], [1.0]), {}, "expected actions .* with as many rows"),
+        (([1.0, np.nan], [1.0, 2.0]), {}, "expected finite actions"),
+        (([1.0], [np.nan]), {}, "expected at least one valid trial"),
+        (([1.0, 2.0], [1.0, 2.0]), {"index": [0]}, r"expected index of shape \(2,\)"),
+        (([1.0, 2.0], [1.0, 2.0]), {"role": ["fit"]}, "expected a role"),
+        (
+            ([1.0, 2.0], [1.0, np.nan]),
+            {"role": ["fit", "held out"]},
+            r"expected measurements in the held-out trials; got NaN in trials \[1\]",
+        ),
+        (
+            ([1.0, 2.0], np.ones((2, 3))),
+            {"sample_times": [0.0, 1.0]},
+            r"expected sample_times of shape \(3,\)",
+        ),
+        (([1.0, 2.0], [[1.0], [[1.0, 2.0]]]), {}, "differ in their first axis alone"),
+        (
+            ([1.0, 2.0], [1.0, 2.0]),
+            {"mask": [[True, True], [True, True]]},
+            "expected a mask of shape",
+        ),
+    ],
+)
+def test_bad_trials(arguments, keywords, message):
+    with pytest.raises(ValueError, match=message):
+        Trials(*arguments, **keywords)
