@@ -1,0 +1,327 @@
+r"""Draw what is wrong with reality, and hand over the trials alone.
+
+This is the one place that knows the truth. A case has two halves: a :class:`Problem`,
+which the loop sees, and a :class:`Truth`, which the scores see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, get_args
+
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+
+from benchmarks.criticism.refit import residual_sum_of_squares
+from benchmarks.criticism.worlds import World
+from sbi_active import DiscreteActions, SimulatorModel
+from sbi_active.criticism import Context, Effect, Trials
+from sbi_active.criticism.trials import Role
+from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
+
+__all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]
+
+Kind = Literal["clean", "library", "outside", "removed", "pair"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+HELD_OUT = 8  # trials that no step may fit or choose by
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """What the loop is given.
+
+    Attributes:
+        model: The bare simulator.
+        prior: Of theta.
+        trials: Measured ones, held-out ones included.
+        effects: The declared library.
+        actions: The permitted ones.
+    """
+
+    model: SimulatorModel
+    prior: BoxUniform
+    trials: Trials
+    effects: list[Effect]
+    actions: DiscreteActions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What the data were made with; for scores only.
+
+    Attributes:
+        world: Where.
+        kind: What was drawn.
+        theta: Shape (1, theta_dim).
+        effects: None, one or two.
+        strengths: Of the effects, each of shape (1, phi_dim).
+        correlation: Of neighboring errors.
+        action: Of the trials to fit, shape (t, action_dim).
+        seed: Of the noise.
+    """
+
+    world: World
+    kind: Kind
+    theta: Tensor
+    effects: tuple[Effect, ...]
+    strengths: tuple[Tensor, ...]
+    correlation: float
+    action: Tensor
+    seed: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect in self.effects)
+
+    def observe(self, action: Tensor, index: Tensor) -> Tensor:
+        """Return what the real system does in trials.
+
+        Args:
+            action: Shape (t, action_dim).
+            index: Number of each trial, shape (t,); its noise depends on it alone.
+
+        Returns:
+            Shape (t, *x_shape).
+        """
+        theta = self.theta.expand(len(action), -1)
+        x, sd = respond(self.world, theta, action, index, self.effects, self.strengths)
+        seeds = row_seeds(self.seed, int(index.max()) + 1)[index]
+        normal = row_normals(seeds, x[0].numel()).reshape(x.shape)
+        rho, error = self.correlation, torch.empty_like(normal)
+        error[..., 0] = normal[..., 0]
+        for k in range(1, x.shape[-1]):
+            fresh = (1 - rho**2) ** 0.5 * normal[..., k]
+            error[..., k] = rho * error[..., k - 1] + fresh if rho else normal[..., k]
+        return (x + sd * error).float()
+
+    @cached_property
+    def non_centrality(self) -> float:
+        r""":math:`\lambda`, what the bare model cannot take up by its parameters.
+
+        The sum of squared residuals, in units of the noise, that is left when the bare
+        model is refitted to the noise-free data.
+        """
+        return self._left_by(()) if self.effects else 0.0
+
+    @cached_property
+    def support(self) -> float:
+        """What is left without the less needed of two effects, the other refitted."""
+        return min(self._left_by((effect,)) for effect in self.effects)
+
+    def residual(
+        self, parameters: Tensor, effects: Sequence[Effect], target: Tensor
+    ) -> Tensor:
+        """Return whitened residuals of the trials to fit, in units of the noise.
+
+        Args:
+            parameters: Theta and the strengths of the effects, shape (n, dim).
+            effects: What the model has.
+            target: Outcomes, shape (t, *x_shape).
+
+        Returns:
+            Shape (n, m), float64.
+        """
+        x = self.predict(parameters, effects, self.action, 0)
+        error = (x - target.double()) / self.world.noise_sd
+        return whiten(error, self.correlation).flatten(1)
+
+    def predict(
+        self, parameters: Tensor, effects: Sequence[Effect], action: Tensor, first: int
+    ) -> Tensor:
+        """Return noise-free outcomes of trials, shape (n, t, *x_shape), float64.
+
+        Args:
+            parameters: As in :meth:`residual`.
+            effects: As in :meth:`residual`.
+            action: Shape (t, action_dim).
+            first: Index of the first of them.
+        """
+        num = len(action)
+        theta_dim = self.theta.shape[1]
+        sizes = [theta_dim, *[effect.phi_dim for effect in effects]]
+        each = parameters.double().repeat_interleave(num, 0)
+        theta, *strengths = each.split(sizes, -1)
+        index = torch.arange(first, first + num).repeat(len(parameters))
+        rows = action.double().repeat(len(parameters), 1)
+        x, _ = respond(self.world, theta, rows, index, effects, strengths)
+        return x.reshape(len(parameters), num, *x.shape[1:])
+
+    def starts(self, effects: Sequence[Effect]) -> Tensor:
+        """Return draws of theta and strengths to start fits from, float64."""
+        with forked_generators(derive_seed(self.seed, "refit")):
+            theta = self.world.prior.sample((64,)).double()
+            return torch.cat([theta, *[e.sample(64) for e in effects]], -1)
+
+    def _left_by(self, effects: Sequence[Effect]) -> float:
+        true = torch.cat([self.theta, *self.strengths], -1)
+        target = self.predict(true, self.effects, self.action, 0)[0]
+        return residual_sum_of_squares(
+            lambda parameters: self.residual(parameters, effects, target),
+            self.starts(effects),
+            prior=self.world.prior,
+        )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem and its truth."""
+
+    problem: Problem
+    truth: Truth
+
+
+def draw_case(
+    world: World,
+    kind: Kind,
+    number: int,
+    *,
+    num_trials: int = 8,
+    num_held_out: int = HELD_OUT,
+    prior_scale: float = 1.0,
+) -> Case:
+    """Draw one case.
+
+    The effect is uniform among those of its kind (noise inflation counts as one of the
+    library), its strength has its prior, theta the prior, and actions are uniform.
+
+    Args:
+        world: Where.
+        kind: "clean", "library", "outside", "removed" (of the library, and taken from
+            what is declared together with its equivalents) or "pair" (two of the
+            library that are not equivalent).
+        number: Of the case; the same number is the same truth for any number of trials.
+        num_trials: Trials to fit.
+        num_held_out: Further trials, held out.
+        prior_scale: By which the scales of the declared priors are wrong.
+
+    Returns:
+        The case.
+
+    Raises:
+        ValueError: If the kind is unknown.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"expected a kind among {KINDS}; got {kind!r}; do choose one")
+    seed = derive_seed(number, "case", world.name, kind)
+    with forked_generators(seed):
+        theta = world.prior.sample((1,))
+        effects = _draw_effects(world, kind)
+        strengths = tuple(effect.prior.sample((1,)) for effect in effects)
+        which = int(torch.randint(len(world.correlations), (1,)))
+        action = world.actions.sample((64 + num_held_out,))
+    held_out = action[64:]
+    action = action[:num_trials]
+    truth = Truth(
+        world=world,
+        kind=kind,
+        theta=theta,
+        effects=effects,
+        strengths=strengths,
+        correlation=world.correlations[which],
+        action=action,
+        seed=derive_seed(seed, "noise"),
+    )
+    library = world.library(prior_scale)
+    if kind == "removed":
+        gone = world.equivalent(effects[0].name)
+        library = [effect for effect in library if effect.name not in gone]
+    problem = Problem(
+        model=world.model,
+        prior=world.prior,
+        trials=make_trials(truth, action, held_out),
+        effects=library,
+        actions=world.actions,
+    )
+    return Case(problem, truth)
+
+
+def make_trials(truth: Truth, action: Tensor, held_out: Tensor) -> Trials:
+    """Return the real system's trials: those to fit, then those held out."""
+    every = torch.cat([action, held_out])
+    index = torch.arange(len(every))
+    roles: list[Role] = ["held out" if i >= len(action) else "fit" for i in index]
+    times = truth.world.sample_times
+    return Trials(
+        every,
+        truth.observe(every, index),
+        role=roles,
+        index=index,
+        sample_times=torch.tensor(times) if times else None,
+    )
+
+
+def extend(case: Case, action: Tensor) -> Case:
+    """Return the case with one more trial to fit and none held out.
+
+    Args:
+        case: The case.
+        action: Of the next trial, shape (action_dim,).
+    """
+    grown = torch.cat([case.truth.action, action.reshape(1, -1)])
+    truth = replace(case.truth, action=grown)
+    trials = make_trials(truth, grown, grown[:0])
+    return Case(replace(case.problem, trials=trials), truth)
+
+
+def respond(
+    world: World,
+    theta: Tensor,
+    action: Tensor,
+    index: Tensor,
+    effects: Sequence[Effect],
+    strengths: Sequence[Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Return the noise-free outcome and the noise's standard deviation, a row each.
+
+    Deliberately apart from the library's own augmented simulator, so that a mistake
+    there does not make the data agree with it.
+    """
+    context = Context(index.to(theta.dtype))
+    keywords: dict[str, Tensor] = {}
+
+    def through(hook: str, value: Tensor) -> Tensor:
+        for effect, phi in zip(effects, strengths, strict=True):
+            if effect.hook == hook:
+                rows = phi.to(theta.dtype).expand(len(theta), -1)
+                value = effect.apply(value, rows, action, context)
+        return value
+
+    for effect, phi in zip(effects, strengths, strict=True):
+        if effect.hook == "dynamics":
+            rows = phi.to(theta.dtype).expand(len(theta), -1)
+            keywords = effect.apply(keywords, rows, action, context)
+    theta = through("parameter", theta)
+    x = world.model.fn(theta, through("action", action), **keywords)
+    sd = through("noise", torch.full_like(x, world.noise_sd))
+    return through("observation", x), sd
+
+
+def whiten(error: Tensor, correlation: float) -> Tensor:
+    """Return independent errors of the same variance, correlated on the last axis."""
+    if not correlation:
+        return error
+    fresh = error[..., 1:] - correlation * error[..., :-1]
+    return torch.cat([error[..., :1], fresh / (1 - correlation**2) ** 0.5], -1)
+
+
+def _draw_effects(world: World, kind: Kind) -> tuple[Effect, ...]:
+    def one(among: Sequence[Effect]) -> Effect:
+        return among[int(torch.randint(len(among), (1,)))]
+
+    library = world.effects
+    visible = [e for e in library if e.name not in world.equivalent("none")]
+    if kind == "clean":
+        return ()
+    if kind == "outside":
+        return (one(world.outside),)
+    if kind == "library":
+        return (one([*library, world.scatter]),)
+    first = one(visible)
+    if kind == "removed":
+        return (first,)
+    apart = [e for e in visible if e.name not in world.equivalent(first.name)]
+    return (first, one(apart))

@@ -1,0 +1,76 @@
+"""How much of an effect the parameters can take up: multi-start least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from sbi.utils import BoxUniform
+from scipy.optimize import OptimizeResult, least_squares
+from torch import Tensor
+
+__all__ = ["local_fits", "residual_sum_of_squares"]
+
+STARTS = 8
+DIFFERENCE = 1e-5  # of a parameter's range
+
+
+def residual_sum_of_squares(
+    residual: Callable[[Tensor], Tensor], starts: Tensor, *, prior: BoxUniform
+) -> float:
+    """Return the smallest sum of squares, arguments as for :func:`local_fits`."""
+    return min(2 * fit.cost for fit in local_fits(residual, starts, prior=prior))
+
+
+def local_fits(
+    residual: Callable[[Tensor], Tensor], starts: Tensor, *, prior: BoxUniform
+) -> list[OptimizeResult]:
+    """Return least-squares fits within the prior's box, one a start.
+
+    Args:
+        residual: Parameters (n, d), float64, to residuals (n, m).
+        starts: Candidates to start from, shape (k, d); the best eight are used. Columns
+            beyond theta are strengths of effects, and unbounded.
+        prior: Of theta, the first columns.
+
+    Returns:
+        SciPy's results: ``x``, ``cost`` (half of the sum of squares) and ``jac``.
+    """
+    low, high = (edge.double() for edge in _edges(prior))
+    dim = len(low)
+    spread = starts.std(0).clamp(min=1e-6).numpy()
+    lower = np.full(starts.shape[1], -np.inf)
+    upper = np.full(starts.shape[1], np.inf)
+    lower[:dim], upper[:dim] = low.numpy(), high.numpy()
+    step = DIFFERENCE * spread
+
+    def value(z: np.ndarray) -> np.ndarray:
+        return residual(torch.from_numpy(z)[None])[0].numpy()
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        # Backwards at the upper edge, so that theta stays in the box.
+        signed = np.where(z + step > upper, -step, step)
+        rows = np.concatenate([z[None], z[None] + np.diag(signed)])
+        r = residual(torch.from_numpy(rows)).numpy()
+        return ((r[1:] - r[0]) / signed[:, None]).T
+
+    cost = residual(starts).square().sum(-1)
+    fits = []
+    for i in torch.argsort(cost)[:STARTS].tolist():
+        start = np.clip(starts[i].numpy(), lower + 1e-9, upper - 1e-9)
+        fits.append(
+            least_squares(
+                value,
+                start,
+                jacobian,  # type: ignore[arg-type]  # SciPy's stub has the string alone
+                bounds=(lower, upper),
+                x_scale=spread,
+                max_nfev=60,
+            )
+        )
+    return fits
+
+
+def _edges(prior: BoxUniform) -> tuple[Tensor, Tensor]:
+    return prior.base_dist.low, prior.base_dist.high

@@ -1,0 +1,149 @@
+"""The closed loop on worlds whose truth is known, one table a command.
+
+    python -m benchmarks.criticism.run --table loop --world A --trials 8 --cases 200
+    python -m benchmarks.criticism.run --table loop --world B --kind clean --cases 40
+    python -m benchmarks.criticism.run --table open --world A --trials 12 --cases 100
+    python -m benchmarks.criticism.run --table pairs --world B --trials 12 --cases 60
+    python -m benchmarks.criticism.run --table active --world B --trials 10 --cases 40
+    python -m benchmarks.criticism.run --table priors --world A --scale 3 --cases 100
+    python -m benchmarks.criticism.run --table correlation --world C --cases 100
+    python -m benchmarks.criticism.run --table loop --world A --summary
+
+loop: false alarms, power, tracing, calibration, error before and after. open: the
+effect was removed from the library, or never stood in it. pairs: two effects. active:
+actions chosen by the loop beside random ones. priors: the scales of the effects' priors
+are wrong by a factor. correlation: false alarms and power by the correlation of the
+errors, as the loop does by default and with the errors taken as independent.
+
+Resumable: a case that stands in the CSV is not run again. One row a case, one file a
+setting, in benchmarks/criticism/results. Give each command a core of its own
+(OMP_NUM_THREADS=1); ``--first`` splits cases over processes, each writing its own file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks.criticism import tables
+from benchmarks.criticism.active import ACTIVE_COLUMNS, score_active
+from benchmarks.criticism.cases import KINDS, draw_case
+from benchmarks.criticism.scores import COLUMNS, score_case
+from benchmarks.criticism.worlds import get_world
+
+RESULTS = Path(__file__).parent / "results"
+#: Which kinds of cases a table is made of.
+TABLES: dict[str, tuple[str, ...]] = {
+    "loop": ("clean", "library"),
+    "open": ("removed", "outside"),
+    "pairs": ("pair",),
+    "active": ("library",),
+    "priors": ("clean", "library"),
+    "correlation": ("clean", "library"),
+}
+
+
+def settings(arguments: argparse.Namespace) -> Iterator[tuple[str, bool]]:
+    """Yield every kind of case and whether errors are taken as independent."""
+    kinds = (arguments.kind,) if arguments.kind else TABLES[arguments.table]
+    both = arguments.table == "correlation"
+    for kind in kinds:
+        for independent in (False, True) if both else (arguments.independent,):
+            yield kind, independent
+
+
+def paths(arguments: argparse.Namespace, kind: str, independent: bool) -> list[Path]:
+    """Return the setting's file, then those of processes with another first case."""
+    name = f"{arguments.world}_{kind}_{arguments.trials}"
+    name += f"_scale_{arguments.scale:.3g}" if arguments.scale != 1 else ""
+    name += "_independent" if independent else ""
+    name += "_active" if arguments.table == "active" else ""
+    mine = f"{name}_from_{arguments.first}" if arguments.first else name
+    others = sorted({RESULTS / f"{name}.csv", *RESULTS.glob(f"{name}_from_*.csv")})
+    return [RESULTS / f"{mine}.csv", *others]
+
+
+def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> None:
+    """Run the cases that are in none of the files yet."""
+    path, *others = paths(arguments, kind, independent)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done = {int(row["case"]) for other in others for row in read(other)}
+    options = {"assume_independent": True} if independent else {}
+    world = get_world(arguments.world, **options)
+    active = arguments.table == "active"
+    for number in range(arguments.first, arguments.first + arguments.cases):
+        if number in done:
+            continue
+        case = draw_case(
+            world,
+            kind,  # type: ignore[arg-type]  # checked by the parser
+            number,
+            num_trials=arguments.trials,
+            prior_scale=arguments.scale,
+        )
+        if active:
+            rows = score_active(case, number)
+        else:
+            oracle = kind == "library" and case.truth.effects[0].hook != "noise"
+            rows = [score_case(case, number, oracle=oracle)]
+        append(path, rows, ACTIVE_COLUMNS if active else COLUMNS)
+        last = rows[-1]
+        print(
+            f"{path.stem} case {number}: {last.get('effects')} -> "
+            f"{last.get('failure') or last.get('verdict')}, "
+            f"{float(str(last.get('cpu_seconds') or 'nan')):.0f} CPU s",
+            flush=True,
+        )
+
+
+def append(path: Path, rows: list[dict[str, object]], columns: list[str]) -> None:
+    """Add rows to a CSV file."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        if new:
+            writer.writeheader()
+        writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file, none if it is not there."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def short(value: object) -> object:
+    """Return a number with six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def main() -> None:
+    """Run what is asked for and print its table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--table", choices=[*TABLES], default="loop")
+    parser.add_argument("--world", choices=["A", "B", "C"], default="A")
+    parser.add_argument("--kind", choices=KINDS)
+    parser.add_argument("--trials", type=int, default=8)
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--scale", type=float, default=1.0, help="of declared priors")
+    parser.add_argument("--independent", action="store_true", help="errors (world C)")
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+    found: dict[tuple[str, bool], list[dict[str, str]]] = {}
+    for kind, independent in settings(arguments):
+        if not arguments.summary:
+            run_setting(arguments, kind, independent)
+        _, *files = paths(arguments, kind, independent)
+        found[kind, independent] = [row for file in files for row in read(file)]
+    world = get_world(arguments.world)
+    for line in tables.summary(arguments.table, world, found):
+        print(line)
+
+
+if __name__ == "__main__":
+    main()

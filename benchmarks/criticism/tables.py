@@ -1,0 +1,293 @@
+"""The tables of the results, with binomial intervals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.criticism.equivalence import merged, true_name
+from benchmarks.criticism.intervals import brier_score, rate, reliability
+from benchmarks.criticism.worlds import World
+
+__all__ = ["summary"]
+
+Row = Mapping[str, str]
+#: Of lambda, residual sum of squares in units of the noise.
+BINS = ((0.0, 10.0), (10.0, 25.0), (25.0, np.inf))
+SUPPORTED = 25.0  # lambda without either effect of a pair that data support
+
+
+def summary(
+    table: str, world: World, found: Mapping[tuple[str, bool], Sequence[Row]]
+) -> list[str]:
+    """Return the lines of a table.
+
+    Args:
+        table: Its name.
+        world: Where.
+        found: Rows by kind and by whether errors were taken as independent.
+    """
+    lines: list[str] = []
+    for (kind, independent), rows in found.items():
+        title = f"world {world.name}, {kind}" + (", iid errors" if independent else "")
+        lines += ["", f"## {title}: {len(rows)} cases"]
+        failed = [r for r in rows if r["failure"]]
+        lines += [f"failed {r['case']}: {r['failure']}" for r in failed]
+        rows = [r for r in rows if not r["failure"]]
+        if not rows:
+            continue
+        if table == "correlation":
+            lines += _by_correlation(world, kind, rows)
+        else:
+            lines += SUMMARIES[table, kind](world, rows)
+        lines += _cost(rows)
+    if table in ("loop", "priors") and len(found) == 2:
+        every = [r for rows in found.values() for r in rows if not r["failure"]]
+        lines += ["", "## calibration, clean and library together"]
+        lines += _calibration(world, every) if every else []
+    return lines
+
+
+def _clean(world: World, rows: Sequence[Row]) -> list[str]:
+    alarms = [r for r in rows if r["verdict"] != "none"]
+    lines = [f"false alarms {rate([r in alarms for r in rows])}"]
+    lines += [f"  case {r['case']}: {r['verdict']}" for r in alarms]
+    ratio = _ratio(rows, "rmse_after", "rmse_before")
+    unexplained = [r["verdict"] == "unexplained" for r in rows]
+    return [
+        *lines,
+        f'false "unexplained" {rate(unexplained)}',
+        f"RMSE after/before: mean {ratio.mean():.3f}, range {_range(ratio)}",
+    ]
+
+
+def _library(world: World, rows: Sequence[Row]) -> list[str]:
+    scattered = [r for r in rows if r["effects"] == world.scatter.name]
+    named = [r for r in rows if r["effects"] != world.scatter.name]
+    lines = _power(named)
+    seen = [r for r in named if _detected(r) and float(r["lambda"]) > BINS[-1][0]]
+    ranks = [_rank(world, r) for r in seen]
+    lines += [
+        f"top-1 {rate([k == 1 for k in ranks])}",
+        f"top-2 {rate([k <= 2 for k in ranks])}",
+        f"verdict right {rate([_right(world, r) for r in seen])}",
+        "of noise inflation, called scatter "
+        + rate([r["verdict"] == "scatter" for r in scattered if _detected(r)])
+        + f", detected {sum(map(_detected, scattered))}/{len(scattered)}",
+    ]
+    lines += [
+        f"  case {r['case']} (lambda {float(r['lambda']):.0f}): {r['effects']} "
+        f"{r['strengths']} called {r['verdict']}"
+        for r in seen
+        if not _right(world, r)
+    ]
+    return [*lines, *_errors([r for r in named if _detected(r)])]
+
+
+def _power(rows: Sequence[Row]) -> list[str]:
+    lines = []
+    for low, high in BINS:
+        inside = [r for r in rows if low <= float(r["lambda"]) < high]
+        lines.append(
+            f"detected, lambda in {low:g}-{high:g}: {rate([*map(_detected, inside)])}"
+        )
+        lines += [
+            f"  missed case {r['case']} (lambda {float(r['lambda']):.0f}): "
+            f"{r['effects']} {r['strengths']}"
+            for r in inside
+            if low >= 25 and not _detected(r)
+        ]
+    return lines
+
+
+def _errors(rows: Sequence[Row]) -> list[str]:
+    if not rows:
+        return []
+    ratio = _ratio(rows, "rmse_after", "rmse_before")
+    lines = [
+        f"RMSE after/before, detected sets: median {np.median(ratio):.2f}, "
+        f"range {_range(ratio)}"
+    ]
+    known = [r for r in rows if r["rmse_oracle"]]
+    if known:
+        best = _ratio(known, "rmse_after", "rmse_oracle")
+        lines.append(
+            f"RMSE after/oracle: median {np.median(best):.3f}, "
+            f"90th percentile {np.percentile(best, 90):.3f}"
+        )
+    before, after = _column(rows, "coverage_before"), _column(rows, "coverage_after")
+    return [*lines, f"90 % coverage: {before.mean():.2f} -> {after.mean():.2f}"]
+
+
+def _removed(world: World, rows: Sequence[Row]) -> list[str]:
+    strong = [r for r in rows if float(r["lambda"]) > BINS[-1][0]]
+    return [
+        *_power(rows),
+        *_said_so(world, "all", [r for r in rows if _detected(r)]),
+        *_said_so(world, "lambda > 25", [r for r in strong if _detected(r)]),
+    ]
+
+
+def _said_so(world: World, title: str, rows: Sequence[Row]) -> list[str]:
+    lines = [f"says so ({title}) {rate([*map(_unexplained, rows)])}"]
+    formulas = [r for r in rows if r["effects"] in world.formulas]
+    hits = [r["formula"] in world.formulas[r["effects"]] for r in formulas]
+    lines.append(f"names the formula ({title}) {rate(hits)}")
+    lines += [
+        f"  case {r['case']} (lambda {float(r['lambda']):.0f}): {r['effects']} called "
+        f"{r['verdict']}" + (f", guess {r['formula']}" if r["formula"] else "")
+        for r in rows
+        if title == "all" and (not _unexplained(r) or r["effects"] in world.formulas)
+    ]
+    return lines
+
+
+def _outside(world: World, rows: Sequence[Row]) -> list[str]:
+    near = [r for r in rows if r["effects"] in world.aliases]
+    far = [r for r in rows if r["effects"] not in world.aliases]
+    return [
+        *_power(rows),
+        "says so, no alias in the library "
+        + rate([_unexplained(r) for r in far if _detected(r)]),
+        "says so or names an alias, near-aliases "
+        + rate([_aliased(world, r) for r in near if _detected(r)]),
+        *_said_so(world, "all", [r for r in rows if _detected(r)]),
+    ]
+
+
+def _pair(world: World, rows: Sequence[Row]) -> list[str]:
+    supported = [r for r in rows if float(r["support"]) > SUPPORTED]
+    exact = [_right(world, r) for r in supported]
+    extra = [
+        bool(_names(world, r["verdict"]) - _names(world, r["effects"])) for r in rows
+    ]
+    lines = [
+        f"exact, both supported (lambda without either > 25) {rate(exact)}",
+        f"false inclusion {rate(extra)}",
+    ]
+    return lines + [
+        f"  case {r['case']} (support {float(r['support']):.0f}): {r['effects']} "
+        f"({r['strengths']}) called {r['verdict']}"
+        for r in supported
+        if not _right(world, r)
+    ]
+
+
+def _active(world: World, rows: Sequence[Row]) -> list[str]:
+    lines = ["trials, top-1 with random actions, top-1 with chosen actions"]
+    share: dict[str, dict[int, float]] = {"random": {}, "chosen": {}}
+    for num in sorted({int(r["trials"]) for r in rows}):
+        cells = []
+        for policy, shares in share.items():
+            these = [r for r in rows if r["policy"] == policy]
+            hits = [r["top"] == "True" for r in these if int(r["trials"]) == num]
+            shares[num] = float(np.mean(hits)) if hits else np.nan
+            cells.append(rate(hits))
+        lines.append(f"{num:2d}  " + "  ".join(cells))
+    last = max(share["random"])
+    target = share["random"][last]
+    reached = [n for n, s in sorted(share["chosen"].items()) if s >= target]
+    if reached:
+        lines.append(
+            f"random's top-1 at {last} trials is reached with {reached[0]} chosen ones "
+            f"({reached[0] / last:.2f})"
+        )
+    return lines
+
+
+def _by_correlation(world: World, kind: str, rows: Sequence[Row]) -> list[str]:
+    lines = SUMMARIES["loop", kind](world, rows)
+    for rho in sorted({float(r["correlation"]) for r in rows}):
+        these = [r for r in rows if float(r["correlation"]) == rho]
+        if kind == "clean":
+            lines.append(f"rho {rho:g}: alarms {rate([*map(_detected, these)])}")
+        else:
+            strong = [r for r in these if float(r["lambda"]) > BINS[-1][0]]
+            found = rate([*map(_detected, strong)])
+            lines.append(f"rho {rho:g}: detected at lambda > 25 {found}")
+    return lines
+
+
+def _calibration(world: World, rows: Sequence[Row]) -> list[str]:
+    stated = [merged(world, json.loads(r["probabilities"])) for r in rows]
+    truth = [_key(world, r["effects"]) for r in rows]
+    sets = [{_key(world, n) for n in json.loads(r["credible_set"])} for r in rows]
+    covered = [t in names for t, names in zip(truth, sets, strict=True)]
+    mass = [
+        sum(p for k, p in row.items() if k in names)
+        for row, names in zip(stated, sets, strict=True)
+    ]
+    lines = [
+        f"credible set: covers {rate(covered)}, mean stated mass {np.mean(mass):.3f}",
+        f"Brier score {brier_score(stated, truth):.3f}",
+        "stated probability, share true, count",
+    ]
+    return lines + [
+        f"  {p:.3f}  {hit:.3f}  {n}" for p, hit, n in reliability(stated, truth)
+    ]
+
+
+def _cost(rows: Sequence[Row]) -> list[str]:
+    seconds, sims = _column(rows, "cpu_seconds"), _column(rows, "trial_simulations")
+    return [
+        f"CPU s: median {np.median(seconds):.1f}, 95th percentile "
+        f"{np.percentile(seconds, 95):.1f}; trial simulations: median "
+        f"{np.median(sims):.0f}, max {sims.max():.0f}"
+    ]
+
+
+def _detected(row: Row) -> bool:
+    return row["verdict"] != "none"
+
+
+def _unexplained(row: Row) -> bool:
+    return row["verdict"] == "unexplained" or bool(row["formula"])
+
+
+def _aliased(world: World, row: Row) -> bool:
+    return _unexplained(row) or row["verdict"] in world.aliases[row["effects"]]
+
+
+def _names(world: World, text: str) -> set[str]:
+    return {_key(world, name) for name in text.split(" + ")}
+
+
+def _right(world: World, row: Row) -> bool:
+    return _names(world, row["verdict"]) == _names(world, row["effects"])
+
+
+def _rank(world: World, row: Row) -> int:
+    """Return the true effect's place among the effects, 1 for the most likely."""
+    stated = merged(world, json.loads(row["probabilities"]))
+    order = [name for name in stated if name != "none"]
+    key = _key(world, row["effects"])
+    return order.index(key) + 1 if key in order else len(order) + 1
+
+
+def _key(world: World, effects: str) -> str:
+    """Return the one name under which equivalent effects are counted."""
+    return next(iter(merged(world, {true_name(world, effects): 1.0})))
+
+
+def _column(rows: Iterable[Row], key: str) -> np.ndarray:
+    return np.array([float(r[key]) if r[key] else np.nan for r in rows])
+
+
+def _ratio(rows: Sequence[Row], key: str, to: str) -> np.ndarray:
+    return _column(rows, key) / _column(rows, to)
+
+
+def _range(values: np.ndarray) -> str:
+    return f"{values.min():.2f}-{values.max():.2f}"
+
+
+SUMMARIES: dict[tuple[str, str], Callable[[World, Sequence[Row]], list[str]]] = {
+    **{(table, "clean"): _clean for table in ("loop", "priors", "correlation")},
+    **{(table, "library"): _library for table in ("loop", "priors", "correlation")},
+    ("open", "removed"): _removed,
+    ("open", "outside"): _outside,
+    ("pairs", "pair"): _pair,
+    ("active", "library"): _active,
+}

@@ -1,0 +1,171 @@
+r"""World A: the numerical model with eight effects.
+
+.. math::
+    x = \theta_1 e^{3 - \xi} + \theta_2 \xi + \varepsilon, \quad
+    \varepsilon \sim \mathcal N(0, 1), \quad \theta \sim U[-5, 5]^2, \quad
+    \xi \in \{-5, -4.5, \ldots, 5\}.
+
+A gain of x is a change of theta, so no action shows it. An offset of the action is a
+change of :math:`\theta_1` and a bias.
+"""
+
+from __future__ import annotations
+
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+
+from benchmarks.criticism.worlds.world import (
+    World,
+    half_normal,
+    normal,
+    signed_uniform,
+    uniform,
+)
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect
+
+__all__ = ["make_world", "response"]
+
+NOISE_SD = 1.0
+#: Logarithms of the limits of a sensor that saturates: 10 to 100,000.
+LOG_LIMIT = (2.302585, 11.512925)
+
+
+def response(
+    theta: Tensor,
+    action: Tensor,
+    *,
+    quadratic: Tensor | float = 0.0,
+    sine: Tensor | float = 0.0,
+    step: Tensor | float = 0.0,
+    bump: Tensor | float = 0.0,
+    power: Tensor | float = 0.0,
+) -> Tensor:
+    r"""Return the noise-free x with terms that the bare model lacks.
+
+    Args:
+        theta: Shape (n, 2).
+        action: Shape (n, 1).
+        quadratic: Coefficient of :math:`\xi^2`, a number or one a row, as all.
+        sine: Of :math:`\sin 2 \xi`.
+        step: Of :math:`1_{\xi > 0}`.
+        bump: Of :math:`\exp(-\frac12 ((\xi - 2) / 0.8)^2)`.
+        power: Of :math:`0.2 |\xi|^{1.5}`.
+
+    Returns:
+        Shape (n, 1).
+    """
+    xi = action[:, 0]
+    x = theta[:, 0] * torch.exp(3 - xi) + theta[:, 1] * xi + quadratic * xi**2
+    x = x + sine * torch.sin(2 * xi) + step * (xi > 0)
+    x = x + bump * torch.exp(-0.5 * ((xi - 2) / 0.8) ** 2)
+    return (x + power * 0.2 * xi.abs() ** 1.5)[:, None]
+
+
+def library(scale: float = 1.0) -> list[Effect]:
+    """Return the declared effects, the scales of their priors multiplied."""
+    return [
+        Effect(
+            "bias",
+            hook="observation",
+            prior=normal(5.0 * scale),
+            null=0.0,
+            apply=lambda x, phi, action, context: x + phi,
+            units="",
+        ),
+        Effect(
+            "gain",
+            hook="observation",
+            prior=normal(0.2 * scale),
+            null=0.0,
+            apply=lambda x, phi, action, context: x * (1 + phi),
+            units="",
+        ),
+        _term("quadratic", normal(1.0 * scale)),
+        Effect(
+            "action offset",
+            hook="action",
+            prior=normal(0.5 * scale),
+            null=0.0,
+            apply=lambda value, phi, action, context: value + phi,
+            units="",
+        ),
+        Effect(
+            "action gain",
+            hook="action",
+            prior=normal(0.1 * scale),
+            null=0.0,
+            apply=lambda value, phi, action, context: value * (1 + phi),
+            units="",
+        ),
+        Effect(
+            "saturation",
+            hook="observation",
+            prior=uniform(*LOG_LIMIT),
+            null=torch.inf,
+            apply=lambda x, phi, action, context: x.clamp(-phi.exp(), phi.exp()),
+            units="log",
+        ),
+        Effect(
+            "drift",
+            hook="observation",
+            prior=normal(1.0 * scale),
+            null=0.0,
+            apply=lambda x, phi, action, context: x + phi * context.index[:, None],
+            units="a trial",
+        ),
+    ]
+
+
+def make_world() -> World:
+    """Return world A."""
+    return World(
+        name="A",
+        model=SimulatorModel(
+            response,
+            noise=GaussianNoise(NOISE_SD),
+            parameter_names=["theta_1", "theta_2"],
+        ),
+        prior=BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2)),
+        actions=DiscreteActions(torch.arange(-5, 5.5, 0.5)),
+        noise_sd=NOISE_SD,
+        library=library,
+        scatter=Effect(
+            "noise inflation",
+            hook="noise",
+            prior=half_normal(3.0),
+            null=0.0,
+            apply=lambda sd, phi, action, context: sd * (1 + phi),
+            units="",
+        ),
+        outside=[
+            _term("sine", signed_uniform(5.0, 12.0)),
+            _term("step", signed_uniform(5.0, 12.0)),
+            _term("bump", signed_uniform(5.0, 12.0)),
+            _term("power", signed_uniform(5.0, 10.0)),
+        ],
+        equivalences=[
+            frozenset({"none", "gain"}),
+            frozenset({"bias", "action offset"}),
+        ],
+        aliases={"power": frozenset({"quadratic"})},
+        formulas={
+            "bias": frozenset({"1"}),
+            "quadratic": frozenset({"xi^2"}),
+            "step": frozenset({"step", "sign"}),
+            "power": frozenset({"|xi|^1.5"}),
+        },
+    )
+
+
+def _term(name: str, prior: torch.distributions.Distribution) -> Effect:
+    """Return an effect that is a keyword argument of the simulator."""
+    return Effect(
+        name,
+        hook="dynamics",
+        prior=prior,
+        null=0.0,
+        apply=lambda value, phi, action, context: {**value, name: phi[:, 0]},
+        units="",
+    )

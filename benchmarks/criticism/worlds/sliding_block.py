@@ -1,0 +1,152 @@
+"""World B: a block on two friction zones, seen six times by a camera.
+
+The block of :mod:`~benchmarks.criticism.worlds.block` is pushed at a signed speed
+between 1 and 3 m/s; the camera has an error of 5 mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+from torch.distributions import Distribution
+
+from benchmarks.criticism.worlds.block import slide
+from benchmarks.criticism.worlds.world import (
+    World,
+    half_normal,
+    normal,
+    signed_uniform,
+    uniform,
+)
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect
+
+__all__ = ["ALIASES", "library", "make_world", "outside", "scatter"]
+
+NOISE_SD = 0.005  # m
+TIMES = (0.1, 0.25, 0.5, 0.8, 1.2, 2.0)  # s
+SPEEDS = (1.0, 1.5, 2.0, 2.5, 3.0)  # m/s
+ALIASES = {"stribeck": frozenset({"speed gain", "speed offset"})}
+
+
+def library(scale: float = 1.0) -> list[Effect]:
+    """Return the declared effects, the scales of their priors multiplied."""
+    return [
+        _force("quadratic drag", half_normal(0.2 * scale), "1/m"),
+        _force("viscous drag", half_normal(0.4 * scale), "1/s"),
+        _force("tilt", normal(math.radians(2.0) * scale), "rad"),
+        Effect(
+            "speed gain",
+            hook="action",
+            prior=normal(0.08 * scale),
+            null=0.0,
+            apply=lambda speed, phi, action, context: speed * (1 + phi),
+            units="",
+        ),
+        Effect(
+            "speed offset",
+            hook="action",
+            prior=normal(0.1 * scale),
+            null=0.0,
+            apply=lambda speed, phi, action, context: speed + phi,
+            units="m/s",
+        ),
+        Effect(
+            "camera bias",
+            hook="observation",
+            prior=normal(0.02 * scale),
+            null=0.0,
+            apply=lambda x, phi, action, context: x + phi,
+            units="m",
+        ),
+        Effect(
+            "camera scale",
+            hook="observation",
+            prior=normal(0.05 * scale),
+            null=0.0,
+            apply=lambda x, phi, action, context: x * (1 + phi),
+            units="",
+        ),
+        _force("time offset", normal(0.03 * scale), "s", family="observation"),
+    ]
+
+
+def scatter() -> Effect:
+    """Return noise inflation."""
+    return Effect(
+        "noise inflation",
+        hook="noise",
+        prior=half_normal(2.0),
+        null=0.0,
+        apply=lambda sd, phi, action, context: sd * (1 + phi),
+        units="",
+    )
+
+
+def outside() -> list[Effect]:
+    """Return the effects that the library lacks."""
+    return [
+        _force("stribeck", uniform(0.3, 0.8), ""),
+        _force("magnet", signed_uniform(0.4, 1.2), "m/s^2"),
+        _force("edge shift", uniform(-0.25, -0.1), "m"),
+        _force("wall", uniform(0.6, 1.2), "m", null=torch.inf),
+    ]
+
+
+def bare_model(times: Sequence[float]) -> partial[Tensor]:
+    """Return the block seen at some times."""
+    return partial(slide, times=times)
+
+
+def make_world(*, one_way: bool = False) -> World:
+    """Return world B.
+
+    Args:
+        one_way: Permit pushes in the positive direction only. A tilt is then a change
+            of both frictions, and nothing shows it.
+    """
+    speeds = SPEEDS if one_way else (*(-v for v in reversed(SPEEDS)), *SPEEDS)
+    return World(
+        name="B",
+        model=SimulatorModel(
+            bare_model(TIMES),
+            noise=GaussianNoise(NOISE_SD),
+            parameter_names=["friction_near", "friction_far"],
+            channel_names=[f"x({t:g} s)" for t in TIMES],
+        ),
+        prior=BoxUniform(0.1 * torch.ones(2), 0.5 * torch.ones(2)),
+        actions=DiscreteActions(speeds, names=["speed"], units=["m/s"]),
+        noise_sd=NOISE_SD,
+        library=library,
+        scatter=scatter(),
+        outside=outside(),
+        equivalences=[frozenset({"none", "tilt"})] if one_way else [],
+        aliases=ALIASES,
+        formulas={"camera bias": frozenset({"1"}), "camera scale": frozenset({"x"})},
+    )
+
+
+def _force(
+    name: str,
+    prior: Distribution,
+    units: str,
+    *,
+    null: float = 0.0,
+    family: str | None = None,
+) -> Effect:
+    """Return an effect that is a keyword argument of the simulator."""
+    keyword = name.replace(" ", "_")
+    return Effect(
+        name,
+        hook="dynamics",
+        family=family,
+        prior=prior,
+        null=null,
+        apply=lambda value, phi, action, context: {**value, keyword: phi[:, 0]},
+        units=units,
+    )
