@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sbi_active.tasks.base import Task
+from sbi_active.tasks.box_collision import BoxCollisionTask
 from sbi_active.tasks.numerical import NumericalTask
 from sbi_active.tasks.oscillator import OscillatorTask
 
@@ -14,6 +15,7 @@ __all__ = ["TASKS", "Task", "get_task"]
 TASKS: dict[str, Callable[..., Task]] = {
     "numerical": NumericalTask,
     "oscillator": OscillatorTask,
+    "box_collision": BoxCollisionTask,
 }
 
 

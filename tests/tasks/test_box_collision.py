@@ -1,0 +1,225 @@
+import math
+import sys
+
+import pytest
+import torch
+
+from sbi_active import simulate
+from sbi_active.tasks import get_task  # pyright: ignore
+
+pytest.importorskip("mujoco")
+
+
+@pytest.fixture(scope="module")
+def task():
+    return get_task("box_collision")
+
+
+def rows(num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    theta = torch.rand(num, 3, generator=generator)
+    action = 0.5 * torch.randint(41, (num, 1), generator=generator).float()
+    return theta, action
+
+
+def test_is_the_paper_s(task):
+    assert task.actions.values[:, 0].tolist() == [0.5 * i for i in range(41)]
+    assert task.parameter_names == ["table_friction", "cube_friction", "cube_density"]
+    assert task.num_rounds == 6
+    assert task.simulator.noise.sd == 0.005
+    assert task.theta_true.tolist() == pytest.approx([0.8] * 3)
+    low = get_task("box_collision", target=2)
+    assert low.theta_true.tolist() == pytest.approx([0.2] * 3)
+    assert bool(task.prior.support.check(task.prior.sample((9,))).all())
+
+
+def test_a_pusher_that_stands_still_moves_nothing(task):
+    x = task.simulator.mean(task.theta_true[None], torch.zeros(1, 1))
+    # The cube sinks into the table by a fraction of a millimeter.
+    assert torch.allclose(x, torch.tensor([[0.0, 0.0, 0.075]]).double(), atol=3e-4)
+
+
+def test_momentum_passes_to_the_cube(task):
+    """A light, slippery cube leaves faster than the pusher, never twice as fast."""
+    from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
+
+    scene = Scene(edge=50.0)
+    scene.prepare([0.0, 0.0, 0.1], 2.0)
+    momentum = 2.0  # kg m/s, of the 1 kg pusher
+    lost = 9.81 * 0.25  # N: the pusher's own friction .25 on the table
+    for _ in range(100):
+        scene.mujoco.mj_step(scene.model, scene.data, 1)
+    velocity = scene.data.qvel
+    total = velocity[0] + 0.1 * 3.375 * velocity[6]
+    assert 1.0 < velocity[6] < 4.0
+    # Friction takes momentum for .25 s at the most; contact friction is elastic-free.
+    assert momentum - lost * 0.25 - 1e-3 < total < momentum
+
+
+def test_density_changes_the_impact(task):
+    """The contacts know of the new mass: a heavier cube moves less."""
+    theta = torch.tensor([[0.5, 0.5, d] for d in (0.2, 0.5, 1.0)])
+    x = task.simulator.mean(theta, torch.full((3, 1), 3.0))[:, 0]
+    assert bool((x[:-1] > x[1:]).all())
+
+
+def test_every_parameter_matters(task):
+    theta = torch.tensor([[0.5, 0.5, 0.5]]).repeat(4, 1)
+    theta[1:] += 0.2 * torch.eye(3)
+    x = task.simulator.mean(theta, torch.full((4, 1), 5.0))[:, 0]
+    assert bool((x[1:] < x[0] - 0.01).all())
+
+
+def test_fast_pushes_leave_the_table(task):
+    theta, _ = rows(60)
+    share = []
+    for speed in (3.0, 7.0, 15.0):
+        x = task.simulator.mean(theta, torch.full((60, 1), speed))
+        assert bool((x.isnan().any(1) == x.isnan().all(1)).all())
+        share.append(float(x.isnan().any(1).double().mean()))
+    assert share[0] < 0.2 < share[1] < 0.8 < share[2]
+
+
+def test_the_fastest_pusher_does_not_pass_through(task):
+    x = task.simulator.mean(torch.ones(1, 3), torch.full((1, 1), 20.0))
+    assert 0.3 < float(x[0, 0]) < 1.0
+
+
+def test_a_central_push_shows_one_number_and_an_off_center_one_more(task):
+    theta, _ = rows(40)
+    action = torch.full((40, 1), 4.0)
+    straight = task.simulator.mean(theta, action)
+    straight = straight[straight.isfinite().all(1)]
+    assert float(straight[:, 1].abs().max()) < 1e-6
+    # A few cubes are still rocking.
+    assert float((straight[:, 2] - 0.075).abs().median()) < 3e-4
+    turned = get_task("box_collision", variant="off_center").simulator
+    turned = turned.mean(theta, action)
+    turned = turned[turned.isfinite().all(1)]
+    assert float(turned[:, 1].std()) > 0.02
+
+
+def test_early_exit_keeps_the_outcome():
+    from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
+
+    early, full = Scene(), Scene(at_rest=False)
+    theta, action = rows(60)
+    for parameters, speed in zip(theta.tolist(), action[:, 0].tolist(), strict=True):
+        x, exact = early.run(parameters, speed), full.run(parameters, speed)
+        assert (x is None) == (exact is None)
+        if x is not None:
+            assert abs(x - exact).max() < 5e-4  # a tenth of the noise
+
+
+def test_observations_are_bit_identical(task):
+    theta, action = rows(60)
+    x = simulate(task.simulator, theta, action, seed=3).x
+    again = simulate(get_task("box_collision").simulator, theta, action, seed=3).x
+    one_by_one = simulate(task.simulator, theta, action, seed=3, batch_size=7).x
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
+    mean = task.simulator.mean(theta, action)
+    assert torch.equal(mean[order].nan_to_num(), permuted(task, theta, action, order))
+    for other in (again, one_by_one):
+        assert torch.equal(x.nan_to_num(), other.nan_to_num())
+
+
+def permuted(task, theta, action, order):
+    return task.simulator.mean(theta[order], action[order]).nan_to_num()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_workers", [2, 4])
+def test_workers_change_nothing(task, num_workers):
+    theta, action = rows(300)
+    one = simulate(task.simulator, theta, action, seed=3)
+    more = simulate(task.simulator, theta, action, seed=3, num_workers=num_workers)
+    assert torch.equal(one.x.nan_to_num(), more.x.nan_to_num())
+    assert torch.equal(one.status, more.status)
+    assert 0 < int(one.valid.sum()) < 300
+
+
+def test_threads_have_a_scene_each(task):
+    from concurrent.futures import ThreadPoolExecutor
+
+    theta, action = rows(40)
+    alone = task.simulator.mean(theta, action).nan_to_num()
+    with ThreadPoolExecutor(2) as pool:
+        parts = [(theta, action)] * 4
+        for x in pool.map(lambda part: task.simulator.mean(*part), parts):
+            assert torch.equal(x.nan_to_num(), alone)
+
+
+def test_the_paper_s_code_for_what_left_the_table():
+    task = get_task("box_collision", left_table="paper", noise=0.0, target=2)
+    x = task.real_system(torch.tensor([10.0]), seed=0)
+    assert x.tolist() == [-1.0, -1.0, -1.0]
+    theta, action = rows(4)
+    with pytest.raises(ValueError, match="expected a simulator with noise"):
+        simulate(task.simulator, theta, action, seed=0, check_noise=True)
+
+
+def test_an_outcome_off_the_table_is_invalid():
+    task = get_task("box_collision", target=2)
+    theta, action = task.theta_true[None], torch.tensor([[10.0]])
+    rows = simulate(task.simulator, theta, action, seed=0)
+    assert rows.counts == {"ok": 0, "invalid": 1, "missing": 0}
+
+
+def test_noise_is_of_the_declared_size(task):
+    theta, action = task.theta_true.expand(400, 3), torch.full((400, 1), 5.0)
+    error = simulate(task.simulator, theta, action, seed=1).x
+    error = error - task.simulator.mean(theta[:1], action[:1])
+    sd = float(error.std())
+    assert abs(sd - 0.005) < 4 * 0.005 / math.sqrt(2 * 1200)
+
+
+class Point:
+    def __init__(self, *theta):
+        self.theta = torch.tensor(theta)
+
+    def sample(self, shape):
+        return self.theta.expand(*shape, 3)
+
+
+def test_reproduction_error_counts_the_code_of_a_fall():
+    task = get_task("box_collision", target=2)
+    table = task.reproduction_table(Point(0.2, 0.2, 0.2))
+    assert table == {3.0: 0.0, 5.0: 0.0, 7.0: 0.0}  # both fall from 5 m/s on
+    stays = Point(0.8, 0.8, 0.8)
+    x = task.simulator.mean(stays.sample((1,)), torch.full((1, 1), 5.0))
+    distance = float((x + 1).norm())
+    error = task.reproduction_error(stays, 5.0, num_samples=2)
+    assert error == pytest.approx(distance)
+    assert task.reproduction_table(stays)[5.0] == pytest.approx(1e3 * distance)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"target": 3}, "expected target among 1, 2; got 3"),
+        ({"variant": "round"}, "expected variant among 'centered', 'off_center'"),
+        ({"left_table": "zero"}, "expected left_table among 'invalid', 'paper'"),
+        ({"theta_true": (0.2, 0.2, 1.2)}, "expected theta_true of three numbers"),
+        ({"noise": -1.0}, "expected a standard deviation >= 0"),
+    ],
+)
+def test_bad_options(options, text):
+    with pytest.raises(ValueError, match=text):
+        get_task("box_collision", **options)
+
+
+def test_theta_outside_the_box_is_refused(task):
+    theta = torch.tensor([[0.5, 0.5, 0.5], [0.5, 1.5, 0.5]])
+    with pytest.raises(ValueError, match=r"expected theta within \[0, 1\].*in row 1"):
+        task.simulator(theta, torch.ones(2, 1))
+
+
+def test_missing_mujoco_says_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"pip install 'sbi-active\[mujoco\]'"):
+        get_task("box_collision")
+
+
+def test_another_truth(task):
+    other = task.with_truth((0.3, 0.4, 0.5))
+    assert other.theta_true.tolist() == pytest.approx([0.3, 0.4, 0.5])

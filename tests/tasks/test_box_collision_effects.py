@@ -1,0 +1,108 @@
+import csv
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import AugmentedSimulator
+from sbi_active.tasks import get_task  # pyright: ignore
+
+pytest.importorskip("mujoco")
+from sbi_active.tasks.box_collision.model import positions  # noqa: E402
+from sbi_active.tasks.box_collision.scene import LocalScene  # noqa: E402
+
+TASK = get_task("box_collision")
+EFFECTS = {effect.name: effect for effect in TASK.effects()}
+SPEEDS = torch.tensor([[3.0], [5.0], [7.0]])
+TABLE = Path(__file__).parents[2] / "benchmarks" / "box_collision" / "shifts.csv"
+
+# Name: strength, and the sign of the shift of x (or y) at a low friction.
+SIGNS = {
+    "restitution": (0.7, 0, 1),
+    "viscosity": (0.5, 0, -1),
+    "air": (1.2, 0, -1),
+    "tilt": (1.0, 0, 1),
+    "speed gain": (-0.05, 0, -1),
+    "speed offset": (0.3, 0, 1),
+    "aim": (0.01, 1, -1),
+    "center of mass": (0.01, 1, 1),
+    "pusher friction": (0.3, 0, -1),
+    "force": (0.3, 0, 1),
+    "camera bias": (0.01, 0, 1),
+    "camera scale": (0.02, 0, 1),
+    "time stamp": (0.05, 0, 1),
+}
+
+
+def evaluate(name, phi, theta, action):
+    simulator = AugmentedSimulator(TASK.simulator, [EFFECTS[name]])
+    return simulator.evaluate(theta, {name: phi}, action)
+
+
+def test_every_effect_has_a_sign_here():
+    assert set(EFFECTS) == set(SIGNS)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_vanishes_exactly_at_its_null(name):
+    theta = torch.tensor([[0.8, 0.8, 0.8], [0.4, 0.5, 0.6], [0.2, 0.2, 0.2]])
+    bare = TASK.simulator.mean(theta, SPEEDS)
+    null = EFFECTS[name].null_phi(3).float()
+    x = evaluate(name, null, theta, SPEEDS)
+    assert torch.equal(x.nan_to_num(), bare.nan_to_num())
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_moves_the_cube_as_it_should(name):
+    strength, axis, sign = SIGNS[name]
+    theta, action = torch.full((1, 3), 0.2), torch.tensor([[5.0]])
+    wide = SimulatorModel(
+        positions, noise=GaussianNoise(TASK.noise), setup=partial(LocalScene, edge=10.0)
+    )
+    simulator = AugmentedSimulator(wide, [EFFECTS[name]])
+    x = simulator.evaluate(theta, {name: torch.full((1, 1), strength)}, action)
+    shift = float((x - wide.mean(theta, action))[0, axis])
+    assert sign * shift > TASK.noise  # a shift that one trial can show
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_draws_of_its_prior_run(name):
+    torch.manual_seed(0)
+    effect = EFFECTS[name]
+    phi = effect.sample(6).float()
+    assert phi.shape == (6, 1)
+    assert bool(effect.log_prob(phi).isfinite().all())
+    theta = TASK.prior.sample((6,))
+    x = evaluate(name, phi, theta, torch.full((6, 1), 4.0))
+    assert bool(x.isfinite().any())
+
+
+def test_a_shifted_aim_is_the_off_center_variant():
+    theta, action = torch.full((1, 3), 0.5), torch.tensor([[4.0]])
+    variant = get_task("box_collision", variant="off_center")
+    expected = variant.simulator.mean(theta, action)[0]
+    x = evaluate("aim", torch.full((1, 1), -0.03), theta, action)[0]
+    # The same collision seen from 3 cm aside.
+    moved = x + torch.tensor([0.0, 0.03, 0.0])
+    assert float((moved - expected).abs().max()) < 2e-3
+
+
+def test_the_camera_leaves_the_code_of_a_fall():
+    task = get_task("box_collision", left_table="paper")
+    simulator = AugmentedSimulator(task.simulator, task.effects())
+    phi = {name: torch.full((1, 1), 0.01) for name in ("camera bias", "camera scale")}
+    x = simulator.evaluate(torch.full((1, 3), 0.2), phi, torch.tensor([[10.0]]))
+    assert x.tolist() == [[-1.0, -1.0, -1.0]]
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_the_shift_that_it_quotes_is_the_measured(name):
+    with TABLE.open() as file:
+        rows = [r for r in csv.DictReader(file) if r["effect"] == name]
+    row = next(r for r in rows if r["theta"] == "target 2")
+    axis = "y" if SIGNS[name][1] else "x"
+    shifts = [float(row[f"{axis} at {speed} m/s"]) for speed in (3, 5, 7)]
+    quoted = "/".join(f"{shift:+.0f}" for shift in shifts)
+    assert f"{quoted} mm" in EFFECTS[name].describe

@@ -1,0 +1,165 @@
+import math
+
+import pytest
+import torch
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.tasks import get_task  # pyright: ignore
+
+pytest.importorskip("mujoco")
+from sbi_active.tasks.box_collision import BoxCollisionReference  # noqa: E402
+
+SD = 0.02
+
+
+def slide(theta, action):
+    """A closed form like the scene: x grows with the speed, and ends at an edge."""
+    table, cube, density = theta.double().unbind(-1)
+    speed = action.double()[:, 0] / (1 + 3 * density)
+    x = speed.square() / (4 + 16 * (table + 0.5 * cube))
+    x = x.where(x < 1, torch.nan)
+    return torch.stack([x, 0 * x, 0 * x + 0.075], -1)
+
+
+MODEL = SimulatorModel(slide, noise=GaussianNoise(SD))
+TRUTH = torch.tensor([[0.6, 0.5, 0.4]])
+
+
+def trials(*speeds):
+    action = torch.tensor(speeds)[:, None]
+    seeds = torch.arange(len(speeds))
+    return action, MODEL(TRUTH.expand(len(speeds), 3), action, seeds)
+
+
+def log_likelihood(theta, action, x):
+    """Written anew, trial by trial."""
+    total = torch.zeros(len(theta), dtype=torch.float64)
+    for xi, observed in zip(action, x, strict=True):
+        mean = slide(theta, xi.expand(len(theta), 1))
+        off = mean[:, 0].isnan()
+        if observed.isnan().all():
+            total = total.where(off, -torch.inf)
+        else:
+            z = (observed - mean) / SD
+            log_density = (-0.5 * z**2 - math.log(SD * math.sqrt(2 * math.pi))).sum(-1)
+            total = (total + log_density).where(~off, -torch.inf)
+    return total
+
+
+def grid(num):
+    middle = (torch.arange(num, dtype=torch.float64) + 0.5) / num
+    return torch.cartesian_prod(middle, middle, middle)
+
+
+@pytest.mark.parametrize("speeds", [(3.0, 5.0), (2.0, 4.0, 12.0)])
+def test_agrees_with_a_grid(speeds):
+    action, x = trials(*speeds)
+    assert bool(x.isnan().any()) == (12.0 in speeds)
+    reference = BoxCollisionReference(MODEL, action, x, num_simulations=24_000)
+    theta = grid(100)
+    log_weight = log_likelihood(theta, action, x)
+    log_evidence = log_weight.logsumexp(0) - math.log(len(theta))
+    se = reference.log_evidence_se
+    assert 0 < se < 0.05
+    # The midpoint rule is off by far less than the draws.
+    assert abs(reference.log_evidence - float(log_evidence)) < 4 * se
+    assert float(reference.log_prob(TRUTH)) == pytest.approx(
+        float(log_likelihood(TRUTH, action, x)[0]) - reference.log_evidence
+    )
+    weight = log_weight.softmax(0)
+    mean = weight @ theta
+    sd = (weight @ (theta - mean) ** 2).sqrt()
+    draws = reference.sample(4000, seed=0)
+    error = sd / reference.effective_sample_size**0.5 + sd / 4000**0.5
+    assert bool(((draws.mean(0) - mean).abs() < 4 * error).all())
+    assert reference.num_simulations <= 24_000 + 1 * len(speeds)
+
+
+def test_without_trials_it_is_the_prior():
+    reference = BoxCollisionReference(
+        MODEL, torch.empty(0, 1), torch.empty(0, 3), num_simulations=4_000
+    )
+    assert reference.log_evidence == pytest.approx(0.0, abs=1e-9)
+    outside = torch.tensor([[1.1, 0.5, 0.5]])
+    density = reference.log_prob(torch.cat([TRUTH, outside]))
+    assert density.tolist() == [pytest.approx(0.0, abs=1e-9), -math.inf]
+    draws = reference.sample(1000, seed=0)
+    assert bool(((draws.mean(0) - 0.5).abs() < 4 * 0.289 / 1000**0.5 * 2**0.5).all())
+
+
+def test_information_gain_is_that_of_a_histogram():
+    reference = BoxCollisionReference(
+        MODEL, torch.empty(0, 1), torch.empty(0, 3), num_simulations=20_000
+    )
+    gain = reference.expected_information_gain(
+        torch.tensor([[0.0], [4.0]]), num_samples=1000
+    )
+    assert float(gain[0]) == pytest.approx(0.0, abs=1e-6)
+    theta = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1))
+    mean = slide(theta, torch.full((len(theta), 1), 4.0))[:, 0]
+    valid = mean[mean.isfinite()]
+    share = len(valid) / len(mean)
+    noise = torch.randn(len(valid), generator=torch.Generator().manual_seed(2))
+    x = valid + SD * noise
+    width = 0.01
+    p = torch.histc(x, 160, -0.2, 1.4).double() / len(x)
+    entropy = -float(torch.xlogy(p, p / width).sum())
+    entropy -= math.log(SD * math.sqrt(2 * math.pi * math.e))
+    split = -share * math.log(share) - (1 - share) * math.log(max(1 - share, 1e-9))
+    expected = split + share * entropy
+    # log densities of 1,000 draws have a standard deviation below 1.
+    assert abs(float(gain[1]) - expected) < 4 / 1000**0.5
+
+
+def test_impossible_trials_are_refused():
+    action = torch.tensor([[1.0], [0.5]])
+    x = torch.tensor([[math.nan] * 3, [0.0, 0.0, 0.075]])
+    with pytest.raises(ValueError, match="expected a draw of the prior that explains"):
+        BoxCollisionReference(MODEL, action, x, num_simulations=2_000)
+
+
+def test_bad_input():
+    bare = SimulatorModel(slide, noise=GaussianNoise(0.0))
+    with pytest.raises(ValueError, match="expected noise > 0"):
+        BoxCollisionReference(bare, torch.ones(1, 1), torch.ones(1, 3))
+    with pytest.raises(ValueError, match=r"expected action \(t, 1\) and x \(t, 3\)"):
+        BoxCollisionReference(MODEL, torch.ones(2, 1), torch.ones(1, 3))
+
+
+def test_a_rough_posterior_is_warned_of():
+    def rough(theta, action):
+        x = torch.sin(4e5 * theta.double().sum(-1))
+        return torch.stack([x, x, x], -1)
+
+    model = SimulatorModel(rough, noise=GaussianNoise(1e-3))
+    with pytest.warns(UserWarning, match="the posterior rests on .* effective draws"):
+        BoxCollisionReference(
+            model, torch.ones(1, 1), torch.zeros(1, 3), num_simulations=2_000
+        )
+
+
+def test_the_task_gives_it_where_there_is_a_budget():
+    task = get_task("box_collision", reference_budget=600)
+    action = torch.tensor([[5.0]])
+    x = task.real_system(action[0], seed=0)[None]
+    reference = task.reference(action, x)
+    assert reference.num_simulations == 600
+    assert float(reference.log_prob(task.theta_true[None])) > 0  # more than the prior
+    assert get_task("box_collision").reference(action, x) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [(1, (5.0, 6.0)), (2, (1.5, 12.0))])
+def test_agrees_with_draws_from_the_prior_in_the_scene(case):
+    target, speeds = case
+    task = get_task("box_collision", target=target)
+    action = torch.tensor(speeds)[:, None]
+    x = torch.stack([task.real_system(xi, seed=i) for i, xi in enumerate(action)])
+    adaptive = BoxCollisionReference(task.simulator, action, x, num_simulations=8_000)
+    theta = torch.rand(6_000, 3, generator=torch.Generator().manual_seed(9))
+    log_weight = adaptive.log_prob(theta) + adaptive.log_evidence
+    log_evidence = float(log_weight.logsumexp(0)) - math.log(len(theta))
+    weight = log_weight.softmax(0)
+    se = (float(weight.square().sum()) + adaptive.log_evidence_se**2) ** 0.5
+    assert se < 0.25
+    assert abs(adaptive.log_evidence - log_evidence) < 4 * se
