@@ -194,7 +194,7 @@ class Baseline(nn.Module):
             misfit = misfit + 0.5 * (gradient * (mean - start)).sum(-1)
         else:
             mean, misfit, precision = self._minimize(y, beta)
-        factor = torch.linalg.cholesky(precision).mT
+        factor = _cholesky(precision).mT
         if self.residual_scaling is not None:
             location, scale = self.residual_scaling.location_and_scale(action)
             location = location[:, None, :, None]
@@ -258,6 +258,25 @@ class Baseline(nn.Module):
         gradient = u - (jacobian @ residual[..., None])[..., 0]
         eye = torch.eye(u.shape[-1], dtype=u.dtype, device=u.device)
         return misfit, gradient, eye + jacobian @ jacobian.mT
+
+
+def _cholesky(precision: Tensor) -> Tensor:
+    """Return the lower factor of I + J J^T, which rounding may have made indefinite.
+
+    That happens where noise is extrapolated to nearly nothing; a share of the largest
+    entry, raised until it suffices, then stands for the lost I.
+    """
+    factor, info = torch.linalg.cholesky_ex(precision)
+    share = 1e-14
+    while bool(info.any()):
+        largest = precision.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+        lifted = precision + torch.diag_embed(
+            (share * largest).expand_as(factor[..., 0])
+        )
+        lost = (info > 0)[..., None, None]
+        factor, info = torch.linalg.cholesky_ex(torch.where(lost, lifted, precision))
+        share *= 10.0
+    return factor
 
 
 def local(u: Tensor, frames: Frames) -> Tensor:

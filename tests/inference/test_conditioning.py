@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
-from sbi_active.inference.baseline import Baseline, local
+from sbi_active.inference.baseline import Baseline, _cholesky, local
 from sbi_active.inference.conditioning import Conditioning
 from sbi_active.inference.mixture_network import PreparedLoss
 from sbi_active.inference.scaling import ActionScaling, Polynomials, exponents_of
@@ -399,3 +399,15 @@ def test_whitening_removes_all_correlation():
     u = conditioning.whiten(theta)
     assert torch.allclose(torch.cov(u.T), torch.eye(2).double(), atol=2e-3)
     assert torch.allclose(conditioning.unwhiten(u), theta.double(), atol=1e-9)
+
+
+def test_factor_survives_rounding():
+    generator = torch.Generator().manual_seed(0)
+    size = 10.0 ** torch.linspace(0, 12, 50, dtype=torch.float64)[:, None, None]
+    jacobian = size * torch.randn(50, 3, 2, dtype=torch.float64, generator=generator)
+    precision = torch.eye(3, dtype=torch.float64) + jacobian @ jacobian.mT
+    lost = torch.linalg.cholesky_ex(precision)[1] > 0
+    assert 5 < lost.sum() < 45  # a plain factorization raises
+    factor = _cholesky(precision)
+    error = (factor @ factor.mT - precision).abs().amax((1, 2))
+    assert (error / precision.abs().amax((1, 2))).max() < 1e-12
