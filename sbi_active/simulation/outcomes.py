@@ -8,7 +8,13 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-__all__ = ["Outcome", "Simulations"]
+__all__ = [
+    "MissingRowsWarning",
+    "Outcome",
+    "SimulationError",
+    "SimulationInterrupted",
+    "Simulations",
+]
 
 
 class Outcome(IntEnum):
@@ -72,3 +78,24 @@ class Simulations:
         return Simulations(
             self.theta[keep], self.action[keep], self.x[keep], self.status[keep]
         )
+
+
+class SimulationError(RuntimeError):
+    """No row could be simulated, or the simulator could not be loaded in a worker."""
+
+
+class SimulationInterrupted(KeyboardInterrupt):
+    """The user interrupted a simulation.
+
+    Attributes:
+        simulations: What is finished; the other rows are missing.
+    """
+
+    def __init__(self, simulations: Simulations) -> None:
+        counts = ", ".join(f"{k} {name}" for name, k in simulations.counts.items())
+        super().__init__(f"simulation interrupted: {counts}")
+        self.simulations = simulations
+
+
+class MissingRowsWarning(UserWarning):
+    """Some rows are missing; the others stand."""

@@ -1,0 +1,142 @@
+"""One call of a simulator: the rows, their random numbers, and what came of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation.model import SimulatorModel
+from sbi_active.simulation.simulator import outcome_tensor
+
+__all__ = ["BLOCK", "Call", "Fault", "Reply", "answer"]
+
+#: Rows that share one seed of the global generators. Part of the definition of x for a
+#: simulator that takes no seeds, so it is never a setting.
+BLOCK = 256
+
+Fault = Literal["raised", "timed out", "worker died", "misused", "not loaded"]
+
+_INTERFACE = {SimulatorModel.__module__, outcome_tensor.__module__}
+
+# The generators of torch and NumPy belong to the process, and some executors run
+# several calls in threads of one.
+_GENERATORS = threading.RLock()
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """Rows to simulate in one call.
+
+    Attributes:
+        rows: Their indices in the whole set, shape (k,), int64.
+        theta: Parameters, shape (k, theta_dim).
+        action: Actions, shape (k, action_dim).
+        seeds: One a row, shape (k,), int64.
+        seed: Of the whole set.
+        draws: Where the random numbers come from: "seeds" passes those to the
+            simulator; "blocks" forks the global generators for each block of 256 rows,
+            and the rows are whole blocks; "alone" forks them for the single row.
+        is_probe: Whether it only asks if the simulator works, its x being dropped.
+        is_second: Whether it is tried again after its worker died.
+    """
+
+    rows: np.ndarray
+    theta: Tensor
+    action: Tensor
+    seeds: Tensor
+    seed: int
+    draws: Literal["seeds", "blocks", "alone"]
+    is_probe: bool = False
+    is_second: bool = False
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def part(self, rows: slice, **changes: Any) -> Call:
+        """Return the call for some of the rows."""
+        return replace(
+            self,
+            rows=self.rows[rows],
+            theta=self.theta[rows],
+            action=self.action[rows],
+            seeds=self.seeds[rows],
+            **changes,
+        )
+
+    def blocks(self) -> Iterator[slice]:
+        """Yield the whole blocks that it is made of."""
+        for start in range(0, len(self), BLOCK):
+            yield slice(start, start + BLOCK)
+
+
+@dataclass(frozen=True, eq=False)
+class Reply:
+    """What came of a call.
+
+    Attributes:
+        x: Shape (k, *x_shape), float32; None where there is a fault.
+        seconds: Wall time that the simulator took.
+        fault: What went wrong; None if nothing did.
+        traceback: Text that tells it.
+        error: The exception itself, where it was raised in this process.
+    """
+
+    x: Tensor | None = None
+    seconds: float = 0.0
+    fault: Fault | None = None
+    traceback: str = ""
+    error: BaseException | None = field(default=None, repr=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # An exception may be impossible to pickle; its text has been taken.
+        return Reply, (self.x, self.seconds, self.fault, self.traceback)
+
+
+def answer(simulator: Callable[..., Any], call: Call) -> Reply:
+    """Run the simulator over the rows of a call; its exceptions become a reply."""
+    start = time.perf_counter()
+    try:
+        x = _draw(simulator, call).float()
+    except (Exception, SystemExit) as error:
+        fault = "misused" if _is_of_the_interface(error) else "raised"
+        return Reply(None, 0.0, fault, traceback.format_exc(), error)
+    return Reply(x, time.perf_counter() - start)
+
+
+def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
+    if call.draws == "seeds":
+        x = simulator(call.theta, call.action, seeds=call.seeds)
+        return outcome_tensor(x, len(call))
+    parts = []
+    kind = "block" if call.draws == "blocks" else "row"
+    for rows in call.blocks():
+        part = call.part(rows)
+        seeds = {"seeds": part.seeds} if isinstance(simulator, SimulatorModel) else {}
+        with _GENERATORS, forked_generators(call.seed, kind, int(part.rows[0])):
+            x = simulator(part.theta, part.action, **seeds)
+        parts.append(outcome_tensor(x, len(part)))
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _is_of_the_interface(error: BaseException) -> bool:
+    """Return whether our own checks raised it, or the call itself: no fault of a row.
+
+    Such an error comes of arguments that do not fit or of rows of another shape, and
+    the innermost frame of its traceback is ours and not the simulator's.
+    """
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = trace.tb_frame.f_globals.get("__name__") if trace is not None else None
+    if where == __name__:
+        return isinstance(error, TypeError)
+    return where in _INTERFACE and isinstance(error, ValueError | TypeError)

@@ -1,0 +1,265 @@
+"""Seeds, workers, batches, stores and interruptions of the engine."""
+
+import os
+import signal
+import sys
+import threading
+import time
+
+import cloudpickle
+import joblib
+import numpy as np
+import pytest
+import torch
+
+from sbi_active import GaussianNoise, SimulatorModel, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import Outcome, SimulationInterrupted
+from sbi_active.simulation.store import run_digest
+
+# A worker cannot import a test module.
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
+
+
+def global_torch(theta, action):
+    return theta * action + torch.randn_like(theta)
+
+
+def global_numpy(theta, action):
+    return theta.numpy() * action.numpy() + np.random.randn(*theta.shape)
+
+
+def seeded(theta, action, seeds):
+    return theta * action + row_normals(seeds, 1).float()
+
+
+def product(theta, action):
+    return theta * action
+
+
+SIMULATORS = [
+    global_torch,
+    global_numpy,
+    seeded,
+    SimulatorModel(product, noise=GaussianNoise(1.0)),
+    SimulatorModel(global_torch, noise=GaussianNoise(1.0)),
+]
+
+
+class MemoryStore:
+    """A store that counts, and refuses rows it has."""
+
+    def __init__(self):
+        self.rows = {}
+        self.num_saves = 0
+
+    def load(self, run):
+        rows = self.rows.get(run)
+        if not rows:
+            return None
+        index = torch.tensor(sorted(rows))
+        x = torch.stack([rows[int(i)][0] for i in index])
+        return index, x, torch.tensor([rows[int(i)][1] for i in index])
+
+    def save(self, run, *, index, theta, action, x, status, seed):
+        self.num_saves += 1
+        rows = self.rows.setdefault(run, {})
+        assert not rows.keys() & set(index.tolist())
+        assert len(index) == len(theta) == len(action) == len(x) == len(status)
+        finished = zip(x, status.tolist(), strict=True)
+        rows.update(zip(index.tolist(), finished, strict=True))
+
+
+@pytest.fixture(scope="module")
+def rows():
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(700, 1, generator=generator), torch.ones(700, 1)
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_x_depends_on_neither_workers_nor_batches(simulator, rows):
+    expected = simulate(simulator, *rows, seed=3).x
+    assert expected.isfinite().all()
+    for options in (
+        {"batch_size": 1},
+        {"batch_size": 300},
+        {"num_workers": 2},
+        {"num_workers": 4, "batch_size": 33},
+        {"time_limit": 5.0},
+    ):
+        x = simulate(simulator, *rows, seed=3, **options).x
+        assert torch.equal(x, expected), options
+    assert not torch.equal(
+        simulate(simulator, *rows, seed=4, num_workers=2).x, expected
+    )
+
+
+def test_a_batch_has_the_rows_that_were_asked_for(rows):
+    sizes = []
+
+    def simulator(theta, action, seeds):
+        sizes.append(len(theta))
+        return seeded(theta, action, seeds)
+
+    simulate(simulator, *rows, seed=0)
+    simulate(simulator, *rows, seed=0, batch_size=300)
+    assert sizes == [700, 300, 300, 100]
+
+
+@pytest.mark.parametrize("backend", ["threading", "multiprocessing", "sequential"])
+def test_other_executors_of_joblib_give_the_same_x(backend, rows):
+    for simulator in (seeded, global_torch):
+        expected = simulate(simulator, *rows, seed=3).x
+        with joblib.parallel_config(backend=backend):
+            x = simulate(simulator, *rows, seed=3, num_workers=2, batch_size=90).x
+        assert torch.equal(x, expected)
+
+
+def test_time_limits_need_processes(rows):
+    with (
+        joblib.parallel_config(backend="threading"),
+        pytest.raises(ValueError, match="expected the processes of this machine"),
+    ):
+        simulate(seeded, *rows, seed=0, num_workers=2, time_limit=1.0)
+
+
+def test_workers_use_one_thread_and_the_folder_of_the_caller(tmp_path, monkeypatch):
+    def simulator(theta, action, seeds):
+        same = os.getcwd() == os.environ["EXPECTED_FOLDER"]
+        number = torch.get_num_threads() + (0 if same else 100)
+        return torch.full((len(theta), 1), float(number))
+
+    simulate(seeded, torch.rand(2, 1), torch.rand(2, 1), seed=0, num_workers=2)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("EXPECTED_FOLDER", str(tmp_path))
+    theta = torch.rand(2, 1)
+    assert (simulate(simulator, theta, theta, seed=0, num_workers=2).x == 1).all()
+
+
+def test_setup_is_no_part_of_the_time_limit():
+    def slow_setup():
+        time.sleep(0.5)
+        return 2.0
+
+    def fn(theta, action, *, context):
+        return theta * context
+
+    model = SimulatorModel(fn, setup=slow_setup, noise=GaussianNoise(0.0))
+    theta = torch.rand(3, 1)
+    x = simulate(model, theta, theta, seed=0, time_limit=0.1).x
+    assert torch.equal(x, theta * 2)
+
+
+def test_a_store_is_read_before_anything_is_simulated(rows):
+    for simulator in (seeded, global_torch):
+        expected = simulate(simulator, *rows, seed=3).x
+        store = MemoryStore()
+        first = simulate(simulator, *rows, seed=3, store=store)
+        assert torch.equal(first.x, expected)
+
+        def never(theta, action, seeds):
+            raise AssertionError("the rows are stored")
+
+        again = simulate(never, *rows, seed=3, store=store)
+        assert torch.equal(again.x, expected)
+        assert torch.equal(again.status, first.status)
+
+        # Any part of them may be lacking.
+        run = run_digest(3, *rows)
+        for row in (0, 5, 256, 300, 301, 699):
+            del store.rows[run][row]
+        some = simulate(simulator, *rows, seed=3, store=store, num_workers=2)
+        assert torch.equal(some.x, expected)
+        assert len(store.rows[run]) == 700
+
+
+def test_a_run_is_its_seed_theta_and_action(rows):
+    theta, action = rows
+    names = {
+        run_digest(0, theta, action),
+        run_digest(1, theta, action),
+        run_digest(0, theta + 1, action),
+        run_digest(0, theta, action + 1),
+        run_digest(0, theta[:5], action[:5]),
+    }
+    assert len(names) == 5
+
+
+def test_an_interrupted_simulation_keeps_what_is_finished(rows):
+    calls = []
+
+    def simulator(theta, action, seeds):
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        calls.append(len(theta))
+        return seeded(theta, action, seeds)
+
+    store = MemoryStore()
+    with pytest.raises(SimulationInterrupted, match="300 ok, 0 invalid, 400") as caught:
+        simulate(simulator, *rows, seed=3, batch_size=100, store=store)
+    expected = simulate(seeded, *rows, seed=3).x
+    kept = caught.value.simulations
+    assert torch.equal(kept.x[:300], expected[:300])
+    assert kept.x[300:].isnan().all()
+    assert (kept.status[300:] == Outcome.MISSING).all()
+    assert len(store.rows[run_digest(3, *rows)]) == 300
+    resumed = simulate(seeded, *rows, seed=3, store=store)
+    assert torch.equal(resumed.x, expected)
+
+
+def test_an_interrupt_ends_the_workers(rows):
+    def simulator(theta, action, seeds):
+        time.sleep(0.02 if theta[0] < 0.9 else 30)
+        return seeded(theta, action, seeds)
+
+    process = os.getpid()
+    threading.Timer(1.0, os.kill, (process, signal.SIGINT)).start()
+    start = time.monotonic()
+    with pytest.raises(SimulationInterrupted) as caught:
+        simulate(simulator, *rows, seed=3, num_workers=2, batch_size=1)
+    assert time.monotonic() - start < 10
+    kept = caught.value.simulations
+    assert kept.valid.any()
+    expected = simulate(seeded, *rows, seed=3).x
+    assert torch.equal(kept.x[kept.valid], expected[kept.valid])
+
+
+def test_progress_is_shown_on_request(rows, capsys):
+    simulate(seeded, *rows, seed=0)
+    assert capsys.readouterr().err == ""
+    simulate(seeded, *rows, seed=0, show_progress=True)
+    assert "700/700" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"num_workers": 0}, "expected num_workers >= 1"),
+        ({"batch_size": 0}, "expected batch_size >= 1"),
+        ({"time_limit": 0.0}, "expected time_limit > 0"),
+        ({"num_retries": -1}, "expected num_retries >= 0"),
+    ],
+)
+def test_bad_options(options, text):
+    with pytest.raises(ValueError, match=text):
+        simulate(seeded, torch.rand(3, 1), torch.rand(3, 1), seed=0, **options)
+
+
+@pytest.mark.parametrize("name", ["theta", "action"])
+def test_rows_must_be_finite(name):
+    rows = {"theta": torch.rand(3, 1), "action": torch.rand(3, 1)}
+    rows[name][1] = torch.nan
+    with pytest.raises(ValueError, match=f"expected finite {name}; got NaN"):
+        simulate(seeded, **rows, seed=0)
+
+
+def test_a_simulator_must_travel():
+    lock = threading.Lock()
+
+    def simulator(theta, action, seeds):
+        with lock:
+            return seeded(theta, action, seeds)
+
+    theta = torch.rand(3, 1)
+    with pytest.raises(TypeError, match="expected a simulator that can travel"):
+        simulate(simulator, theta, theta, seed=0, num_workers=2)

@@ -1,0 +1,150 @@
+"""A real Dask cluster on this machine, one worker of which is killed meanwhile."""
+
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections import Counter
+
+import cloudpickle
+import joblib
+import pytest
+import torch
+
+from sbi_active import simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import MissingRowsWarning
+
+dask = pytest.importorskip("dask")
+distributed = pytest.importorskip(
+    "distributed", reason="needs Dask: pip install 'sbi-active[cluster]'"
+)
+
+# A worker cannot import a test module.
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
+
+
+@pytest.fixture(scope="module")
+def client():
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def rows():
+    return torch.rand(600, 1), torch.rand(600, 1)
+
+
+def seeded(theta, action, seeds):
+    return theta * action + row_normals(seeds, 1).float()
+
+
+def unseeded(theta, action):
+    return theta * action + torch.randn_like(theta)
+
+
+class Reporting:
+    """Takes its time, and leaves the number of its process for each call."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def report(self, theta):
+        (self.folder / f"{os.getpid()}-{time.monotonic()}").touch()
+        time.sleep(2e-3 * len(theta))
+
+
+class ReportingSeeded(Reporting):
+    def __call__(self, theta, action, seeds):
+        self.report(theta)
+        return seeded(theta, action, seeds)
+
+
+class ReportingUnseeded(Reporting):
+    def __call__(self, theta, action):
+        self.report(theta)
+        return unseeded(theta, action)
+
+
+def kill_at_work(folder, killed):
+    """Kill the first process that is at its third call."""
+    while not killed:
+        calls = Counter(int(f.name.split("-")[0]) for f in folder.iterdir())
+        killed += [pid for pid, count in calls.items() if count >= 3][:1]
+        time.sleep(1e-3)
+    os.kill(killed[0], signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("simulator", "reporting"),
+    [
+        (seeded, ReportingSeeded),
+        pytest.param(unseeded, ReportingUnseeded, marks=pytest.mark.slow),
+    ],
+)
+def test_a_worker_killed_in_the_middle_loses_nothing(
+    client, rows, simulator, reporting, tmp_path
+):
+    client.wait_for_workers(2)
+    expected = simulate(simulator, *rows, seed=0).x
+    killed = []
+    killer = threading.Thread(target=kill_at_work, args=(tmp_path, killed), daemon=True)
+    killer.start()
+    with joblib.parallel_config(backend="dask"):
+        result = simulate(
+            reporting(tmp_path), *rows, seed=0, num_workers=2, batch_size=10
+        )
+    killer.join(timeout=0)
+    assert not killer.is_alive()  # it was killed before the end
+    assert result.tracebacks == {}
+    assert torch.equal(result.x, expected)
+    assert killed[0] not in client.run(os.getpid).values()
+
+
+@pytest.mark.slow
+def test_faults_on_the_cluster_cost_their_rows(client, rows):
+    def faulty(theta, action, seeds):
+        if bool((action == 3).any()):
+            raise RuntimeError("no")
+        return theta + row_normals(seeds, 1).float()
+
+    theta, action = rows
+    action[[7, 300]] = 3
+    clean = simulate(
+        lambda t, a, seeds: t + row_normals(seeds, 1).float(), theta, action, seed=0
+    ).x
+    with (
+        joblib.parallel_config(backend="dask"),
+        pytest.warns(MissingRowsWarning, match="2 of 600 rows are missing: 2 raised"),
+    ):
+        result = simulate(faulty, theta, action, seed=0, num_workers=-1)
+    assert result.tracebacks.keys() == {7, 300}
+    assert torch.equal(result.x[result.valid], clean[result.valid])
+
+
+@pytest.mark.slow
+def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
+    def killer(theta, action, seeds):
+        if bool((action == 3).any()):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return theta
+
+    theta, action = (r[:4] for r in rows)
+    action[2] = 3
+    with joblib.parallel_config(backend="dask"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissingRowsWarning)
+        result = simulate(killer, theta, action, seed=0, num_workers=2, batch_size=2)
+    assert result.tracebacks.keys() == {2}
+    assert "KilledWorker" in result.tracebacks[2]
+    assert torch.equal(result.x[result.valid], theta[result.valid])
