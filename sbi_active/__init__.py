@@ -21,9 +21,13 @@ from sbi_active.inference import (
     Refinement,
 )
 from sbi_active.simulation import (
+    AutocorrelatedNoise,
+    Bank,
     GaussianNoise,
     Simulations,
     SimulatorModel,
+    StudentTNoise,
+    estimate_noise,
     simulate,
 )
 
@@ -37,6 +41,8 @@ __all__ = [
     "ActionEmbedding",
     "ActionPosterior",
     "ActionSpace",
+    "AutocorrelatedNoise",
+    "Bank",
     "Belief",
     "Campaign",
     "CampaignOptions",
@@ -49,7 +55,9 @@ __all__ = [
     "Refinement",
     "Simulations",
     "SimulatorModel",
+    "StudentTNoise",
     "Trial",
+    "estimate_noise",
     "simulate",
     "to_inference_data",
 ]

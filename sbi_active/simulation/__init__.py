@@ -1,17 +1,42 @@
 """Simulators, their noise, and the engine that runs them."""
 
+from sbi_active.simulation.autocorrelated import AutocorrelatedNoise
+from sbi_active.simulation.bank import Bank, ReusedRows, reuse
+from sbi_active.simulation.check import check_simulator
 from sbi_active.simulation.engine import simulate
 from sbi_active.simulation.model import Simulator, SimulatorModel, require_noise
 from sbi_active.simulation.noise import GaussianNoise, NoiseModel
-from sbi_active.simulation.outcomes import Outcome, Simulations
+from sbi_active.simulation.noise_estimation import estimate_noise
+from sbi_active.simulation.outcomes import (
+    MissingRowsWarning,
+    Outcome,
+    SimulationError,
+    SimulationInterrupted,
+    Simulations,
+)
+from sbi_active.simulation.simulator_report import SimulatorReport
+from sbi_active.simulation.store import RowStore
+from sbi_active.simulation.student import StudentTNoise
 
 __all__ = [
+    "AutocorrelatedNoise",
+    "Bank",
     "GaussianNoise",
+    "MissingRowsWarning",
     "NoiseModel",
     "Outcome",
+    "ReusedRows",
+    "RowStore",
+    "SimulationError",
+    "SimulationInterrupted",
     "Simulations",
     "Simulator",
     "SimulatorModel",
+    "SimulatorReport",
+    "StudentTNoise",
+    "check_simulator",
+    "estimate_noise",
     "require_noise",
+    "reuse",
     "simulate",
 ]

@@ -1,10 +1,9 @@
-"""The command line: ``sbi-active run TASK --out DIR``."""
+"""``sbi-active run TASK --out DIR``: a campaign on a task."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,40 +21,18 @@ from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 
-__all__ = ["main"]
+__all__ = ["add_parser"]
 
 SETTINGS = {"default": CampaignOptions, "faithful": CampaignOptions.faithful}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+def add_parser(commands: Any) -> None:
+    """Add the command to the parser.
 
     Args:
-        argv: Arguments; None takes those of the process.
-
-    Returns:
-        The exit status.
+        commands: What ``ArgumentParser.add_subparsers`` returned.
     """
-    parser = _parser()
-    arguments = parser.parse_args(argv)
-    try:
-        return arguments.command(arguments)
-    except (ValueError, OSError) as error:
-        print(f"sbi-active: {error}", file=sys.stderr)
-        return 2
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="sbi-active",
-        description="Tune a black-box simulator from a handful of real trials.",
-    )
-    parser.add_argument("--version", action="version", version=__version__)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    run = commands.add_parser(
-        "run",
-        help="run a campaign on a task",
-    )
+    run = commands.add_parser("run", help="run a campaign on a task")
     run.set_defaults(command=_run)
     run.add_argument("task", help=f"one of: {', '.join(TASKS)}")
     run.add_argument(
@@ -74,7 +51,6 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--simulations", type=int, help="to train on, a round")
     run.add_argument("--samples", type=int, help="for the gain, a candidate action")
     run.add_argument("--iterations", type=int, help="training steps a round")
-    return parser
 
 
 def _run(arguments: argparse.Namespace) -> int:

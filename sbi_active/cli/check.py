@@ -1,0 +1,167 @@
+"""``sbi-active check MODULE:FUNCTION``: look a simulator over before a campaign."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from typing import Any
+
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.campaign import CampaignOptions
+from sbi_active.cli.loading import load_object
+from sbi_active.simulation.check import check_simulator
+from sbi_active.tasks import TASKS, get_task  # pyright: ignore
+
+__all__ = ["actions_of", "add_parser", "numbers_of", "prior_of"]
+
+MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command to the parser.
+
+    Args:
+        commands: What ``ArgumentParser.add_subparsers`` returned.
+    """
+    check = commands.add_parser(
+        "check",
+        help="look a simulator over before a campaign",
+        description=(
+            "Shapes, seeds, noise, lost rows, parameters that change nothing, and the "
+            "cost of a campaign. Exit status 1 where something keeps a campaign from "
+            "working. Write negative numbers as in --theta-low=-5,-5."
+        ),
+    )
+    check.set_defaults(command=_check)
+    check.add_argument(
+        "simulator",
+        nargs="?",
+        metavar="MODULE:FUNCTION",
+        help="or file.py:FUNCTION; not with --task",
+    )
+    check.add_argument("--task", help=f"one of: {', '.join(TASKS)}")
+    check.add_argument("--theta-low", metavar="A,B,...", help="one a parameter")
+    check.add_argument("--theta-high", metavar="A,B,...", help="one a parameter")
+    check.add_argument("--prior", metavar="MODULE:NAME", help="in place of bounds")
+    check.add_argument(
+        "--actions",
+        nargs="+",
+        metavar="SPEC",
+        help="for each entry of the action LOW:HIGH:COUNT or A,B,...; or one "
+        "MODULE:NAME of an action space",
+    )
+    check.add_argument("--rows", type=int, default=256, help="a check (256)")
+    check.add_argument("--rounds", type=int, default=4, help="of the campaign (4)")
+    check.add_argument("--workers", type=int, default=1, help="of the campaign (1)")
+    check.add_argument("--seed", type=int, default=0)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    for name in ("rows", "rounds", "workers"):
+        if getattr(arguments, name) < 1:
+            raise ValueError(
+                f"expected --{name} >= 1; got {getattr(arguments, name)}; do give a "
+                "positive number"
+            )
+    simulator, prior, actions = _source(arguments)
+    num_simulations = _campaign_size(actions, arguments.rounds)
+    report = check_simulator(
+        simulator,
+        prior,
+        actions,
+        num_rows=arguments.rows,
+        num_simulations=num_simulations,
+        num_workers=arguments.workers,
+        seed=arguments.seed,
+    )
+    print(report)
+    return 0 if report.is_ready else 1
+
+
+def _campaign_size(actions: ActionSpace, num_rounds: int) -> int:
+    """Return the most simulations that the default options allow.
+
+    A round trains, designs over all actions, and refines on the trials so far.
+    """
+    options = CampaignOptions()
+    values = getattr(actions, "values", None)
+    num_actions = MANY_ACTIONS if values is None else len(values)
+    trials = num_rounds * (num_rounds + 1) // 2
+    a_round = options.num_simulations + num_actions * options.num_samples
+    return num_rounds * a_round + trials * options.refinement.num_histories
+
+
+def _source(arguments: argparse.Namespace) -> tuple[Any, Distribution, ActionSpace]:
+    if (arguments.task is None) == (arguments.simulator is None):
+        raise ValueError(
+            "expected MODULE:FUNCTION or --task; got both or neither; do give one, as "
+            "in sbi-active check my_robot.py:simulator"
+        )
+    if arguments.task is not None:
+        task = get_task(arguments.task)
+        return task.simulator, task.prior, task.actions
+    simulator = load_object(arguments.simulator)
+    if not callable(simulator):
+        raise ValueError(
+            f"expected a function or SimulatorModel; got {type(simulator).__name__} "
+            f"under {arguments.simulator}; do name what takes (theta, action)"
+        )
+    return simulator, prior_of(arguments), actions_of(arguments)
+
+
+def prior_of(arguments: argparse.Namespace) -> Distribution:
+    """Return the prior that --prior, or --theta-low and --theta-high, name."""
+    if arguments.prior is not None:
+        return load_object(arguments.prior)
+    if arguments.theta_low is None or arguments.theta_high is None:
+        raise ValueError(
+            "expected --theta-low and --theta-high, or --prior; got too few; do give "
+            "bounds as in --theta-low=0,-1 --theta-high=1,1"
+        )
+    low, high = numbers_of(arguments.theta_low), numbers_of(arguments.theta_high)
+    if len(low) != len(high) or any(a >= b for a, b in zip(low, high, strict=True)):
+        raise ValueError(
+            f"expected as many bounds, low below high; got {low} and {high}; do give "
+            "one of each a parameter"
+        )
+    return BoxUniform(torch.tensor(low), torch.tensor(high))
+
+
+def actions_of(arguments: argparse.Namespace) -> ActionSpace:
+    """Return the action space that --actions names."""
+    specs = arguments.actions
+    if specs is None:
+        raise ValueError(
+            "expected --actions; got none; do give values as in --actions 0:5:11, one "
+            "an entry of the action"
+        )
+    if len(specs) == 1 and specs[0].count(":") == 1:
+        return load_object(specs[0])
+    axes = [_axis(spec) for spec in specs]
+    return DiscreteActions(torch.tensor([*itertools.product(*axes)]))
+
+
+def _axis(spec: str) -> list[float]:
+    parts = spec.split(":")
+    if len(parts) == 1:
+        return numbers_of(spec)
+    if len(parts) != 3 or not parts[2].isdigit() or int(parts[2]) < 1:
+        raise ValueError(
+            f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; do write, say, 0:5:11"
+        )
+    low, high = (numbers_of(part)[0] for part in parts[:2])
+    return torch.linspace(low, high, int(parts[2])).tolist()
+
+
+def numbers_of(text: str) -> list[float]:
+    """Return numbers that are separated by commas."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ValueError(
+            f"expected numbers separated by commas; got {text!r}; do write, say, 0,1.5"
+        ) from error

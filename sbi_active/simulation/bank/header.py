@@ -1,0 +1,130 @@
+"""What a bank says of itself: format, simulator, shapes and names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sbi_active.simulation.bank.fingerprint import differences
+from sbi_active.simulation.bank.segments import (
+    TEMPORARY,
+    CorruptSegmentError,
+    write_file,
+)
+
+__all__ = [
+    "has_header",
+    "make_folder",
+    "new_header",
+    "read_header",
+    "require_same_simulator",
+    "write_header",
+]
+
+FORMAT = 1
+HEADER = "bank.json"
+
+#: Files of a bank whose header is not written yet.
+OWN = ("segments", "writer.json", "writer.lock")
+
+
+def new_header(
+    identity: Mapping[str, Any], *, names: Sequence[str] | None, created: str | None
+) -> dict[str, Any]:
+    """Return the header of an empty bank.
+
+    Args:
+        identity: Fingerprint of the simulator.
+        names: Of the parameters.
+        created: Date.
+    """
+    return {
+        "format": FORMAT,
+        "created": created,
+        **identity,
+        "parameter_names": names,
+        "shapes": None,
+    }
+
+
+def has_header(folder: Path) -> bool:
+    """Return whether a folder holds a bank."""
+    return (folder / HEADER).exists()
+
+
+def make_folder(folder: Path, name: str) -> None:
+    """Make the folder of a bank with one inside.
+
+    Raises:
+        ValueError: If it holds anything else.
+        OSError: If it cannot be made.
+    """
+    try:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        found = sorted(path.name for path in folder.iterdir())
+    except OSError as error:
+        raise type(error)(
+            error.errno,
+            f"expected a folder that can be made for a bank; got {error.strerror!r}; "
+            "do choose a place that can be written",
+            str(folder),
+        ) from error
+    other = [f for f in found if f not in OWN and not f.startswith(TEMPORARY)]
+    if other:
+        raise ValueError(
+            f"expected a bank or an empty folder; got {folder} with {other[0]!r}; do "
+            "choose another folder"
+        )
+
+
+def write_header(folder: Path, header: Mapping[str, Any]) -> None:
+    """Write the header, atomically."""
+    write_file(folder / HEADER, (json.dumps(header, indent=2) + "\n").encode())
+
+
+def read_header(folder: Path) -> dict[str, Any]:
+    """Return the header.
+
+    Raises:
+        ValueError: If there is none, or one of another format.
+        CorruptSegmentError: If it cannot be read.
+    """
+    path = folder / HEADER
+    try:
+        header = json.loads(path.read_text())
+        found = header["format"]
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ValueError(
+            f"expected a bank; got no {path}; do give simulator= to make one"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptSegmentError(path, f"no header ({error})") from error
+    if found != FORMAT:
+        raise ValueError(
+            f"expected a bank of format {FORMAT}; got {found} in {path}; do use the "
+            "release of sbi-active that wrote it, or make a new bank"
+        )
+    return header
+
+
+def require_same_simulator(
+    folder: Path, stored: Mapping[str, Any], mine: Mapping[str, Any]
+) -> None:
+    """Compare the header on the disk with that of the simulator at hand.
+
+    Raises:
+        ValueError: If simulator, version or names differ; the text says where.
+    """
+    lines = differences(stored, mine)
+    names = stored["parameter_names"], mine["parameter_names"]
+    if None not in names and names[0] != names[1]:
+        lines.append(f"parameter names {names[0]} there, {names[1]} here")
+    if lines:
+        raise ValueError(
+            f"expected the simulator of the bank {folder}; got another: "
+            f"{'; '.join(lines)}; do make a bank for each simulator, or, where x is "
+            "the same, give the same version= each time and keep what changes from "
+            "call to call in attributes with a leading underscore"
+        )

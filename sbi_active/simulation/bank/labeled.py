@@ -1,0 +1,74 @@
+"""A bank that notes the proposal of what is stored through it."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.simulation.bank.log_density import log_density
+
+if TYPE_CHECKING:
+    from sbi_active.simulation.bank.bank import Bank
+
+__all__ = ["LabeledStore"]
+
+
+class LabeledStore:
+    """A bank that notes which proposal theta was drawn from; see ``drawn_from``."""
+
+    def __init__(
+        self, bank: Bank, proposal: Distribution | None, label: str, log_action: Tensor
+    ) -> None:
+        self._bank = bank
+        self._proposal, self._label, self._log_action = proposal, label, log_action
+
+    def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
+        """As :meth:`Bank.load`."""
+        return self._bank.load(run)
+
+    def save(
+        self,
+        run: str,
+        *,
+        index: Tensor,
+        theta: Tensor,
+        action: Tensor,
+        x: Tensor,
+        status: Tensor,
+        seed: int,
+    ) -> None:
+        """As :meth:`Bank.save`."""
+        rows = {"theta": theta, "action": action, "x": x, "status": status}
+        if any(len(column) != len(index) for column in rows.values()):
+            lengths = {name: len(column) for name, column in rows.items()}
+            raise ValueError(
+                f"expected {len(index)} rows, one an index; got {lengths}; do give "
+                "columns of one length"
+            )
+        log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
+        if self._proposal is not None:
+            log_proposal = log_density(self._proposal, theta)
+            if bool((log_proposal == -torch.inf).any()):
+                warnings.warn(
+                    f"{int((log_proposal == -torch.inf).sum())} of {len(theta)} rows "
+                    f"have density 0 under the proposal {self._label!r}: they were not "
+                    "drawn from it",
+                    stacklevel=2,
+                )
+        log_action = self._log_action.double()
+        log_action = log_action[index] if log_action.ndim else log_action
+        columns = {
+            "index": index.to(torch.int64),
+            **{name: rows[name].float() for name in ("theta", "action", "x")},
+            "status": status.to(torch.int8),
+            "log_proposal": log_proposal,
+            "log_action": log_action.expand(len(index)),
+        }
+        self._bank.store(
+            {"digest": run, "seed": seed, "label": self._label},
+            {name: c.detach().cpu().numpy() for name, c in columns.items()},
+        )

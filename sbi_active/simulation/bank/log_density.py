@@ -1,0 +1,41 @@
+"""Log densities of what users bring as a prior or a proposal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["log_density"]
+
+
+def log_density(distribution: Any, theta: Tensor) -> Tensor:
+    """Return the log density of rows, -inf outside the support.
+
+    A torch distribution that validates its arguments raises outside of its support.
+
+    Args:
+        distribution: Anything with ``log_prob``.
+        theta: Shape (n, theta_dim).
+
+    Returns:
+        Shape (n,), float64.
+    """
+    result = torch.full((len(theta),), -torch.inf, dtype=torch.float64)
+    try:
+        inside = distribution.support.check(theta)
+    except (AttributeError, NotImplementedError):
+        inside = torch.ones(len(theta), dtype=torch.bool)
+    inside = inside.reshape(len(theta), -1).all(-1)
+    if bool(inside.any()):
+        with torch.no_grad():
+            value = distribution.log_prob(theta[inside])
+        if value.shape != (int(inside.sum()),):
+            raise ValueError(
+                "expected one log density a row from a distribution over parameters; "
+                f"got shape {tuple(value.shape)} for {int(inside.sum())} rows; do wrap "
+                "it, as in torch.distributions.Independent(distribution, 1)"
+            )
+        result[inside] = value.double()
+    return result

@@ -1,0 +1,217 @@
+"""Old simulations for a new belief: importance weights over the rows of a bank."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation.bank.bank import Bank
+from sbi_active.simulation.bank.log_density import log_density
+from sbi_active.simulation.outcomes import Outcome, Simulations
+
+__all__ = ["ReusedRows", "reuse"]
+
+#: Below it an average over the rows has a standard error above a tenth of an sd.
+FEW = 100
+
+#: Nats by which a proposal may differ from the density noted for its own rows.
+TOLERANCE = 0.05
+
+
+@dataclass(frozen=True)
+class ReusedRows:
+    r"""Rows of a bank, weighted for a target.
+
+    Attributes:
+        bank: Where the rows are.
+        rows: Their positions, shape (k,), int64.
+        weights: Sum to one, shape (k,), float64.
+        denominator: "mixture" of all proposals, or each row's "own" proposal.
+        share: Of the weight, by label of the proposal.
+    """
+
+    bank: Bank
+    rows: Tensor
+    weights: Tensor
+    denominator: Literal["mixture", "own"]
+    share: dict[str, float]
+
+    @property
+    def effective_sample_size(self) -> float:
+        r"""Kish's effective sample size, :math:`(\sum w)^2 / \sum w^2`."""
+        return float(self.weights.sum() ** 2 / (self.weights**2).sum())
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def simulations(self) -> Simulations:
+        """Return the rows, in the order of the weights."""
+        return self.bank.read(self.rows)
+
+    def resample(self, num_rows: int, *, seed: int) -> Simulations:
+        """Return rows of equal weight, drawn by systematic resampling.
+
+        A row of large weight appears several times, so these are worth no more than
+        the effective sample size.
+
+        Args:
+            num_rows: Rows to return.
+            seed: Of the draw and the order.
+
+        References:
+            Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.
+        """
+        with forked_generators(seed, "resample"):
+            offset = torch.rand((), dtype=torch.float64)
+            order = torch.randperm(num_rows)
+        points = (torch.arange(num_rows, dtype=torch.float64) + offset) / num_rows
+        # The cumulative sum ends at one but for rounding.
+        chosen = torch.searchsorted(self.weights.cumsum(0), points)
+        return self.bank.read(self.rows[chosen.clamp(max=len(self) - 1)[order]])
+
+
+def reuse(
+    bank: Bank,
+    target: Distribution,
+    *,
+    action: Tensor | None = None,
+    proposals: Mapping[str, Distribution] | None = None,
+    same_actions: bool = False,
+) -> ReusedRows:
+    r"""Weight the rows of a bank so that their theta is distributed as a target.
+
+    With :math:`n_k` of n rows from proposal :math:`q_k`, the weights are those of the
+    deterministic mixture, or balance heuristic,
+
+    .. math::
+        w_i \propto p(\theta_i) \Big/ \sum_k \frac{n_k}{n} q_k(\theta_i),
+
+    where all proposals are given. Else only the density of each row's own proposal is
+    known, as it was noted in the bank, and
+
+    .. math::
+        w_i \propto p(\theta_i) / q_{k(i)}(\theta_i),
+
+    which is consistent only where *each* proposal covers the target, and of larger
+    variance. Neither can tell whether the proposals cover the target.
+
+    What is weighted is the law of theta *given an action*, as a posterior estimator of
+    q(theta | x, action) needs it. Proposals may have met with different actions, so by
+    default the mixture is taken anew among the rows of each action. Where every action
+    is another one, that amounts to the second formula: set ``same_actions``.
+
+    Invalid rows are part of the result, missing ones are not, nor are rows whose
+    proposal is not known.
+
+    Args:
+        bank: The rows.
+        target: A prior or belief, anything with ``log_prob``.
+        action: Only rows with this action, shape (action_dim,); None takes all.
+        proposals: By label, all of those in the bank that have one.
+        same_actions: Whether all proposals drew actions from one law, whatever theta.
+
+    Returns:
+        The weighted rows; a warning is given where they amount to less than 100.
+
+    Raises:
+        ValueError: If no row can be used, a proposal is not given, or one given is not
+            the one noted in the bank.
+
+    References:
+        Veach & Guibas, Optimally combining sampling techniques, SIGGRAPH 1995;
+        Elvira, Martino, Luengo & Bugallo, Generalized multiple importance sampling,
+        Statistical Science 2019 (their schemes N3 and N1).
+    """
+    column = bank.columns("theta", "action", "status", "label", "log_proposal")
+    usable = (column["status"] != Outcome.MISSING) & column["log_proposal"].isfinite()
+    if action is not None:
+        wanted = torch.as_tensor(action, dtype=torch.float32).reshape(1, -1)
+        usable &= torch.isclose(column["action"], wanted, rtol=1e-5, atol=1e-7).all(-1)
+    rows = usable.nonzero()[:, 0]
+    if not len(rows):
+        raise ValueError(
+            f"expected rows of a known proposal in {bank}; got none"
+            f"{'' if action is None else f' at action {action.tolist()}'}; do simulate "
+            "with store=bank.drawn_from(prior, label='prior')"
+        )
+    theta, label = column["theta"][rows], column["label"][rows]
+    log_own = column["log_proposal"][rows]
+    log_target = log_density(target, theta)
+    if proposals is None:
+        log_denominator = log_own
+    else:
+        log_densities = _log_densities(bank, proposals, theta, label, log_own)
+        strata = torch.zeros(len(rows), dtype=torch.int64)
+        if action is None and not same_actions:
+            strata = torch.unique(column["action"][rows], dim=0, return_inverse=True)[1]
+        log_denominator = _log_mixture(log_densities, label, strata)
+    log_weight = log_target - log_denominator
+    if not bool((log_weight > -torch.inf).any()):
+        raise ValueError(
+            f"expected rows within the support of the target; got {len(rows)} rows, all"
+            " of density 0; do simulate from the target"
+        )
+    weights = log_weight.softmax(0)
+    totals = {
+        name: float(weights[label == code].sum())
+        for code, name in enumerate(bank.labels)
+        if name
+    }
+    result = ReusedRows(
+        bank, rows, weights, "own" if proposals is None else "mixture", totals
+    )
+    if result.effective_sample_size < FEW:
+        warnings.warn(
+            f"{len(rows)} rows of the bank are worth {result.effective_sample_size:.1f}"
+            f" draws from the target, fewer than {FEW}: simulate more rows from it, "
+            + ("or give proposals=" if proposals is None else "or from nearer to it"),
+            stacklevel=2,
+        )
+    return result
+
+
+def _log_densities(
+    bank: Bank,
+    proposals: Mapping[str, Distribution],
+    theta: Tensor,
+    label: Tensor,
+    log_own: Tensor,
+) -> Tensor:
+    """Return the log density of every row under every label, shape (n, k)."""
+    present = {code: bank.labels[code] for code in label.unique().tolist()}
+    lacking = [name for name in present.values() if name not in proposals]
+    if lacking:
+        raise ValueError(
+            f"expected proposals for all labels in the bank, {[*present.values()]}; got"
+            f" none for {lacking}; do give them, or none at all for weights by each "
+            "row's own proposal"
+        )
+    result = torch.full((len(theta), len(bank.labels)), -torch.inf).double()
+    for code, name in present.items():
+        result[:, code] = log_density(proposals[name], theta)
+        own = label == code
+        gap = (result[own, code] - log_own[own]).abs().median()
+        if not gap <= TOLERANCE:
+            raise ValueError(
+                f"expected proposals[{name!r}] to be what its rows were drawn from; got"
+                f" log densities that differ by {gap:.3g} nats (median) from those in "
+                "the bank; do give the distribution that was passed to drawn_from"
+            )
+    return result
+
+
+def _log_mixture(log_densities: Tensor, label: Tensor, strata: Tensor) -> Tensor:
+    """Return log sum_k n_k / n q_k, counted within each stratum, shape (n,)."""
+    num_labels = log_densities.shape[1]
+    cell = strata * num_labels + label
+    size = (int(strata.max()) + 1) * num_labels
+    counts = torch.bincount(cell, minlength=size).reshape(-1, num_labels).double()
+    log_share = (counts / counts.sum(1, keepdim=True)).log()
+    return torch.logsumexp(log_densities + log_share[strata], dim=1)

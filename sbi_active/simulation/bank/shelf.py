@@ -1,0 +1,280 @@
+"""The segments of a bank in order: list, add, read, merge and check them.
+
+A segment is named after the numbers that it covers, ``00000004-00000009.h5`` being
+what 4 to 9 were merged into. One that is covered by another no longer counts, so a
+merger is complete when its result has its name, whatever dies thereafter.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sbi_active.simulation.bank.segments import (
+    CorruptSegmentError,
+    leftovers,
+    read_segment,
+    synchronize,
+    write_segment,
+)
+from sbi_active.simulation.outcomes import Outcome
+
+__all__ = ["Segment", "Shelf"]
+
+#: Bytes of a segment: what reading one row may cost in memory.
+SEGMENT_BYTES = 64 * 2**20
+
+#: Small segments that are merged by themselves.
+MANY = 64
+
+NAME = re.compile(r"(\d{8})-(\d{8})\.h5")
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A file of rows.
+
+    Attributes:
+        path: The file.
+        meta: Number of rows, counts by outcome, and the runs that rows belong to.
+        num_bytes: Size of the file.
+    """
+
+    path: Path
+    meta: dict[str, Any]
+    num_bytes: int
+
+    @property
+    def num_rows(self) -> int:
+        """Rows in the file."""
+        return self.meta["num_rows"]
+
+    @property
+    def runs(self) -> list[dict[str, Any]]:
+        """Digest, seed and label of each run; the column "run" is an index here."""
+        return self.meta["runs"]
+
+    def read(self, names: list[str] | None) -> dict[str, np.ndarray]:
+        """Return columns; None reads all."""
+        return read_segment(self.path, names)[0]
+
+
+class Shelf:
+    """Segments in a folder.
+
+    Args:
+        folder: Need not exist to be read as empty.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._meta: dict[tuple[str, int, int], dict[str, Any]] = {}
+        self._small = 0
+        self._last: tuple[Path | None, dict[str, np.ndarray]] = (None, {})
+
+    def segments(self) -> list[Segment]:
+        """Return the segments as they are on the disk now.
+
+        Raises:
+            CorruptSegmentError: If one cannot be read.
+        """
+        while True:
+            try:
+                return [self._open(path) for path in self._paths()]
+            except FileNotFoundError:  # merged while being listed
+                continue
+
+    def gather(
+        self, names: list[str], rows: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
+        """Return columns at positions; None takes all rows."""
+        while True:
+            try:
+                return self._gather(self.segments(), names, rows)
+            except FileNotFoundError:  # merged while being read
+                continue
+
+    def add(self, run: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
+        """Write rows of a run as new segments, in the order given."""
+        row_bytes = sum(column.nbytes for column in columns.values())
+        row_bytes /= max(len(columns["index"]), 1)
+        size = max(1, int(SEGMENT_BYTES / row_bytes))
+        for start in range(0, len(columns["index"]), size):
+            part = {name: c[start : start + size] for name, c in columns.items()}
+            part["run"] = np.zeros(len(part["index"]), np.int32)
+            number = max((_numbers(path)[1] for path in self._paths()), default=0) + 1
+            self._write(number, number, part, [run])
+            self._small += 1
+        if self._small > MANY:
+            self.compact()
+
+    def compact(self) -> None:
+        """Merge neighbors up to the size of a segment; a corrupt one is left alone."""
+        group: list[Path] = []
+        size = 0
+        for path in self._paths():
+            added = path.stat().st_size
+            if size + added > SEGMENT_BYTES or not self._sound(path):
+                self._merge(group)
+                group, size = [], 0
+            if self._sound(path) and added <= SEGMENT_BYTES / 2:
+                group.append(path)
+                size += added
+        self._merge(group)
+        self._small = 0
+
+    def clean(self) -> None:
+        """Remove what a writer that died left; for the writer alone."""
+        paths = {*self._paths()}
+        for path in [*leftovers(self._folder), *leftovers(self._folder.parent)]:
+            path.unlink(missing_ok=True)
+        for path in {*self._list()} - paths:
+            path.unlink()
+        self._small = sum(p.stat().st_size <= SEGMENT_BYTES / 2 for p in paths)
+
+    def verify(self) -> list[str]:
+        """Return what is wrong, one line each."""
+        problems, expected = [], 1
+        for path in self._paths():
+            first, last = _numbers(path)
+            if first != expected:
+                problems.append(
+                    f"{self._folder}: segments {expected} to {first - 1} are not there"
+                )
+            expected = last + 1
+            try:
+                read_segment(path, None)
+            except CorruptSegmentError as error:
+                problems.append(f"{path}: {error.reason}")
+        return problems
+
+    def _paths(self) -> list[Path]:
+        """Return the files that count, in order."""
+        found = self._list()
+        # A file that is renamed while a folder is listed may not be seen, and what it
+        # was merged from may be gone already.
+        while (again := self._list()) != found:
+            found = again
+        # The widest of those that begin at one number comes first.
+        found.sort(key=lambda path: (_numbers(path)[0], -_numbers(path)[1]))
+        paths, covered = [], 0
+        for path in found:
+            if _numbers(path)[1] > covered:
+                paths.append(path)
+                covered = _numbers(path)[1]
+        return paths
+
+    def _list(self) -> list[Path]:
+        paths = self._folder.glob("*.h5")
+        return sorted(path for path in paths if NAME.fullmatch(path.name))
+
+    def _open(self, path: Path) -> Segment:
+        state = path.stat()
+        key = (path.name, state.st_mtime_ns, state.st_size)
+        if key not in self._meta:
+            self._meta[key] = read_segment(path, [])[1]
+        return Segment(path, self._meta[key], state.st_size)
+
+    def _sound(self, path: Path) -> bool:
+        try:
+            self._open(path)
+        except CorruptSegmentError:
+            return False
+        return True
+
+    def _gather(
+        self, segments: list[Segment], names: list[str], rows: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
+        total = sum(segment.num_rows for segment in segments)
+        rows = np.arange(total) if rows is None else rows
+        result: dict[str, np.ndarray] = {}
+        codes: dict[str, int] = {}
+        order = np.argsort(rows, kind="stable")
+        ordered = rows[order]
+        start = 0
+        for segment in segments:
+            stop = start + segment.num_rows
+            for run in segment.runs:
+                codes.setdefault(run["label"], len(codes))
+            here = order[slice(*np.searchsorted(ordered, [start, stop]))]
+            if len(here) or not result:
+                columns = self._columns(segment, names, codes)
+                for name, column in columns.items():
+                    if name not in result:
+                        shape = (len(rows), *column.shape[1:])
+                        result[name] = np.empty(shape, column.dtype)
+                    result[name][here] = column[rows[here] - start]
+            start = stop
+        if not result:
+            raise ValueError(
+                f"expected rows in {self._folder.parent}; got none; do simulate into "
+                "it first"
+            )
+        return result
+
+    def _columns(
+        self, segment: Segment, names: list[str], codes: dict[str, int]
+    ) -> dict[str, np.ndarray]:
+        stored = ["run" if name in ("seed", "label") else name for name in names]
+        if self._last[0] != segment.path or not {*stored} <= self._last[1].keys():
+            self._last = (segment.path, segment.read([*dict.fromkeys(stored)]))
+        columns = self._last[1]
+        of_run = {
+            "seed": [run["seed"] for run in segment.runs],
+            "label": [codes[run["label"]] for run in segment.runs],
+        }
+        return {
+            name: np.array(of_run[name], np.int64)[columns["run"]]
+            if name in of_run
+            else columns[name]
+            for name in names
+        }
+
+    def _merge(self, paths: list[Path]) -> None:
+        if len(paths) < 2:
+            return
+        try:
+            parts = [read_segment(path, None) for path in paths]
+        except CorruptSegmentError:  # found only now: leave all for verify() to name
+            return
+        runs: dict[str, dict[str, Any]] = {}
+        for columns, meta in parts:
+            for run in meta["runs"]:
+                runs.setdefault(f"{run['digest']} {run['label']}", run)
+            keys = [*runs]
+            own = [keys.index(f"{r['digest']} {r['label']}") for r in meta["runs"]]
+            columns["run"] = np.array(own, np.int32)[columns["run"]]
+        merged = {
+            name: np.concatenate([columns[name] for columns, _ in parts])
+            for name in parts[0][0]
+        }
+        first, last = _numbers(paths[0])[0], _numbers(paths[-1])[1]
+        self._write(first, last, merged, [*runs.values()])
+        for path in paths:
+            path.unlink()
+        synchronize(self._folder)
+
+    def _write(
+        self,
+        first: int,
+        last: int,
+        columns: dict[str, np.ndarray],
+        runs: list[dict[str, Any]],
+    ) -> None:
+        meta = {
+            "num_rows": len(columns["index"]),
+            "counts": [int((columns["status"] == o).sum()) for o in Outcome],
+            "runs": runs,
+        }
+        path = self._folder / f"{first:08d}-{last:08d}.h5"
+        write_segment(path, columns, meta)
+
+
+def _numbers(path: Path) -> tuple[int, int]:
+    match = NAME.match(path.name)
+    assert match is not None
+    return int(match[1]), int(match[2])

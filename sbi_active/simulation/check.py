@@ -1,0 +1,338 @@
+"""Look a simulator over before a campaign spends hours on it."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.simulation.engine import simulate
+from sbi_active.simulation.model import SimulatorModel, takes_seeds
+from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
+from sbi_active.simulation.simulator import outcome_tensor, require_noise
+from sbi_active.simulation.simulator_report import SimulatorReport
+
+__all__ = ["SimulatorReport", "check_simulator"]
+
+MIN_ROWS = 16
+RUNS = 6  # of all rows, beside one a parameter and one an entry of the action
+ROUNDING = 1e-5  # relative difference between batches that mixes no rows
+MANY = 0.5  # share of rows without a measurement that is worth a word
+
+
+def check_simulator(
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    actions: ActionSpace,
+    *,
+    num_rows: int = 256,
+    max_seconds: float = 60.0,
+    num_simulations: int | None = None,
+    num_workers: int = 1,
+    seed: int = 0,
+) -> SimulatorReport:
+    """Run a simulator over draws of the prior and say what a campaign would meet.
+
+    A defect keeps a campaign from working: the simulator raises, gives rows of another
+    number or shape, is deterministic, has no measurement at all, mixes its rows, or
+    depends on no parameter. Everything else is a warning.
+
+    Args:
+        simulator: ``simulator(theta, action)``, see
+            :class:`~sbi_active.simulation.Simulator`.
+        prior: Over the parameters.
+        actions: What the robot may do; the values of a discrete space are all run.
+        num_rows: Rows a check, at least 16.
+        max_seconds: Of simulation time; a slow simulator gets fewer rows, 16 at least.
+        num_simulations: That the campaign needs, for :attr:`SimulatorReport.minutes`.
+        num_workers: That share them.
+        seed: Of the draws.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> from sbi_active import DiscreteActions
+        >>> report = check_simulator(
+        ...     lambda theta, action: theta[:, :1] * action,
+        ...     BoxUniform(torch.zeros(2), torch.ones(2)), DiscreteActions([1.0, 2.0]),
+        ... )
+        >>> report.is_ready, report.is_deterministic, report.idle_parameters
+        (False, True, ('theta_2',))
+    """
+    run = _Runs(simulator, prior, actions, seed)
+    theta, action = run.draw(MIN_ROWS)
+    report = SimulatorReport(
+        takes_seeds=takes_seeds(simulator),
+        num_simulations=num_simulations,
+        num_workers=num_workers,
+    )
+    try:
+        report = _look(run, theta, action, report)
+    except Exception as error:  # whatever the user's code raises is the finding
+        try:
+            report = _look_by_rows(run, theta, action, report)
+        except (SimulationError, ValueError):
+            return replace(report, defects=(_told(error),))
+    if report.defects:
+        return report
+    assert report.seconds_batch is not None
+    num_runs = RUNS + theta.shape[1] + action.shape[1]
+    affordable = max_seconds / num_runs / (report.seconds_batch / MIN_ROWS + 1e-9)
+    report = replace(report, num_rows=max(MIN_ROWS, min(num_rows, int(affordable))))
+    theta, action = run.draw(report.num_rows)
+    try:
+        return _compare(run, theta, action, report)
+    except SimulationError as error:
+        return replace(report, defects=(_told(error),))
+
+
+class _Runs:
+    """Draws and runs that share their seeds."""
+
+    def __init__(
+        self,
+        simulator: Callable[..., Any],
+        prior: Distribution,
+        actions: ActionSpace,
+        seed: int,
+    ) -> None:
+        self.simulator, self.prior = simulator, prior
+        self.actions, self.seed = actions, seed
+
+    def draw(self, num: int, key: str = "draw") -> tuple[Tensor, Tensor]:
+        """Return parameters and actions; those of a discrete space equally often."""
+        with forked_generators(self.seed, key, "theta"):
+            theta = self.prior.sample((num,)).float()
+        values = getattr(self.actions, "values", None)
+        if values is None:
+            seed = derive_seed(self.seed, key, "action")
+            return theta, self.actions.sample((num,), seed=seed)
+        with forked_generators(self.seed, key, "action"):
+            order = torch.randperm(len(values))
+        return theta, values[order[torch.arange(num) % len(values)]]
+
+    def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Any:
+        """Call the simulator as it is, whatever it returns."""
+        taken = takes_seeds(self.simulator)
+        if isinstance(self.simulator, SimulatorModel) or taken:
+            with forked_generators(self.seed, "call"):
+                return self.simulator(theta, action, seeds=seeds)
+        with forked_generators(self.seed, "call"):
+            return self.simulator(theta, action)
+
+    def simulate(self, theta: Tensor, action: Tensor, key: str = "x") -> Any:
+        """Return simulations, what raises being missing."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)
+            seed = derive_seed(self.seed, key)
+            return simulate(self.simulator, theta, action, seed=seed)
+
+
+def _look(
+    run: _Runs, theta: Tensor, action: Tensor, report: SimulatorReport
+) -> SimulatorReport:
+    """Call it with several rows and with one; raises what it raises."""
+    seeds = row_seeds(run.seed, len(theta))
+    outcome_tensor(run.call(theta, action, seeds), len(theta))  # the first may load
+    start = time.perf_counter()
+    raw = run.call(theta, action, seeds)
+    middle = time.perf_counter()
+    single = outcome_tensor(run.call(theta[:1], action[:1], seeds[:1]), 1)
+    end = time.perf_counter()
+    x = outcome_tensor(raw, len(theta))
+    if single.shape[1:] != x.shape[1:]:
+        text = (
+            f"expected x of one shape; got {tuple(x.shape[1:])} a row from "
+            f"{len(theta)} rows and {tuple(single.shape[1:])} from one; do keep the "
+            "rows' axis for a single row"
+        )
+        return replace(report, defects=(text,))
+    dtype = str(getattr(raw, "dtype", type(raw).__name__))
+    output = dtype if isinstance(raw, Tensor) else f"{type(raw).__module__}.{dtype}"
+    return replace(
+        report,
+        num_rows=len(theta),
+        x_shape=tuple(x.shape[1:]),
+        output=output,
+        seconds_batch=middle - start,
+        seconds_row=end - middle,
+    )
+
+
+def _look_by_rows(
+    run: _Runs, theta: Tensor, action: Tensor, report: SimulatorReport
+) -> SimulatorReport:
+    """Simulate so that only the rows are lost that raise; raises where all do."""
+    start = time.perf_counter()
+    x = run.simulate(theta, action).x
+    seconds = time.perf_counter() - start
+    return replace(
+        report,
+        num_rows=len(theta),
+        x_shape=tuple(x.shape[1:]),
+        output=f"{x.dtype} after conversion",
+        seconds_batch=seconds,
+        seconds_row=seconds / len(theta),
+    )
+
+
+def _told(error: Exception) -> str:
+    text = str(error)
+    return text if text.startswith("expected ") else f"{type(error).__name__}: {text}"
+
+
+def _compare(
+    run: _Runs, theta: Tensor, action: Tensor, report: SimulatorReport
+) -> SimulatorReport:
+    """Run all rows under the same and other seeds, parameters and actions."""
+    seeds = row_seeds(derive_seed(run.seed, "x"), len(theta))
+    start = time.perf_counter()
+    rows = run.simulate(theta, action)
+    seconds = time.perf_counter() - start
+    again, other = run.simulate(theta, action), run.simulate(theta, action, "other")
+    reproducible = _same(rows.x, again.x)
+    independent = None
+    if report.takes_seeds and rows.counts["missing"] == 0:
+        order = torch.arange(len(theta)).flip(0)
+        x = outcome_tensor(run.call(theta, action, seeds), len(theta))
+        permuted = run.call(theta[order], action[order], seeds[order])
+        permuted = outcome_tensor(permuted, len(theta))
+        independent = _close(permuted, x[order])
+    report = replace(
+        report,
+        seconds_batch=seconds,
+        counts=rows.counts,
+        lost_by_action=_lost(action, rows.status != Outcome.OK),
+        is_reproducible=reproducible,
+        is_deterministic=_identical(rows.x, other.x),
+        noiseless=_noiseless(rows.x, other.x),
+        rows_are_independent=independent,
+    )
+    if reproducible:
+        fresh = run.draw(len(theta), "fresh")
+        report = replace(
+            report,
+            idle_parameters=_idle(run, rows.x, (theta, action), 0, fresh[0]),
+            idle_actions=_idle(run, rows.x, (theta, action), 1, fresh[1]),
+        )
+    return _judge(run, report, theta, action, rows)
+
+
+def _idle(
+    run: _Runs, x: Tensor, drawn: tuple[Tensor, Tensor], which: int, fresh: Tensor
+) -> tuple[str, ...]:
+    """Return names of columns of theta (0) or action (1) that change nothing."""
+    names = _names(run, which, fresh.shape[1])
+    idle = []
+    for column, name in enumerate(names):
+        changed = list(drawn)
+        changed[which] = drawn[which].clone()
+        changed[which][:, column] = fresh[:, column]
+        if torch.equal(changed[which], drawn[which]):  # a single action
+            continue
+        if _same(run.simulate(changed[0], changed[1]).x, x):
+            idle.append(name)
+    return tuple(idle)
+
+
+def _names(run: _Runs, which: int, num: int) -> Sequence[str]:
+    if which == 1:
+        return run.actions.names
+    names = getattr(run.simulator, "parameter_names", None)
+    return [f"theta_{i + 1}" for i in range(num)] if names is None else names
+
+
+def _judge(
+    run: _Runs, report: SimulatorReport, theta: Tensor, action: Tensor, rows: Any
+) -> SimulatorReport:
+    """Add defects and warnings."""
+    defects, notes = [], []
+    lost = len(theta) - report.counts["ok"]
+    if lost == len(theta):
+        defects.append("no row has a measurement")
+    elif lost > MANY * len(theta):
+        notes.append(f"{lost / len(theta):.0%} of the rows have no measurement")
+    if report.counts["missing"]:
+        text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
+        notes.append(
+            f"{report.counts['missing']} rows raise, the first "
+            f"{text[-1] if text else 'without a word'}; their outcome is missing; do "
+            "return NaN where the system gave no measurement"
+        )
+    if report.is_deterministic:
+        try:
+            require_noise(rows.x, rows.x)
+        except ValueError as error:
+            defects.append(str(error))
+    model = run.simulator
+    declared = isinstance(model, SimulatorModel) and model.noise is not None
+    sound = report.counts["missing"] == 0
+    if declared and sound and not model.is_deterministic(theta, action):
+        notes.append(
+            "fn is random beside declared noise, which so counts twice; do declare "
+            "noise=None, or remove the random numbers from fn"
+        )
+    if report.noiseless:
+        notes.append(
+            f"numbers {', '.join(map(str, report.noiseless))} of x have no noise, and "
+            "so no density; do declare the noise of every channel"
+        )
+    if report.rows_are_independent is False:
+        defects.append(
+            "rows permuted with their seeds do not give permuted x; do let row i "
+            "depend on theta[i], action[i] and seeds[i] alone"
+        )
+    if not report.is_reproducible:
+        notes.append(
+            "one seed gives two different x, so that no run can be repeated; do take "
+            "seeds, or draw from torch's or NumPy's global generator"
+        )
+    if len(report.idle_parameters) == theta.shape[1]:
+        defects.append("no parameter changes x")
+    elif report.idle_parameters:
+        notes.append(f"changing {', '.join(report.idle_parameters)} leaves x as it is")
+    if report.idle_actions:
+        notes.append(f"changing {', '.join(report.idle_actions)} leaves x as it is")
+    return replace(report, defects=tuple(defects), warnings=tuple(notes))
+
+
+def _lost(action: Tensor, lost: Tensor) -> tuple[tuple[tuple[float, ...], float], ...]:
+    """Return the share of lost rows by action, largest first."""
+    distinct, inverse = torch.unique(action, dim=0, return_inverse=True)
+    if len(distinct) > len(action) / 2:  # a continuous space: too few rows an action
+        return ()
+    share = torch.zeros(len(distinct)).index_add_(0, inverse, lost.float())
+    share /= torch.bincount(inverse)
+    order = share.argsort(descending=True, stable=True)
+    order = order[share[order] > 0]
+    return tuple((tuple(distinct[i].tolist()), float(share[i])) for i in order)
+
+
+def _same(x: Tensor, other: Tensor) -> bool:
+    return bool(((x == other) | (x.isnan() & other.isnan())).all())
+
+
+def _close(x: Tensor, other: Tensor) -> bool:
+    near = torch.isclose(x, other, rtol=ROUNDING, atol=ROUNDING * float(x.std()) * 0.1)
+    return bool((near | (x == other) | (x.isnan() & other.isnan())).all())
+
+
+def _identical(x: Tensor, other: Tensor) -> bool:
+    """Return whether all numbers that both have are equal, and there are some."""
+    both = x.isfinite() & other.isfinite()
+    return bool(both.any()) and bool((x[both] == other[both]).all())
+
+
+def _noiseless(x: Tensor, other: Tensor) -> tuple[int, ...]:
+    """Return numbers of x that the seed leaves alone while it changes others."""
+    x, other = x.flatten(1), other.flatten(1)
+    both = x.isfinite() & other.isfinite()
+    silent = ((x == other) | ~both).all(0) & both.any(0)
+    return () if bool(silent.all()) else tuple(torch.nonzero(silent)[:, 0].tolist())

@@ -1,0 +1,108 @@
+"""What was seen of a simulator before a campaign."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["SimulatorReport"]
+
+LINES = 10  # of actions without a measurement
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorReport:
+    """What was seen of a simulator; print it.
+
+    Attributes:
+        num_rows: Rows that each check simulated.
+        x_shape: Of one outcome; None where there was none.
+        output: Type of the simulator's output, "torch.float32".
+        takes_seeds: Whether it is given one seed a row.
+        is_deterministic: Whether two seeds gave identical x.
+        is_reproducible: Whether one seed gave the same x twice.
+        rows_are_independent: Whether rows permuted with their seeds give permuted x;
+            None for a simulator without seeds.
+        counts: Rows by outcome.
+        lost_by_action: Actions and the share of their rows without a measurement,
+            largest first, where any were lost.
+        idle_parameters: Parameters that change nothing.
+        idle_actions: Entries of the action that change nothing.
+        seconds_batch: Time of ``num_rows`` rows at once.
+        seconds_row: Time of a call with one row.
+        num_simulations: That a campaign needs.
+        num_workers: That share them.
+        noiseless: Numbers of x, flattened, that two seeds leave as they are while
+            others change.
+        defects: What keeps a campaign from working.
+        warnings: What deserves a look.
+    """
+
+    num_rows: int = 0
+    x_shape: tuple[int, ...] | None = None
+    output: str = ""
+    takes_seeds: bool = False
+    is_deterministic: bool | None = None
+    is_reproducible: bool | None = None
+    rows_are_independent: bool | None = None
+    counts: dict[str, int] = field(default_factory=dict)
+    lost_by_action: tuple[tuple[tuple[float, ...], float], ...] = ()
+    idle_parameters: tuple[str, ...] = ()
+    idle_actions: tuple[str, ...] = ()
+    seconds_batch: float | None = None
+    seconds_row: float | None = None
+    num_simulations: int | None = None
+    num_workers: int = 1
+    noiseless: tuple[int, ...] = ()
+    defects: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether nothing was found that keeps a campaign from working."""
+        return not self.defects
+
+    @property
+    def minutes(self) -> float | None:
+        """Simulation time of a campaign, shared evenly by the workers."""
+        if self.seconds_batch is None or self.num_simulations is None:
+            return None
+        seconds = self.num_simulations * self.seconds_batch / self.num_rows
+        return seconds / self.num_workers / 60
+
+    def __str__(self) -> str:
+        lines = []
+        if self.x_shape is not None:
+            seeds = "one a row" if self.takes_seeds else "none taken, blocks of 256"
+            lines += [
+                f"x: shape (n, {', '.join(map(str, self.x_shape))}), {self.output}",
+                f"seeds: {seeds}",
+            ]
+        if self.counts:
+            counts = ", ".join(f"{n} {name}" for name, n in self.counts.items())
+            lines.append(f"rows: {counts}")
+        for action, share in self.lost_by_action[:LINES]:
+            text = ", ".join(f"{a:g}" for a in action)
+            lines.append(f"  action {text}: {share:.0%} without a measurement")
+        if len(self.lost_by_action) > LINES:
+            lines.append(f"  and {len(self.lost_by_action) - LINES} actions more")
+        if self.seconds_batch is not None and self.seconds_row is not None:
+            lines.append(
+                f"time: {1e3 * self.seconds_batch:.3g} ms for {self.num_rows} rows at "
+                f"once, {1e3 * self.seconds_row:.3g} ms for one"
+            )
+        if self.minutes is not None:
+            workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}"
+            lines.append(
+                f"campaign: at most {self.num_simulations:,} simulations, about "
+                f"{_duration(self.minutes)} on {workers}"
+            )
+        lines += [f"warning: {text}" for text in self.warnings]
+        lines += [f"defect: {text}" for text in self.defects]
+        lines.append("ready" if self.is_ready else "not ready")
+        return "\n".join(lines)
+
+
+def _duration(minutes: float) -> str:
+    if minutes < 1:
+        return f"{60 * minutes:.2g} seconds"
+    return f"{minutes:.0f} minutes" if minutes < 120 else f"{minutes / 60:.1f} hours"

@@ -1,0 +1,118 @@
+"""Kills processes that simulate into a bank, and says what was left of it.
+
+Run as ``killed_writer.py FOLDER NUM_MOMENTS SEED NUM_WORKERS``; one line of JSON a
+moment. Worker processes take their time to start, so that with more than one the
+moments are counted from the first report.
+"""
+
+import json
+import os
+import random
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from sbi_active import Bank, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation.bank import shelf
+from sbi_active.simulation.store import Recorder
+
+#: An outcome of 80 kB, so that writing takes most of the time.
+ROWS, BATCH, NUMBERS = 480, 16, 20_000
+
+
+def simulator(theta, action, seeds):
+    return (theta[:, :1] * action + row_normals(seeds, 1).float()).expand(-1, NUMBERS)
+
+
+class Reporting:
+    """Says which rows are stored, once the bank says so."""
+
+    def __init__(self, bank, pipe):
+        self.bank, self.pipe = bank, pipe
+
+    def load(self, run):
+        return self.bank.load(run)
+
+    def save(self, run, *, index, **rows):
+        self.bank.save(run, index=index, **rows)
+        os.write(self.pipe, (json.dumps([run, index.tolist()]) + "\n").encode())
+
+
+def run(store=None, num_workers=1):
+    generator = torch.Generator().manual_seed(0)
+    theta = torch.rand(ROWS, 2, generator=generator)
+    action = torch.rand(ROWS, 1, generator=generator)
+    return simulate(
+        simulator,
+        theta,
+        action,
+        seed=7,
+        num_workers=num_workers,
+        batch_size=BATCH,
+        store=store,
+    )
+
+
+def kill_after(seconds, path, num_workers):
+    """Return what a process had reported as stored when it was killed."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read)
+        bank = Bank(path, simulator=simulator)
+        run(Reporting(bank, write), num_workers)
+        os._exit(0)
+    os.close(write)
+    if num_workers > 1:
+        select.select([read], [], [])
+    time.sleep(seconds)
+    os.kill(child, signal.SIGKILL)
+    status = os.waitpid(child, 0)[1]
+    with os.fdopen(read) as pipe:
+        lines = [line for line in pipe.read().splitlines(keepends=True) if line[-1:]]
+    reported = [json.loads(line) for line in lines if line.endswith("\n")]
+    return reported, os.WIFSIGNALED(status)
+
+
+def main(folder, num_moments, seed, num_workers):
+    torch.set_num_threads(1)
+    Recorder.INTERVAL = 0.0  # a segment a batch: more writing than simulating
+    shelf.MANY = 8  # and mergers all the time
+    expected = run()
+    start = time.perf_counter()
+    with Bank(folder / "whole", simulator=simulator) as bank:
+        run(bank)
+    duration = time.perf_counter() - start
+    moments = random.Random(seed)
+    for moment in range(num_moments):
+        path = folder / str(moment)
+        reported, was_killed = kill_after(
+            moments.uniform(0, duration), path, num_workers
+        )
+        names = [f.name for f in path.glob("segments/*")]
+        record = {
+            "killed": was_killed,
+            "reported": sum(len(index) for _, index in reported),
+            "half_written": sum(name.startswith(".") for name in names),
+        }
+        with Bank(path, simulator=simulator) as bank:
+            record["problems"] = bank.verify()
+            stored = bank.load(reported[0][0]) if reported else None
+            index = torch.tensor([i for _, part in reported for i in part])
+            if stored is not None:
+                where = {int(i): k for k, i in enumerate(stored[0])}
+                record["lost"] = sum(int(i) not in where for i in index)
+                record["same"] = torch.equal(stored[1], expected.x[stored[0]])
+            record["resumed"] = torch.equal(run(bank).x, expected.x)
+            record["rows"] = len(bank)
+            record["problems"] += bank.verify()
+        print(json.dumps(record), flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))

@@ -1,0 +1,322 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import traceback
+
+import pytest
+import torch
+
+from sbi_active import Bank, GaussianNoise, Simulations, SimulatorModel, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation.bank import LockedError, shelf
+
+
+def simulator(theta, action, seeds):
+    x = theta[:, :1] * action + row_normals(seeds, 3).float()
+    return torch.where(theta[:, :1] > 0.1, x, torch.nan)  # a tenth is invalid
+
+
+def draw(num_rows):
+    return torch.rand(num_rows, 2), torch.rand(num_rows, 1)
+
+
+@pytest.fixture
+def bank(tmp_path):
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        yield bank
+
+
+def same(a, b):
+    return all(
+        torch.equal(x.nan_to_num(nan=-99.0), y.nan_to_num(nan=-99.0))
+        for x, y in [(a.theta, b.theta), (a.action, b.action), (a.x, b.x)]
+    ) and torch.equal(a.status, b.status)
+
+
+def test_rows_come_back_as_they_went_in(bank):
+    theta, action = draw(500)
+    stored = simulate(simulator, theta, action, seed=3, store=bank)
+    reader = Bank(bank.path)
+    assert same(reader.read(), simulate(simulator, theta, action, seed=3))
+    assert len(reader) == 500
+    assert reader.counts == stored.counts
+    assert 20 < reader.counts["invalid"] < 80
+    column = reader.columns("index", "seed", "log_proposal", "log_action")
+    assert column["index"].tolist() == list(range(500))
+    assert (column["seed"] == 3).all()
+    assert column["log_proposal"].isnan().all()
+    assert reader.header["shapes"] == {"theta": [2], "action": [1], "x": [3]}
+    assert reader.verify() == []
+
+
+def test_what_is_stored_is_not_simulated_again(tmp_path):
+    calls = []
+
+    def counted(theta, action, seeds):
+        calls.append(len(theta))
+        return simulator(theta, action, seeds)
+
+    theta, action = draw(300)
+    with Bank(tmp_path / "bank", simulator=counted, version="1") as bank:
+        first = simulate(counted, theta, action, seed=0, store=bank)
+    del calls[:]
+    with Bank(tmp_path / "bank", simulator=counted, version="1") as bank:
+        assert same(simulate(counted, theta, action, seed=0, store=bank), first)
+        assert not calls
+        assert len(bank) == 300
+        simulate(counted, theta, action, seed=1, store=bank)
+        assert len(bank) == 600
+        assert sum(calls) == 300
+
+
+def test_part_of_a_run_is_completed(bank):
+    theta, action = draw(300)
+    whole = simulate(simulator, theta, action, seed=0)
+    with_store = simulate(simulator, theta, action, seed=0, store=bank)
+    run = bank._shelf.segments()[0].runs[0]["digest"]
+    other = Bank(bank.path.parent / "other", simulator=simulator)
+    some = torch.arange(0, 300, 7)
+    rows = {k: getattr(whole, k)[some] for k in ("theta", "action", "x", "status")}
+    other.save(run, index=some, **rows, seed=0)
+    assert same(simulate(simulator, theta, action, seed=0, store=other), with_store)
+    assert len(other) == 300
+    assert sorted(other.load(run)[0].tolist()) == list(range(300))
+
+
+def test_same_rows_are_stored_once(bank):
+    rows = simulate(simulator, *draw(50), seed=0)
+    assert bank.append(rows, seed=0) == 50
+    assert bank.append(rows, seed=0) == 0
+    assert bank.append(rows, seed=1) == 50
+    simulate(simulator, rows.theta, rows.action, seed=0, store=bank)
+    assert len(bank) == 100
+
+
+def test_rows_by_position_slice_and_mask(bank, monkeypatch):
+    monkeypatch.setattr(shelf, "SEGMENT_BYTES", 60 * 60)  # about 60 rows a segment
+    rows = simulate(simulator, *draw(200), seed=0)
+    bank.append(rows, seed=0)
+    assert len(bank._shelf.segments()) > 2
+    some = torch.tensor([199, 3, 3, 70])
+    assert torch.equal(bank.read(some).theta, rows.theta[some])
+    assert torch.equal(bank.read(slice(50, 150)).theta, rows.theta[50:150])
+    mask = rows.theta[:, 0] > 0.5
+    assert torch.equal(bank.read(mask).theta, rows.theta[mask])
+    assert len(bank.read(slice(0, 0))) == 0
+    chunks = [*bank.chunks(33)]
+    assert max(map(len, chunks)) == 33
+    assert torch.equal(torch.cat([c.theta for c in chunks]), rows.theta)
+    for bad in ([200], [-1], [0.5]):
+        with pytest.raises(ValueError, match=r"positions of rows within \[0, 200\)"):
+            bank.read(bad)
+
+
+@pytest.mark.slow
+def test_memory_is_bounded_by_a_segment(tmp_path):
+    code = """
+        import resource, sys, torch
+        from sbi_active import Bank, Simulations
+
+        def simulator(theta, action):
+            return theta
+
+        rows = 2_000
+        with Bank(sys.argv[1], simulator=simulator) as bank:
+            for seed in range(10):
+                theta = torch.full((rows, 1), float(seed))
+                x = torch.full((rows, 5_000), float(seed))  # 40 MB
+                bank.append(Simulations(theta, theta, x), seed=seed)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        total = 0.0
+        for chunk in Bank(sys.argv[1]).chunks(1_000):
+            total += float(chunk.x.double().mean())
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        print(total, bank.num_bytes / 2**20, (after - before) / 2**10)
+    """
+    total, size, growth = map(float, _run(code, tmp_path / "bank").split())
+    assert total == pytest.approx(2 * sum(range(10)))
+    assert size > 380  # MiB
+    assert growth < 130
+
+
+def test_small_segments_are_merged_and_rows_keep_their_places(bank):
+    for seed in range(70):
+        theta, action = draw(4)
+        simulate(simulator, theta, action, seed=seed, store=bank)
+        if seed == 59:
+            before = bank.read()
+            reader = Bank(bank.path)
+            assert len(reader) == 240
+    assert len(bank._shelf.segments()) < 10
+    assert same(reader.read(torch.arange(240)), before)
+    bank.compact()
+    assert len(bank._shelf.segments()) == 1
+    assert bank.columns("seed")["seed"].tolist() == [
+        s for s in range(70) for _ in "abcd"
+    ]
+    assert len(bank.load(bank._shelf.segments()[0].runs[5]["digest"])[0]) == 4
+    assert bank.verify() == []
+
+
+def test_a_merger_that_was_cut_short_changes_nothing(bank, monkeypatch):
+    for seed in range(5):
+        simulate(simulator, *draw(4), seed=seed, store=bank)
+    before = bank.read()
+
+    def die(path):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(bank.path), "unlink", die)
+        with pytest.raises(KeyboardInterrupt):
+            bank.compact()
+    assert len([*(bank.path / "segments").glob("*.h5")]) == 6
+    assert same(Bank(bank.path).read(), before)
+    (bank.path / "segments" / ".writing-1-00000009-00000009.h5").write_bytes(b"half")
+    bank.close()
+    with Bank(bank.path, simulator=simulator) as again:
+        simulate(simulator, *draw(4), seed=9, store=again)
+        assert same(again.read(slice(0, 20)), before)
+    assert sorted(p.name for p in (bank.path / "segments").iterdir()) == [
+        "00000001-00000005.h5",
+        "00000006-00000006.h5",
+    ]
+
+
+def test_second_writer_is_told_who_writes_and_readers_go_on(bank):
+    simulate(simulator, *draw(10), seed=0, store=bank)
+    second = Bank(bank.path, simulator=simulator)
+    with pytest.raises(LockedError, match=r"got process \d+ \(this one\)"):
+        second.compact()
+    assert len(Bank(bank.path).read()) == 10
+    bank.close()
+    second.compact()
+    second.close()
+
+
+def test_readers_go_on_while_another_process_writes_and_merges(bank, monkeypatch):
+    monkeypatch.setattr(shelf, "MANY", 3)
+
+    def write():
+        own = Bank(bank.path, simulator=simulator)
+        for seed in range(60):
+            theta = torch.full((10, 1), float(seed))
+            own.append(Simulations(theta, theta, theta), seed=seed)
+
+    lengths = []
+    with forked(write) as is_running:
+        while is_running():
+            reader = Bank(bank.path)
+            lengths.append(len(reader))
+            rows = slice(0, lengths[-1])
+            if lengths[-1]:
+                expected = torch.arange(lengths[-1] // 10).repeat_interleave(10)
+                assert torch.equal(reader.read(rows).x[:, 0], expected.float())
+            time.sleep(0.002)  # the writer needs the disk too
+    assert lengths == sorted(lengths)
+    assert len({*lengths}) > 5  # the reader did see the bank grow
+    assert len(bank) == 600
+
+
+def test_shapes_set_by_another_writer_hold(bank):
+    late = Bank(bank.path, simulator=simulator)
+    bank.append(Simulations(*draw(3), torch.rand(3, 3)), seed=0)
+    bank.close()
+    with late, pytest.raises(ValueError, match=r"'x': \[3\]}, as in the bank"):
+        late.append(Simulations(*draw(3), torch.rand(3, 4)), seed=1)
+
+
+def test_the_lock_goes_with_its_process(bank):
+    def hold():
+        own = Bank(bank.path, simulator=simulator)
+        own.compact()
+        time.sleep(60)
+
+    with forked(hold) as is_running:
+        while not (bank.path / "writer.json").exists():
+            assert is_running()
+        other = Bank(bank.path, simulator=simulator)
+        text = f"got process {is_running.pid} on"
+        with pytest.raises(LockedError, match=text) as raised:
+            other.compact()
+        assert raised.value.pid == is_running.pid
+        os.kill(is_running.pid, signal.SIGKILL)
+        assert is_running.join() == -signal.SIGKILL
+        other.compact()
+        other.close()
+
+
+def test_names_and_settings_are_in_the_header(tmp_path):
+    model = SimulatorModel(
+        simulator, noise=GaussianNoise(0.5), parameter_names=["mass", "friction"]
+    )
+    Bank(tmp_path / "bank", simulator=model, created="2026-01-31")
+    header = json.loads((tmp_path / "bank" / "bank.json").read_text())
+    assert header["parameter_names"] == ["mass", "friction"]
+    assert header["created"] == "2026-01-31"
+    assert header["simulator"]["noise"]["sd"] == 0.5
+    assert header["simulator"]["fn"]["name"].endswith("test_bank.simulator")
+    assert Bank(tmp_path / "bank").simulator_name.endswith("test_bank.simulator")
+
+
+def test_log_density_of_the_actions(bank):
+    rows = simulate(simulator, *draw(3), seed=0)
+    bank.append(rows, seed=0, log_action=torch.tensor([-1.0, -2.0, -3.0]))
+    bank.append(rows, seed=1, log_action=-4.0)
+    expected = [-1, -2, -3, -4, -4, -4]
+    assert bank.columns("log_action")["log_action"].tolist() == expected
+
+
+def test_missing_rows_are_counted(bank):
+    x = torch.full((2, 3), torch.nan)
+    status = torch.tensor([1, 2], dtype=torch.int8)
+    bank.append(Simulations(*draw(2), x, status), seed=0)
+    assert bank.counts == {"ok": 0, "invalid": 1, "missing": 1}
+
+
+class forked:  # noqa: N801
+    """A function in a process of its own, which needs no imports."""
+
+    def __init__(self, function):
+        self.pid = os.fork()
+        if self.pid == 0:
+            status = 1
+            try:
+                function()
+                status = 0
+            except BaseException:
+                traceback.print_exc()
+            os._exit(status)
+        self.code = None
+
+    def __call__(self):
+        if self.code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self.code = os.waitstatus_to_exitcode(status) if pid else None
+        return self.code is None
+
+    def join(self):
+        while self():
+            time.sleep(0.01)
+        return self.code
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, *_):
+        if kind is not None and self():
+            os.kill(self.pid, signal.SIGKILL)
+        assert kind or self.join() in (0, -signal.SIGKILL)
+
+
+def _run(code, *arguments):
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout

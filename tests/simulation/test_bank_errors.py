@@ -1,0 +1,268 @@
+import errno
+import json
+import os
+import resource
+import shutil
+import subprocess
+import warnings
+from pathlib import Path
+
+import h5py
+import pytest
+import torch
+
+from sbi_active import Bank, GaussianNoise, Simulations, SimulatorModel, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation.bank import CorruptSegmentError
+from sbi_active.simulation.bank.fingerprint import differences, fingerprint
+
+
+def simulator(theta, action, seeds):
+    return theta + row_normals(seeds, 2).float()
+
+
+def other(theta, action, seeds):
+    return theta - row_normals(seeds, 2).float()
+
+
+class Robot:
+    def __init__(self, mass):
+        self.mass = mass
+        self._cache = object()
+
+    def __call__(self, theta, action):
+        return theta * self.mass
+
+
+def rows(num_rows=100, dim=2):
+    return Simulations(torch.rand(num_rows, 2), torch.rand(num_rows, 1), _x(num_rows))
+
+
+def _x(num_rows):
+    return torch.rand(num_rows, 2)
+
+
+@pytest.fixture
+def bank(tmp_path):
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        bank.append(rows(), seed=0)
+        bank.append(rows(), seed=1)
+        yield bank
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "text"),
+    [
+        (simulator, other, "simulator.name .*simulator' there, .*other' here"),
+        (Robot(1.0), Robot(2.0), "simulator.mass 1.0 there, 2.0 here"),
+        (Robot(1.0), simulator, "simulator.name .*Robot' there"),
+        (
+            SimulatorModel(simulator, noise=GaussianNoise(1.0)),
+            SimulatorModel(simulator, noise=GaussianNoise(0.5)),
+            "simulator.noise.sd 1.0 there, 0.5 here",
+        ),
+        (
+            SimulatorModel(simulator, parameter_names=["a", "b"]),
+            SimulatorModel(simulator, parameter_names=["a", "c"]),
+            r"parameter names \['a', 'b'\] there, \['a', 'c'\] here",
+        ),
+    ],
+)
+def test_a_bank_of_another_simulator(first, second, text, tmp_path):
+    Bank(tmp_path / "bank", simulator=first)
+    Bank(tmp_path / "bank", simulator=first)
+    with pytest.raises(ValueError, match=f"got another: .*{text}.*; do make a bank"):
+        Bank(tmp_path / "bank", simulator=second)
+
+
+def test_version_stands_for_the_source(tmp_path):
+    def make(text):
+        (tmp_path / "source.py").write_text(text)
+        scope = {"__name__": "source"}
+        exec(compile(text, str(tmp_path / "source.py"), "exec"), scope)
+        import linecache
+
+        linecache.checkcache()
+        return scope["f"]
+
+    before = make("def f(theta, action):\n    return theta\n")
+    old, old_version = fingerprint(before), fingerprint(before, version="1")
+    after = make("def f(theta, action):\n    return theta + 1\n")
+    assert "simulator.source" in differences(old, fingerprint(after))[0]
+    assert differences(old_version, fingerprint(after, version="1")) == []
+    (line,) = differences(old_version, fingerprint(after, version="2"))
+    assert line == "version '1' there, '2' here"
+
+
+def test_settings_in_closures_and_partials_count():
+    def make(gain):
+        return lambda theta, action: gain * theta
+
+    (line,) = differences(fingerprint(make(1.0)), fingerprint(make(3.0)))
+    assert line == "simulator.captured.gain 1.0 there, 3.0 here"
+    assert differences(fingerprint(make(1.0)), fingerprint(make(1.0))) == []
+    assert differences(fingerprint(Robot(1)), fingerprint(Robot(1))) == []
+
+
+def test_other_shapes_and_lengths(bank):
+    wide = Simulations(torch.rand(3, 2), torch.rand(3, 1), torch.rand(3, 5))
+    with pytest.raises(ValueError, match=r"'x': \[2\]}, as in the bank .* 'x': \[5\]"):
+        bank.append(wide, seed=2)
+    short = {"theta": torch.rand(2, 2), "action": torch.rand(3, 1), "x": _x(3)}
+    with pytest.raises(ValueError, match="expected 3 rows, one an index; got .*'the"):
+        bank.save("run", index=torch.arange(3), status=torch.zeros(3), seed=0, **short)
+    assert len(bank) == 200
+
+
+def test_other_formats_and_folders(bank, tmp_path):
+    header = json.loads((bank.path / "bank.json").read_text())
+    (bank.path / "bank.json").write_text(json.dumps({**header, "format": 99}))
+    with pytest.raises(ValueError, match="expected a bank of format 1; got 99"):
+        Bank(bank.path)
+    (bank.path / "bank.json").write_text("{")
+    with pytest.raises(CorruptSegmentError, match=r"bank.json as it was written"):
+        Bank(bank.path)
+    with pytest.raises(ValueError, match=r"got no .*bank.json; do give simulator="):
+        Bank(tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").touch()
+    with pytest.raises(ValueError, match=r"an empty folder; got .* with 'thesis.tex'"):
+        Bank(tmp_path / "full", simulator=simulator)
+
+
+def test_a_bank_that_reads_does_not_write(bank):
+    with pytest.raises(ValueError, match="opened with its simulator, to write to"):
+        Bank(bank.path).append(rows(), seed=5)
+
+
+def test_proposal_and_label_belong_together(bank):
+    with pytest.raises(ValueError, match="a proposal and its label together"):
+        bank.append(rows(), seed=5, label="prior")
+    normal = torch.distributions.Normal(torch.zeros(2), torch.ones(2))
+    with pytest.raises(ValueError, match=r"one log density a row .* \(100, 2\)"):
+        bank.append(rows(), seed=5, proposal=normal, label="prior")
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "empty", "rewritten"])
+def test_a_damaged_segment_is_named_and_refused(bank, damage):
+    first, second = sorted((bank.path / "segments").glob("*.h5"))
+    content = bytearray(second.read_bytes())
+    if damage == "cut":
+        second.write_bytes(content[: len(content) // 2])
+    elif damage == "empty":
+        second.write_bytes(b"")
+    elif damage == "flip":
+        x = Bank(bank.path).read(slice(100, 200)).x.numpy().tobytes()
+        content[content.index(x) + 100] ^= 1
+        second.write_bytes(content)
+    else:
+        with h5py.File(second, "r+") as file:
+            file["x"][0, 0] = 7.0
+    reader = Bank(bank.path)
+    (problem,) = reader.verify()
+    assert problem.startswith(f"{second}: ")
+    with pytest.raises(CorruptSegmentError, match=str(second)) as raised:
+        reader.read()
+    assert raised.value.path == second
+    with pytest.raises(CorruptSegmentError):
+        for _ in reader.chunks(10):
+            pass
+    # Mergers leave it as it is, and new rows are still stored.
+    bank.compact()
+    assert sorted((bank.path / "segments").glob("*.h5")) == [first, second]
+
+
+def test_a_lost_segment_is_named(bank):
+    (bank.path / "segments" / "00000001-00000001.h5").unlink()
+    (problem,) = bank.verify()
+    assert "segments 1 to 1 are not there" in problem
+
+
+def full_disk(folder):
+    """Return whether a small file system could be mounted."""
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        return False
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if not full_disk(folder):
+        pytest.skip("only root can mount a small file system here")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_a_full_disk(small_disk):
+    theta, action = torch.rand(200_000, 2), torch.rand(200_000, 1)
+    few = Simulations(theta[:100], action[:100], theta[:100])
+    with Bank(small_disk / "bank", simulator=simulator) as bank:
+        bank.append(few, seed=0)
+        text = "expected to write .* got 'No space left on device'; do make room"
+        with pytest.raises(OSError, match=text) as raised:
+            simulate(simulator, theta, action, seed=1, store=bank)
+        assert raised.value.errno == errno.ENOSPC
+        assert Bank(bank.path).verify() == []
+        assert torch.equal(bank.read(slice(0, 100)).theta, theta[:100])
+        # With room again, what was stored is gone on with.
+        before = len(bank)
+        simulate(simulator, theta[:100], action[:100], seed=2, store=bank)
+        assert len(bank) == before + 100
+
+
+def test_a_limit_on_file_sizes(bank):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OSError, match="got 'File too large'; do make room"):
+            bank.append(rows(5_000), seed=3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(bank) == 200
+    assert bank.verify() == []
+    assert len([*(bank.path / "segments").iterdir()]) == 2
+    bank.append(rows(5_000), seed=3)
+    assert len(bank) == 5_200
+
+
+def test_a_folder_that_cannot_be_written(small_disk):
+    with Bank(small_disk / "bank", simulator=simulator) as bank:
+        bank.append(rows(), seed=0)
+    remount = ["mount", "-o", "remount,ro", str(small_disk)]
+    subprocess.run(remount, check=True)
+    assert len(Bank(small_disk / "bank").read()) == 100
+    with pytest.raises(OSError, match=r"got 'Read-only file system'; do choose a pl"):
+        Bank(small_disk / "bank", simulator=simulator).append(rows(), seed=1)
+    with pytest.raises(
+        OSError, match="a folder that can be made for a bank; got 'Read"
+    ):
+        Bank(small_disk / "new", simulator=simulator)
+
+
+def test_a_folder_below_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="can be made for a bank; got 'Not a directory'"):
+        Bank(tmp_path / "file" / "bank", simulator=simulator)
+    with pytest.raises(ValueError, match="expected a bank; got no"):
+        Bank(tmp_path / "file" / "bank")
+
+
+def test_rows_from_elsewhere_are_noticed(bank):
+    box = torch.distributions.Uniform(torch.zeros(2), 0.5 * torch.ones(2))
+    half = torch.distributions.Independent(box, 1)
+    with pytest.warns(UserWarning, match="rows have density 0 under the proposal 'h'"):
+        bank.append(rows(), seed=7, proposal=half, label="h")
+    inside = rows()
+    inside.theta.mul_(0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bank.append(inside, seed=8, proposal=half, label="h")
+
+
+def test_paths_may_be_strings(tmp_path):
+    Bank(str(tmp_path / "bank"), simulator=simulator)
+    assert Path(tmp_path / "bank" / "bank.json").is_file()

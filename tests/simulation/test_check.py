@@ -1,0 +1,277 @@
+"""The command on small modules in files, one for each defect, and a clean one."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import DiscreteActions
+from sbi_active.cli import main
+from sbi_active.simulation.check import check_simulator
+
+HEAD = "import numpy as np\nimport torch\nfrom sbi_active import *\n"
+SPACE = ["--theta-low=0,-1", "--theta-high=1,1", "--actions", "0.5:2:4"]
+
+CLEAN = """
+def simulator(theta, action):
+    return theta[:, :1] * action + theta[:, 1:] + torch.randn(len(theta), 1)
+"""
+ROWS = """
+def row(theta, action, rng):
+    return theta * action + rng.normal(size=2)
+
+simulator = SimulatorModel(row, batched=False)
+"""
+DETERMINISTIC = """
+def simulator(theta, action):
+    return theta * action
+"""
+ONE_ROW = """
+def simulator(theta, action):
+    return (theta * action + torch.randn_like(theta))[:1]
+"""
+RAISES = """
+def simulator(theta, action):
+    raise RuntimeError("no model file")
+"""
+FLAT = """
+def simulator(theta, action):
+    x = theta * action + torch.randn_like(theta)
+    return x if len(x) > 1 else x[:, :1]
+"""
+NOTHING = """
+def simulator(theta, action):
+    return torch.full((len(theta), 2), torch.nan)
+"""
+MIXED = """
+def simulator(theta, action, seeds):
+    noise = torch.randn(len(theta), 2, generator=torch.Generator().manual_seed(1))
+    return theta * action + noise
+"""
+NO_PARAMETER = """
+def simulator(theta, action):
+    return action + torch.randn_like(action)
+"""
+IDLE = """
+def simulator(theta, action):
+    return theta[:, :1] + torch.randn(len(theta), 1)
+"""
+HIDDEN = """
+rng = np.random.default_rng(0)
+
+def simulator(theta, action):
+    return theta * action + rng.normal(size=theta.shape)
+"""
+TWICE = """
+def fn(theta, action):
+    return theta * action + torch.randn_like(theta)
+
+simulator = SimulatorModel(fn, noise=GaussianNoise(1.0))
+"""
+FALLS_OFF = """
+def simulator(theta, action):
+    x = theta * action + torch.randn_like(theta)
+    return torch.where(action > 1.2, torch.nan, x)
+"""
+SOME_RAISE = """
+def row(theta, action, rng):
+    if theta[0] > 0.8:
+        raise FloatingPointError("unstable contact")
+    return theta * action + rng.normal(size=2)
+
+simulator = SimulatorModel(row, batched=False)
+"""
+ONE_CHANNEL = """
+def simulator(theta, action):
+    return torch.cat([theta, theta + torch.randn_like(theta)], 1)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _same_path(monkeypatch):
+    """Let no folder of a test stay on the path, which processes started later get."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+
+@pytest.fixture
+def check(tmp_path, capsys, request):
+    """Return exit status and printed text of the command on a module of this text."""
+
+    def run(text, *options):
+        name = f"robot_{abs(hash(request.node.name))}"
+        (tmp_path / f"{name}.py").write_text(HEAD + text)
+        path = str(tmp_path / f"{name}.py:simulator")
+        status = main(["check", path, *SPACE, "--rows", "64", *options])
+        captured = capsys.readouterr()
+        return status, captured.out + captured.err
+
+    return run
+
+
+@pytest.mark.parametrize("text", [CLEAN, ROWS], ids=["batch", "rows"])
+def test_a_clean_simulator_is_ready(check, text):
+    status, printed = check(text, "--rounds", "2", "--workers", "4")
+    assert status == 0
+    assert printed.strip().endswith("\nready")
+    assert "warning" not in printed
+    assert "rows: 64 ok, 0 invalid, 0 missing" in printed
+    # 2 rounds of 5000 + 4 actions x 1500, and refinement on 1 and 2 trials
+    assert "at most 31,000 simulations, about " in printed
+    assert "on 4 workers" in printed
+    if text is CLEAN:
+        assert "x: shape (n, 1), torch.float32\nseeds: none taken" in printed
+    else:
+        assert "x: shape (n, 2), torch.float64\nseeds: one a row" in printed
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            DETERMINISTIC,
+            "got identical x from two seeds, and a deterministic simulator",
+        ),
+        (DETERMINISTIC, "SimulatorModel(simulator, noise=GaussianNoise(sd))"),
+        (
+            ONE_ROW,
+            "expected x with one row a parameter set, shape (16, ...); got (1, 2)",
+        ),
+        (RAISES, "RuntimeError: no model file"),
+        (
+            FLAT,
+            "expected x of one shape; got (2,) a row from 16 rows and (1,) from one",
+        ),
+        (NOTHING, "no row has a measurement"),
+        (MIXED, "rows permuted with their seeds do not give permuted x"),
+        (NO_PARAMETER, "no parameter changes x"),
+    ],
+)
+def test_defects_are_found(check, text, expected):
+    status, printed = check(text)
+    assert status == 1
+    assert printed.strip().endswith("\nnot ready")
+    (line,) = [s for s in printed.splitlines() if expected in s]
+    assert line.startswith("defect: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (IDLE, "changing theta_2 leaves x as it is"),
+        (IDLE, "changing action leaves x as it is"),
+        (HIDDEN, "one seed gives two different x"),
+        (TWICE, "fn is random beside declared noise, which so counts twice"),
+        (SOME_RAISE, "FloatingPointError: unstable contact; their outcome is missing"),
+        (ONE_CHANNEL, "numbers 0, 1 of x have no noise"),
+    ],
+)
+def test_warnings_do_not_fail(check, text, expected):
+    status, printed = check(text)
+    assert status == 0
+    (line,) = [s for s in printed.splitlines() if expected in s]
+    assert line.startswith("warning: ")
+
+
+def test_lost_rows_are_told_by_action(check):
+    status, printed = check(FALLS_OFF)
+    assert status == 0
+    assert "rows: 32 ok, 32 invalid, 0 missing" in printed
+    assert "action 2: 100% without a measurement" in printed
+    assert "action 1.5: 100% without a measurement" in printed
+    assert "action 1:" not in printed
+
+
+@pytest.mark.slow
+def test_the_installed_command_sets_the_exit_status(tmp_path):
+    (tmp_path / "my_robot.py").write_text(HEAD + DETERMINISTIC)
+    command = [sys.executable, "-c", "import sys; from sbi_active.cli import main; "]
+    command[-1] += "sys.exit(main())"
+    done = subprocess.run(
+        [*command, "check", "my_robot:simulator", *SPACE],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 1
+    assert "defect: expected a simulator with noise" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def test_tasks_are_ready(capsys):
+    assert main(["check", "--task", "numerical", "--rows", "32"]) == 0
+    assert "x: shape (n, 1)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ([], "expected MODULE:FUNCTION or --task; got both or neither"),
+        (["math:pi", *SPACE], "expected a function or SimulatorModel; got float"),
+        (["none.py:f", *SPACE], "expected a file; got none at"),
+        (["math:sin"], "expected --theta-low and --theta-high, or --prior"),
+        (["math:sin", *SPACE[:2]], "expected --actions; got none"),
+        (
+            ["math:sin", "--theta-low=1", "--theta-high=0"],
+            "expected as many bounds, low below high; got [1.0] and [0.0]",
+        ),
+        (["math:sin", *SPACE, "--rows", "0"], "expected --rows >= 1; got 0"),
+        (
+            ["math:sin", *SPACE[:2], "--actions", "0:1:2:3"],
+            "expected LOW:HIGH:COUNT or A,B,...; got '0:1:2:3'",
+        ),
+        (
+            ["math:sin", *SPACE[:2], "--actions", "fast"],
+            "expected numbers separated by commas; got 'fast'",
+        ),
+    ],
+)
+def test_bad_options(options, text, capsys):
+    assert main(["check", *options]) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_files_named_like_other_modules_are_refused(tmp_path, capsys):
+    (tmp_path / "json.py").write_text(HEAD + CLEAN)
+    assert main(["check", f"{tmp_path}/json.py:simulator", *SPACE]) == 2
+    assert "expected a file whose name no other module has" in capsys.readouterr().err
+
+
+def test_slow_simulators_get_fewer_rows():
+    calls = []
+
+    def simulator(theta, action):
+        calls.append(len(theta))
+        return theta * action + torch.randn_like(theta)
+
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    report = check_simulator(
+        simulator, prior, DiscreteActions([1.0, 2.0]), max_seconds=0, num_rows=500
+    )
+    assert report.is_ready
+    assert max(calls) == report.num_rows == 16
+    assert report.minutes is None
+
+
+def test_every_entry_of_a_large_grid_is_varied():
+    def simulator(theta, action):
+        return theta * action[:, :1] + torch.randn_like(theta)
+
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    axis = torch.linspace(1.0, 2.0, 60)
+    grid = DiscreteActions(torch.cartesian_prod(axis, axis))
+    report = check_simulator(simulator, prior, grid, num_rows=32)
+    assert report.idle_actions == ("action_2",)
+
+
+def test_actions_of_several_entries(check):
+    text = """
+def simulator(theta, action):
+    return theta * action[:, 1:] + torch.randn_like(theta)
+"""
+    status, printed = check(text, "--actions", "0:1:2", "1,2,4")
+    assert status == 0
+    assert "changing action_1 leaves x as it is" in printed
+    assert "at most 68,000 simulations" not in printed
+    assert "at most 86,000 simulations" in printed  # 4 (5000 + 6 x 1500) + 30,000

@@ -1,0 +1,215 @@
+import warnings
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy import stats
+from torch.distributions import Independent, MultivariateNormal, Normal
+
+from sbi_active import Bank, Simulations, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import reuse
+
+NOISE = 0.3
+
+
+def simulator(theta, action, seeds):
+    return theta + action + NOISE * row_normals(seeds, 1).float()
+
+
+def normal(mean, sd):
+    return Independent(Normal(torch.tensor([mean]), torch.tensor([sd])), 1)
+
+
+PRIOR, ROUND = normal(0.0, 2.0), normal(3.0, 1.0)
+PROPOSALS = {"prior": PRIOR, "round 1": ROUND}
+TARGET = normal(1.0, 0.5)
+
+
+def fill(bank, *, num_rows=2_000, seed=0, actions=((0.0, 1.0), (0.0, 1.0))):
+    """Store rows of both proposals, each with actions of its own."""
+    torch.manual_seed(seed)
+    for (label, proposal), own in zip(PROPOSALS.items(), actions, strict=True):
+        theta = proposal.sample((num_rows,))
+        action = torch.tensor(own)[torch.randint(len(own), (num_rows, 1))]
+        store = bank.drawn_from(proposal, label=label)
+        simulate(simulator, theta, action, seed=seed, store=store)
+
+
+@pytest.fixture
+def bank(tmp_path):
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        fill(bank)
+        yield bank
+
+
+def z_score(values, weights, exact):
+    """Return the error of a weighted mean in its own standard errors."""
+    mean = (weights * values).sum()
+    error = (weights**2 * (values - mean) ** 2).sum().sqrt()
+    return float((mean - exact) / error)
+
+
+@pytest.mark.parametrize("proposals", [PROPOSALS, None])
+@pytest.mark.parametrize("same_actions", [True, False])
+def test_weighted_rows_have_the_law_of_the_target(bank, proposals, same_actions):
+    reused = reuse(bank, TARGET, proposals=proposals, same_actions=same_actions)
+    rows = reused.simulations()
+    theta, weights = rows.theta[:, 0].double(), reused.weights
+    assert float(weights.sum()) == pytest.approx(1)
+    assert len(reused) == 4_000
+    assert abs(z_score(theta, weights, 1.0)) < 4
+    assert abs(z_score((theta - 1) ** 2, weights, 0.25)) < 4
+    for action in (0.0, 1.0):
+        some = rows.action[:, 0] == action
+        w = weights[some] / weights[some].sum()
+        x = rows.x[some, 0].double()
+        assert abs(z_score(x, w, 1 + action)) < 4
+        assert abs(z_score((x - 1 - action) ** 2, w, 0.25 + NOISE**2)) < 4
+    # Negative control: the same rows, unweighted.
+    equal = torch.full_like(weights, 1 / len(weights))
+    assert abs(z_score(theta, equal, 1.0)) > 10
+
+
+@pytest.mark.parametrize("proposals", [PROPOSALS, None])
+def test_errors_have_the_size_that_is_stated(proposals, tmp_path):
+    scores = []
+    for seed in range(30):
+        with Bank(tmp_path / str(seed), simulator=simulator) as bank:
+            fill(bank, num_rows=800, seed=seed)
+        reused = reuse(bank, TARGET, proposals=proposals)
+        theta = reused.simulations().theta[:, 0].double()
+        scores.append(z_score(theta, reused.weights, 1.0))
+    total = float((torch.tensor(scores) ** 2).sum())
+    low, high = stats.chi2(30).ppf([0.0005, 0.9995])
+    assert low < total < high
+
+
+def test_effective_sample_size_is_that_of_kish(bank):
+    reused = reuse(bank, TARGET, proposals=PROPOSALS, same_actions=True)
+    theta = reused.simulations().theta
+    mixture = 0.5 * (PRIOR.log_prob(theta).exp() + ROUND.log_prob(theta).exp())
+    weights = (TARGET.log_prob(theta).exp() / mixture).double()
+    expected = float(weights.sum() ** 2 / (weights**2).sum())
+    assert reused.effective_sample_size == pytest.approx(expected, rel=1e-4)
+    assert reused.denominator == "mixture"
+    assert sum(reused.share.values()) == pytest.approx(1)
+    assert reused.share["prior"] > reused.share["round 1"]
+    # The target itself needs no weights.
+    only = Bank(bank.path.parent / "only", simulator=simulator)
+    only.append(bank.read(slice(0, 2_000)), seed=0, proposal=PRIOR, label="prior")
+    assert reuse(only, PRIOR).effective_sample_size == pytest.approx(2_000)
+
+
+def test_a_mixture_is_worth_more_than_own_proposals(bank):
+    mixture = reuse(bank, TARGET, proposals=PROPOSALS)
+    own = reuse(bank, TARGET)
+    assert own.denominator == "own"
+    assert mixture.effective_sample_size > 1.2 * own.effective_sample_size
+
+
+def test_proposals_may_have_met_with_other_actions(tmp_path):
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        uneven = ((0.0, 0.0, 0.0, 1.0), (0.0, 1.0, 1.0, 1.0))
+        fill(bank, num_rows=10_000, actions=uneven)
+    scores = {}
+    for same in (False, True):
+        reused = reuse(bank, TARGET, proposals=PROPOSALS, same_actions=same)
+        rows = reused.simulations()
+        some = rows.action[:, 0] == 0
+        w = reused.weights[some] / reused.weights[some].sum()
+        scores[same] = z_score(rows.theta[some, 0].double(), w, 1.0)
+    assert abs(scores[False]) < 4
+    assert abs(scores[True]) > 6  # negative control: the assumption is wrong here
+    at = reuse(bank, TARGET, proposals=PROPOSALS, action=torch.zeros(1))
+    assert (at.simulations().action == 0).all()
+    assert abs(z_score(at.simulations().theta[:, 0].double(), at.weights, 1.0)) < 4
+
+
+def test_resampled_rows_have_equal_weight(bank):
+    reused = reuse(bank, TARGET, proposals=PROPOSALS)
+    rows = reused.resample(3_000, seed=1)
+    # The rows are draws from the weights, and these have their own error.
+    error = 0.5 * (1 / 3_000 + 1 / reused.effective_sample_size) ** 0.5
+    assert len(rows) == 3_000
+    assert abs(float(rows.theta.double().mean()) - 1.0) < 4 * error
+    assert torch.equal(reused.resample(3_000, seed=1).x, rows.x)
+    assert not torch.equal(reused.resample(3_000, seed=2).x, rows.x)
+    # Systematic: a row comes as often as its weight says, rounded up or down.
+    theta = reused.simulations().theta[:, 0]
+    best = int(reused.weights.argmax())
+    times = int((rows.theta[:, 0] == theta[best]).sum())
+    assert abs(times - 3_000 * float(reused.weights[best])) < 1
+
+
+def test_rows_of_unknown_proposals_and_missing_ones_are_left_out(bank):
+    theta, action = PRIOR.sample((50,)), torch.zeros(50, 1)
+    simulate(simulator, theta, action, seed=9, store=bank)
+    lost = Simulations(
+        theta, action, torch.full((50, 1), torch.nan), torch.full((50,), 2).char()
+    )
+    bank.append(lost, seed=10, proposal=PRIOR, label="prior")
+    assert len(bank) == 4_100
+    assert len(reuse(bank, TARGET, proposals=PROPOSALS)) == 4_000
+
+
+def test_invalid_rows_stay(bank):
+    theta, action = PRIOR.sample((50,)), torch.zeros(50, 1)
+    invalid = Simulations(theta, action, torch.full((50, 1), torch.nan))
+    bank.append(invalid, seed=10, proposal=PRIOR, label="prior")
+    assert (~reuse(bank, TARGET).simulations().valid).sum() == 50
+
+
+def test_few_effective_rows_are_told(bank):
+    far = normal(-7.5, 0.3)
+    with pytest.warns(UserWarning, match=r"4000 rows of the bank are worth \d+\.\d"):
+        reused = reuse(bank, far, proposals=PROPOSALS)
+    assert reused.effective_sample_size < 50
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reuse(bank, TARGET, proposals=PROPOSALS)
+
+
+def test_mergers_keep_proposals_apart(bank):
+    before = reuse(bank, TARGET, proposals=PROPOSALS)
+    bank.compact()
+    after = reuse(Bank(bank.path), TARGET, proposals=PROPOSALS)
+    assert torch.equal(before.weights, after.weights)
+    assert torch.equal(before.simulations().x, after.simulations().x)
+
+
+def test_a_box_that_validates_its_arguments(bank):
+    box = MultivariateNormal(torch.zeros(1), torch.eye(1))
+    assert len(reuse(bank, box, proposals=PROPOSALS)) == 4_000
+    inside = BoxUniform(torch.zeros(1), torch.ones(1))
+    reused = reuse(bank, inside, proposals=PROPOSALS)
+    theta = reused.simulations().theta[:, 0]
+    assert (reused.weights[(theta < 0) | (theta > 1)] == 0).all()
+    assert abs(z_score(theta.double(), reused.weights, 0.5)) < 4
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"proposals": {"prior": PRIOR}}, r"got none for \['round 1'\]; do give them"),
+        (
+            {"proposals": {"prior": ROUND, "round 1": ROUND}},
+            r"expected proposals\['prior'\] to be what its rows were drawn from",
+        ),
+        ({"action": torch.tensor([0.5])}, r"got none at action \[0.5\]; do simulate"),
+    ],
+)
+def test_bad_arguments(bank, options, text):
+    with pytest.raises(ValueError, match=text):
+        reuse(bank, TARGET, **options)
+
+
+def test_a_target_elsewhere(bank):
+    far = BoxUniform(torch.tensor([50.0]), torch.tensor([51.0]))
+    with pytest.raises(
+        ValueError, match="got 4000 rows, all of density 0; do simulate"
+    ):
+        reuse(bank, far)
+    empty = Bank(bank.path.parent / "empty", simulator=simulator)
+    with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
+        reuse(empty, TARGET)
