@@ -44,6 +44,7 @@ class Design:
             eliminated early have fewer.
         stopped: Why no further simulations were run: "leader separated", "difference
             negligible" or "budget spent".
+        num_missing: Simulations of them all that were lost to faults of the simulator.
         notes: What to know: estimators that failed a check or disagree, where an
             estimate is a bound, candidates that were excluded.
     """
@@ -62,6 +63,7 @@ class Design:
     estimator: str = "none"
     num_samples: Tensor = field(default_factory=lambda: torch.empty(0).long())
     stopped: str = "at random"
+    num_missing: int = 0
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design import Design, action_name
-from sbi_active.eligibility import discrete, excluded_note, reaches
+from sbi_active.eligibility import discrete, excluded_note, reaches, warn_missing
 from sbi_active.information_gain import (
     CandidateSimulations,
     InformationGainEstimator,
@@ -55,6 +55,11 @@ class InformationGainDesigner:
             replicates that pass a test of normality, else the network's bound.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
+        num_workers: Of the simulations, see
+            :func:`~sbi_active.simulation.simulate`.
+        time_limit: Seconds a simulated row may take; None waits for ever. With it, or
+            with more than one worker, a simulator that ends its process costs a row.
+        num_retries: How often a row that a fault lost is tried again.
 
     Raises:
         ValueError: If ``num_samples`` is below 8 or the estimator's name is unknown.
@@ -81,6 +86,9 @@ class InformationGainDesigner:
         num_samples: int = 1_500,
         estimator: str | InformationGainEstimator = "auto",
         eliminate: bool = True,
+        num_workers: int = 1,
+        time_limit: float | None = None,
+        num_retries: int = 0,
     ) -> None:
         if num_samples < 8:
             raise ValueError(
@@ -91,6 +99,11 @@ class InformationGainDesigner:
         self.num_samples = num_samples
         self.estimator = estimator
         self.eliminate = eliminate
+        self.engine: dict[str, Any] = {
+            "num_workers": num_workers,
+            "time_limit": time_limit,
+            "num_retries": num_retries,
+        }
         find_estimator(estimator)  # an unknown name is an error here
 
     def select(
@@ -153,10 +166,8 @@ class InformationGainDesigner:
         else:
             notes = estimator.problems(first)
         notes += estimator.remarks(first)
-        replicates &= estimator.needs_noise
+        replicates = first.replicate is not None
         halves = _halves(first)
-        if not replicates:
-            halves = [half.unpaired() for half in halves]
         num_valid, num_counted = first.num_valid()
         eligible = reaches(num_valid / num_counted, min_probability_valid)
         notes += excluded_note(eligible, min_probability_valid)
@@ -200,6 +211,7 @@ class InformationGainDesigner:
                 for half, new in zip(halves, _halves(drawn), strict=True)
             ]
 
+        warn_missing(sampler.num_missing, sampler.num_drawn)
         contributions = torch.stack([gains[0][a] for a in active])
         with single_thread():
             notes += disagreements(estimator, model, halves[0], belief, contributions)
@@ -226,6 +238,7 @@ class InformationGainDesigner:
             estimator=type(estimator).__name__,
             num_samples=torch.tensor(samples),
             stopped=stop,
+            num_missing=sampler.num_missing,
             notes=tuple(notes),
         )
 
@@ -273,7 +286,9 @@ class InformationGainDesigner:
                 f"expected a model for {type(estimator).__name__}; got None; do pass "
                 "the trained posterior, or estimator='auto'"
             )
-        sampler = CandidateSampler(simulator, belief, self.actions.values, seed)
+        sampler = CandidateSampler(
+            simulator, belief, self.actions.values, seed, self.engine
+        )
         return sampler, estimator, belief
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.simulation import MissingRowsWarning
 
-__all__ = ["discrete", "excluded_note", "reaches"]
+__all__ = ["discrete", "excluded_note", "reaches", "warn_missing"]
 
 
 def discrete(actions: ActionSpace) -> DiscreteActions:
@@ -53,3 +56,14 @@ def excluded_note(eligible: Tensor, least: float) -> tuple[str, ...]:
         f"{num} of {len(eligible)} candidates excluded: a measurement is less probable "
         f"than {least:g}, or every simulation was lost",
     )
+
+
+def warn_missing(num_missing: int, num_simulations: int) -> None:
+    """Warn once a design of simulations lost to faults."""
+    if num_missing:
+        warnings.warn(
+            f"{num_missing} of {num_simulations} simulations of the design are "
+            "missing, by faults of the simulator; they were left out",
+            MissingRowsWarning,
+            stacklevel=3,
+        )

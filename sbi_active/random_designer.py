@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -11,9 +12,9 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design import Design, action_name
-from sbi_active.eligibility import discrete, excluded_note, reaches
+from sbi_active.eligibility import discrete, excluded_note, reaches, warn_missing
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Outcome, simulate
+from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 
 __all__ = ["RandomDesigner"]
 
@@ -25,11 +26,28 @@ class RandomDesigner:
         actions: The action space.
         num_samples: Simulations a candidate where ``min_probability_valid`` asks for
             its share of measurements; otherwise nothing is simulated.
+        num_workers: Of these simulations, with the next two as in
+            :class:`~sbi_active.InformationGainDesigner`.
+        time_limit: Seconds a simulated row may take.
+        num_retries: How often a row that a fault lost is tried again.
     """
 
-    def __init__(self, actions: ActionSpace, *, num_samples: int = 200) -> None:
+    def __init__(
+        self,
+        actions: ActionSpace,
+        *,
+        num_samples: int = 200,
+        num_workers: int = 1,
+        time_limit: float | None = None,
+        num_retries: int = 0,
+    ) -> None:
         self.actions = discrete(actions)
         self.num_samples = num_samples
+        self.engine: dict[str, Any] = {
+            "num_workers": num_workers,
+            "time_limit": time_limit,
+            "num_retries": num_retries,
+        }
 
     def select(
         self,
@@ -62,7 +80,7 @@ class RandomDesigner:
         """
         num = len(self.actions)
         unknown = torch.full((num,), torch.nan, dtype=torch.float64)
-        valid, num_simulations = unknown, 0
+        valid, num_simulations, num_missing = unknown, 0, 0
         eligible = torch.ones(num).bool()
         if min_probability_valid > 0:
             belief = getattr(model, "belief", None) if belief is None else belief
@@ -73,8 +91,12 @@ class RandomDesigner:
                     "both, or leave min_probability_valid at 0"
                 )
             seed = int(torch.randint(2**62, ())) if seed is None else seed
-            valid = self._probability_valid(simulator, belief, seed)
-            num_simulations = num * self.num_samples
+            status = self._outcomes(simulator, belief, seed)
+            counted = (status != Outcome.MISSING).sum(1)
+            valid = (status == Outcome.OK).sum(1).double() / counted
+            num_simulations = status.numel()
+            num_missing = num_simulations - int(counted.sum())
+            warn_missing(num_missing, num_simulations)
             eligible = reaches(valid, min_probability_valid)
         with forked_generators(seed):
             remaining = torch.nonzero(eligible)[:, 0]
@@ -92,18 +114,21 @@ class RandomDesigner:
             num_simulations=num_simulations,
             name=action_name(self.actions),
             num_samples=torch.full((num,), num_simulations // num).long(),
+            num_missing=num_missing,
             notes=excluded_note(eligible, min_probability_valid),
         )
 
-    def _probability_valid(
+    def _outcomes(
         self, simulator: Callable[..., Any], belief: Distribution, seed: int
     ) -> Tensor:
-        """Share of measurements of each candidate, at the same parameters."""
+        """Simulate candidates at the same parameters; statuses, shape (a, n)."""
         n, values = self.num_samples, self.actions.values
         with forked_generators(seed, "theta"):
             theta = belief.sample(torch.Size([n]))
         rows = theta.repeat(len(values), 1), values.repeat_interleave(n, 0)
-        drawn = simulate(simulator, *rows, seed=derive_seed(seed, "x"))
-        status = drawn.status.reshape(len(values), n)
-        counted = (status != Outcome.MISSING).sum(1)
-        return (status == Outcome.OK).sum(1).double() / counted
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+            drawn = simulate(
+                simulator, *rows, seed=derive_seed(seed, "x"), **self.engine
+            )
+        return drawn.status.reshape(len(values), n)

@@ -1,10 +1,14 @@
+import os
+import time
+
 import pytest
 import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner, RandomDesigner
 from sbi_active.actions import ActionSpace
 from sbi_active.information_gain.race import DRAWS, Race
-from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from sbi_active.tasks.numerical.task import NumericalTask
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
@@ -436,3 +440,47 @@ def test_without_elimination_every_candidate_gets_all_samples():
     assert design.num_samples.tolist() == [200] * 4
     racing = InformationGainDesigner(ACTIONS, num_samples=200, estimator="posterior")
     assert racing.select(ExactModel(), simulator, seed=0).num_samples.min() == 100
+
+
+class Hanging:
+    """Hangs on one row in 50, and ends its process on another."""
+
+    def __call__(self, theta, action, seeds):
+        if bool((seeds % 50 == 0).any()):
+            time.sleep(60)
+        if bool((seeds % 50 == 1).any()):
+            os._exit(1)
+        return theta * action + row_normals(seeds, 1)
+
+
+@pytest.mark.slow
+def test_a_simulator_that_hangs_or_dies_costs_rows_and_one_warning():
+    designer = InformationGainDesigner(
+        DiscreteActions([0.1, 4.0]), num_samples=200, num_workers=2, time_limit=0.05
+    )
+    belief = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
+    with pytest.warns(MissingRowsWarning, match="of the design are missing") as caught:
+        design = designer.select(None, Hanging(), belief=belief, seed=0)
+    assert len([w for w in caught if w.category is MissingRowsWarning]) == 1
+    assert design.action.tolist() == [4.0]
+    error = (0.04 / design.num_simulations) ** 0.5
+    assert abs(design.num_missing / design.num_simulations - 0.04) < 3 * error
+
+
+def test_missing_rows_are_counted_and_warned_of_once():
+    def raises(theta, action, seeds):
+        if bool((seeds % 25 == 0).any()):
+            raise RuntimeError("licence server")
+        return theta * action + row_normals(seeds, 1)
+
+    actions = DiscreteActions([0.1, 4.0])
+    belief = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
+    for designer, options in (
+        (InformationGainDesigner(actions, num_samples=400), {}),
+        (RandomDesigner(actions, num_samples=400), {"min_probability_valid": 0.5}),
+    ):
+        with pytest.warns(MissingRowsWarning, match="of the design are miss") as caught:
+            design = designer.select(None, raises, belief=belief, seed=0, **options)
+        assert len([w for w in caught if w.category is MissingRowsWarning]) == 1
+        error = (0.04 / design.num_simulations) ** 0.5
+        assert abs(design.num_missing / design.num_simulations - 0.04) < 3 * error

@@ -116,9 +116,7 @@ def disagreements(
         others.append(PosteriorGain())
     notes = []
     for other in others:
-        rows = simulations.unpaired() if not other.needs_noise else simulations
-        contributions = other(model, rows, belief)[:, : gain.shape[1]]
-        difference = contributions - gain
+        difference = other(model, simulations, belief) - gain
         error = torch.stack([standard_error(row) for row in difference])
         mean = difference.nanmean(1)
         apart = mean.abs() > DISAGREEMENT + 4 * error

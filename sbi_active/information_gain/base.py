@@ -79,12 +79,11 @@ class CandidateSimulations:
         """Return x and, where there are any, replicates."""
         return [self.x] if self.replicate is None else [self.x, self.replicate]
 
-    def rows(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return theta, x and action with one row a pair, a * n rows each."""
+    def rows(self) -> tuple[Tensor, Tensor]:
+        """Return theta and action of every outcome in turn, a * n rows each."""
         num_actions, num_samples = self.x.shape[:2]
         return (
             self.theta.repeat(num_actions, 1),
-            self.x.flatten(0, 1),
             self.action.repeat_interleave(num_samples, 0),
         )
 
@@ -111,15 +110,6 @@ class CandidateSimulations:
         names = ("x", "mean", "replicate", "missing")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
-
-    def unpaired(self) -> CandidateSimulations:
-        """Return replicates as further simulations, 2 n in all."""
-        if self.replicate is None:
-            return self
-        x = torch.cat([self.x, self.replicate], 1)
-        missing = None if self.missing is None else self.missing.repeat(1, 2)
-        theta = self.theta.repeat(2, 1)
-        return CandidateSimulations(theta, self.action, x, missing=missing)
 
 
 class InformationGainEstimator(ABC):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,7 +13,14 @@ from torch.distributions import Distribution
 
 from sbi_active.information_gain.base import CandidateSimulations
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
-from sbi_active.simulation import Outcome, SimulatorModel, require_noise, simulate
+from sbi_active.simulation import (
+    MissingRowsWarning,
+    Outcome,
+    Simulations,
+    SimulatorModel,
+    require_noise,
+    simulate,
+)
 
 __all__ = ["CandidateSampler"]
 
@@ -27,11 +36,13 @@ class CandidateSampler:
         belief: Distribution of the parameters.
         action: Candidates, shape (a, action_dim).
         seed: Of everything drawn.
+        engine: Options of every :func:`~sbi_active.simulation.simulate`; None for none.
 
     Attributes:
         declared: Whether the simulator declares its noise around an output that does
             not change from run to run.
         num_drawn: Simulations so far.
+        num_missing: Those of them lost to faults of the simulator.
     """
 
     def __init__(
@@ -40,10 +51,12 @@ class CandidateSampler:
         belief: Distribution,
         action: Tensor,
         seed: int,
+        engine: Mapping[str, Any] | None = None,
     ) -> None:
         self.simulator, self.belief = simulator, belief
         self.action, self.seed = action, seed
-        self.num_drawn = 0
+        self.engine = dict(engine or {})
+        self.num_drawn = self.num_missing = 0
         self._num_waves = 0
         self.declared = self._probe()
 
@@ -65,12 +78,13 @@ class CandidateSampler:
             theta = self.belief.sample((num,))
         action = self.action[candidates]
         rows = theta.repeat(len(action), 1), action.repeat_interleave(num, 0)
-        self.num_drawn += len(rows[0]) * (2 if paired else 1)
         shape = (len(action), num)
 
         def run(simulator: Callable[..., Any], key: str) -> tuple[Tensor, Tensor]:
             seed = derive_seed(self.seed, key, self._num_waves)
-            drawn = simulate(simulator, *rows, seed=seed)
+            drawn = self._simulate(simulator, rows, seed)
+            self.num_drawn += len(drawn)
+            self.num_missing += drawn.counts["missing"]
             x = drawn.x.reshape(*shape, *drawn.x.shape[1:])
             return x, (drawn.status == Outcome.MISSING).reshape(shape)
 
@@ -107,11 +121,12 @@ class CandidateSampler:
         if len(lost) == 0:
             return False
         lost = lost[:: -(-len(lost) // RETRIED)]
-        self.num_drawn += len(lost)
         assert isinstance(self.simulator, SimulatorModel)
         theta, action = (part[lost] for part in rows)
         seed = derive_seed(self.seed, "retry")
-        again = simulate(self.simulator.mean, theta, action, seed=seed)
+        again = self._simulate(self.simulator.mean, (theta, action), seed)
+        self.num_drawn += len(again)
+        self.num_missing += again.counts["missing"]
         known = again.status != Outcome.MISSING
         same = again.x.flatten(1).isfinite() == present[lost]
         return not bool(same[known].all())
@@ -124,14 +139,33 @@ class CandidateSampler:
 
         def run(simulator: Callable[..., Any], key: str) -> Tensor:
             seed = derive_seed(self.seed, "probe", key)
-            return simulate(simulator, theta, action, seed=seed).x
+            return self._simulate(simulator, (theta, action), seed).x
 
         x = run(self.simulator, "first")
         require_noise(x, run(self.simulator, "second"))
         model = self.simulator
         if not isinstance(model, SimulatorModel) or model.noise is None:
             return False
-        return model.is_deterministic(theta, action)
+        reproducible = run(_Reproducible(model), "reproducible")
+        return bool((reproducible[reproducible.isfinite()] == 1).all())
+
+    def _simulate(
+        self, simulator: Callable[..., Any], rows: tuple[Tensor, Tensor], seed: int
+    ) -> Simulations:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+            return simulate(simulator, *rows, seed=seed, **self.engine)
+
+
+@dataclass(frozen=True)
+class _Reproducible:
+    """Says of rows whether the noise-free output is, where a fault costs no more."""
+
+    model: SimulatorModel
+
+    def __call__(self, theta: Tensor, action: Tensor) -> Tensor:
+        same = self.model.is_deterministic(theta, action)
+        return torch.full((len(theta), 1), float(same))
 
 
 def _if_any(missing: Tensor) -> Tensor | None:

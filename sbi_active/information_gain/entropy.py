@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import torch
-from scipy.spatial import KDTree
 from scipy.special import digamma
 from torch import Tensor
 from torch.distributions import Distribution
@@ -15,6 +14,7 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
+from sbi_active.information_gain.nearest_neighbors import nearest_neighbor_entropy
 from sbi_active.information_gain.presence import (
     presence_information,
     presence_notes,
@@ -26,7 +26,6 @@ __all__ = ["EntropyGain", "conditional_entropy", "with_control"]
 
 LOG_2PI_E = math.log(2 * math.pi) + 1
 NOISE_DRAWS = 16  # of the declared noise, for its entropy
-FLOAT32 = 2.0**-23  # outcomes are float32: no two are closer than their rounding
 LOG_SQUARE_MEAN = float(digamma(0.5) + math.log(2))  # E log z^2, z standard normal
 LOG_SQUARE_VARIANCE = math.pi**2 / 2  # Var log z^2
 FEW = 20  # outcomes too few for either entropy
@@ -131,29 +130,6 @@ class EntropyGain(InformationGainEstimator):
             *problems,
             f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}",
         ]
-
-
-def nearest_neighbor_entropy(x: Tensor, num_neighbors: int) -> Tensor:
-    """Return each outcome's contribution to the entropy of x, nats, shape (n,).
-
-    Args:
-        x: Outcomes, shape (n, d).
-        num_neighbors: k.
-    """
-    n, d = x.shape
-    center = x.mean(0)
-    scale = x.std(0).clamp_min(1e-30)
-    z = (x - center) / scale
-    covariance = torch.cov(z.T).reshape(d, d) + 1e-12 * torch.eye(d).double()
-    factor = torch.linalg.cholesky(covariance)
-    z = torch.linalg.solve_triangular(factor, z.T, upper=False).T
-    distance = KDTree(z.numpy()).query(z.numpy(), k=num_neighbors + 1)[0][:, -1]
-    floor = FLOAT32 * float((x.abs().amax(0) / scale).max())  # ties
-    log_distance = torch.from_numpy(distance).clamp_min(floor + 1e-300).log()
-    log_ball = 0.5 * d * math.log(math.pi) - math.lgamma(0.5 * d + 1)
-    log_det = factor.diagonal().log().sum() + scale.log().sum()
-    constant = float(digamma(n) - digamma(num_neighbors)) + log_ball
-    return constant + d * log_distance + log_det
 
 
 def conditional_entropy(simulations: CandidateSimulations) -> tuple[Tensor, Tensor]:

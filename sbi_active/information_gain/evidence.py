@@ -45,21 +45,30 @@ class Evidence:
 
     def __call__(
         self, x: Tensor, slope: Tensor, rows: Tensor, num_local: int
-    ) -> Tensor:
-        """Return log evidences with Jensen's bias removed, shape (rows,)."""
+    ) -> tuple[Tensor, Tensor]:
+        """Return log evidences with Jensen's bias removed, and what they rest on.
+
+        Returns:
+            The log evidences, shape (rows,), and the share of each simulation in them,
+            summed over the outcomes, shape (n,). Local draws have the rest.
+        """
         m = int(self.complete.counted.sum()) - 1
         parts = []
+        influence = torch.zeros(len(self.knots), dtype=torch.float64)
         with forked_generators(0):  # the same base draws for all candidates
             for some in rows.split(BLOCK):
                 shared = self._shared(x, some)
+                weight = shared.softmax(1)
                 log_p, variance = _log_mean(shared, m, m)
                 poor = torch.nonzero(~(variance + 1 / m <= 1 / ENOUGH))[:, 0]
                 if len(poor):
                     i = some[poor]
                     terms = self._with_local(x[i], slope[i], i, shared[poor], num_local)
                     log_p[poor], variance[poor] = _log_mean(terms, m, m + num_local)
+                    weight[poor] = terms.softmax(1)[:, :-num_local]
                 parts.append(log_p + 0.5 * variance)
-        return torch.cat(parts)
+                influence += self.complete.share[some] @ weight.nan_to_num()
+        return torch.cat(parts), influence
 
     def _shared(self, x: Tensor, rows: Tensor) -> Tensor:
         """Log density p(x_i | theta_j), -inf for j = i, shape (rows, n)."""

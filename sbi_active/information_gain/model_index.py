@@ -60,6 +60,7 @@ class RivalSampler:
         probability: Of the models, shape (K,), float64.
         declared: False: no noise is declared.
         num_drawn: Outcomes so far.
+        num_missing: 0: rivals lose none.
 
     Raises:
         ValueError: If there are fewer than two rivals, or their probabilities are not
@@ -67,6 +68,7 @@ class RivalSampler:
     """
 
     declared = False
+    num_missing = 0
 
     def __init__(
         self, rivals: Sequence[RivalPredictive], action: Tensor, seed: int

@@ -20,6 +20,7 @@ from sbi_active.information_gain.entropy import (
     with_control,
 )
 from sbi_active.information_gain.evidence import Evidence, log_belief
+from sbi_active.information_gain.learning_error import learning_error
 from sbi_active.information_gain.presence import (
     presence_information,
     presence_notes,
@@ -32,6 +33,7 @@ __all__ = ["NestedGain"]
 
 FEW = 20  # outcomes too few for an emulator
 MAX_MISSED = 0.5  # of the numbers of x, by smoothing, more than by the noise
+FEWEST = 8  # complete outcomes of one candidate that are compared
 PAIRS = 5  # for each number of x, to estimate its noise
 MAX_ERROR = 1.0  # of the emulator, in noise standard deviations ...
 MAX_SHARE = 0.25  # ... that at most this share of the outcomes may exceed
@@ -64,7 +66,8 @@ class NestedGain(InformationGainEstimator):
     Where noise is not declared, mean and noise are first learned from pairs of outcomes
     at the same parameters (:func:`~sbi_active.information_gain.smoothing.declare`):
     Gaussian noise of one covariance a candidate, and an outcome smooth in theta. The
-    estimate is then the information of the learned model.
+    estimate is then the information of the learned model, and its contributions include
+    the error of learning.
 
     Where outcomes lack numbers, those that are complete are compared under the belief
     given completeness. The noise-free outcomes decide which parameters give complete
@@ -91,9 +94,11 @@ class NestedGain(InformationGainEstimator):
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
     ) -> Tensor:
         gain = presence_information(simulations)
+        enough = _enough(simulations).tolist()
         chances = completeness(simulations)
-        if simulations.noise is None:
-            simulations, _ = declare(simulations)
+        learned = declare(simulations) if simulations.noise is None else None
+        if learned is not None:
+            simulations = learned.simulations
         mean, noise = _declared(simulations)
         entropy, surprise = conditional_entropy(simulations)
         theta = simulations.theta.double()
@@ -105,9 +110,9 @@ class NestedGain(InformationGainEstimator):
         slopes = emulator.slope(emulator.knots)
         q = filled.shape[-1]
         for a, complete in enumerate(chances):
-            rows = complete.share > 0
-            if int(rows.sum()) < FEW:
-                continue
+            rows, counted = complete.share > 0, complete.counted
+            if not enough[a]:
+                continue  # too few measurements: what is present still counts
             evidence = Evidence(
                 emulator=emulator,
                 columns=slice(a * q, (a + 1) * q),
@@ -118,7 +123,7 @@ class NestedGain(InformationGainEstimator):
                 belief=belief,
                 log_belief=log_belief(belief, emulator, emulator.knots),
             )
-            log_p = evidence(
+            log_p, influence = evidence(
                 simulations.x[a].double(),
                 slopes[:, evidence.columns],
                 torch.nonzero(rows)[:, 0],
@@ -128,10 +133,26 @@ class NestedGain(InformationGainEstimator):
             gain[a, rows] += complete.share[rows] * with_control(
                 -log_p - entropy[a, rows], surprise[a, rows] - entropy[a, rows]
             )
+            chance = complete(emulator.knots, emulator).exp()
+            gain[a] += _of_sharing(influence, complete.share, chance, counted)
+            if learned is not None:
+                gain[a, counted] += learning_error(
+                    slopes[counted, evidence.columns],
+                    emulator.knots[counted],
+                    learned.difference[a, counted],
+                    learned.residual[a, counted],
+                    complete.share[counted],
+                )
         return gain
 
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         notes = presence_notes(simulations)
+        few = int((~_enough(simulations)).sum())
+        if few:
+            notes.append(
+                f"too few complete outcomes at {few} of {len(simulations.action)} "
+                "actions: only which numbers are present counts, a lower bound"
+            )
         if simulations.noise is None:
             notes.append(
                 "noise not declared: it and the mean are learned from pairs, which can "
@@ -151,7 +172,7 @@ class NestedGain(InformationGainEstimator):
             return [f"fewer than {needed} complete outcomes a candidate"]
         if simulations.noise is None:
             problems = EntropyGain().problems(simulations)
-            missed = declare(simulations)[1] > 1 + MAX_ERROR
+            missed = declare(simulations).score > 1 + MAX_ERROR
             share = float(missed.double().mean())
             if share > MAX_MISSED:
                 problems.append(f"smoothing misses {share:.0%} of the numbers of x")
@@ -178,6 +199,42 @@ def noise_scale(simulations: CandidateSimulations) -> Tensor:
     finite = square.isfinite()
     square = torch.where(finite, square, 0.0).sum(1) / finite.sum(1).clamp_min(1)
     return torch.where(square > 0, square, 1.0).sqrt()
+
+
+def _enough(simulations: CandidateSimulations) -> Tensor:
+    """Whether complete outcomes suffice to compare, or to learn from, shape (a,)."""
+    needed = FEWEST
+    if simulations.noise is None:
+        needed = max(FEWEST, simulations.x[0, 0].numel() + 2)
+    return simulations.complete.sum(1) >= needed
+
+
+def _of_sharing(
+    influence: Tensor, share: Tensor, chance: Tensor, counted: Tensor
+) -> Tensor:
+    r"""Return what simulations add to the error by being in the evidence of others.
+
+    Simulation j, of completeness :math:`v_j`, changes :math:`- \sum_i \log \hat p(x_i)`
+    by minus its share in the evidences. Without local draws that is :math:`v_j` but for
+    noise, and the contributions of its own outcome and of validity are all. Local draws
+    take a share :math:`\lambda` and know the belief, so that only the chance
+    :math:`\pi(\theta_j)` of a complete outcome is learned from simulations:
+
+    .. math::
+        (1 - \lambda) v_j + \lambda \pi(\theta_j) - \sum_i v_i w_{ij}
+
+    Args:
+        influence: The last sum, shape (n,).
+        share: v, shape (n,).
+        chance: :math:`\pi(\theta)`, shape (n,).
+        counted: Rows that are not missing, shape (n,), bool.
+
+    Returns:
+        Shape (n,), of mean zero; it adds to errors and leaves the estimate.
+    """
+    local = 1 - influence.sum() / share.sum()
+    effect = (1 - local) * share + local * chance - influence
+    return torch.where(counted, effect - effect[counted].mean(), 0.0)
 
 
 def _declared(simulations: CandidateSimulations) -> tuple[Tensor, NoiseModel]:

@@ -21,7 +21,7 @@ from sbi_active.information_gain.conditional_density import (
     log_normal,
 )
 from sbi_active.information_gain.cross_fitting import cross_fit, patterns_of_numbers
-from sbi_active.information_gain.entropy import nearest_neighbor_entropy
+from sbi_active.information_gain.nearest_neighbors import nearest_neighbor_entropy
 from sbi_active.seeding import forked_generators
 
 __all__ = ["ParameterGain"]

@@ -37,7 +37,8 @@ class PosteriorGain(InformationGainEstimator):
     :math:`E[U(\xi)] = I(\theta; x | \xi) - E[\mathrm{KL}(p(\theta | x, \xi) \| q)]`,
     so on simulations that q was not trained on it is a lower bound. Its slack differs
     by action: ranking by it is not ranking by information where q is blunter for one
-    action than for another.
+    action than for another. Outcomes at the same parameters are averaged, as they are
+    not independent.
 
     Args:
         batch_size: Rows in one pass of the network; bounds memory.
@@ -57,9 +58,15 @@ class PosteriorGain(InformationGainEstimator):
         simulations: CandidateSimulations,
         belief: Distribution,
     ) -> Tensor:
-        rows = [part.split(self.batch_size) for part in simulations.rows()]
-        log_q = torch.cat(
-            [model.log_posterior(*batch) for batch in zip(*rows, strict=True)]
-        )
         log_p = belief.log_prob(simulations.theta)
-        return log_q.reshape(simulations.x.shape[:2]) - log_p
+        gains = []
+        for x in simulations.outcomes():
+            theta, action = simulations.rows()
+            rows = [
+                part.split(self.batch_size) for part in (theta, x.flatten(0, 1), action)
+            ]
+            log_q = torch.cat(
+                [model.log_posterior(*batch) for batch in zip(*rows, strict=True)]
+            )
+            gains.append(log_q.reshape(x.shape[:2]) - log_p)
+        return torch.stack(gains).mean(0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from sbi_active.information_gain.emulator import kernel, linear, whitening
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise
 
-__all__ = ["declare", "fill"]
+__all__ = ["Learned", "declare", "fill"]
 
 LENGTHS = (0.7, 1.0, 1.4, 2.0, 4.0)  # in standard deviations of the belief
 REFINED = (0.7, 1.0, 1.4)  # of the best, in the metric of slopes
@@ -21,7 +21,27 @@ FEW = 300  # rows that choose the metric
 FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise
 
 
-def declare(simulations: CandidateSimulations) -> tuple[CandidateSimulations, Tensor]:
+@dataclass(frozen=True)
+class Learned:
+    """Simulations of a learned model, and what it was learned from.
+
+    Attributes:
+        simulations: In whitened coordinates with mean and noise, x of shape (a, n, q).
+        score: Leave-one-out mean squares over their expectation under the noise, near 1
+            where smoothing misses nothing, shape (a, q).
+        difference: Of the pairs, of unit mean square; zero for incomplete ones,
+            (a, n, q).
+        residual: Of the pairs' averages to the smoothed mean; zero where there is
+            none, shape (a, n, q).
+    """
+
+    simulations: CandidateSimulations
+    score: Tensor
+    difference: Tensor
+    residual: Tensor
+
+
+def declare(simulations: CandidateSimulations) -> Learned:
     r"""Return simulations of the learned model, whose noise is declared.
 
     The noise of a candidate is Gaussian with the covariance of the pairs' differences,
@@ -44,9 +64,7 @@ def declare(simulations: CandidateSimulations) -> tuple[CandidateSimulations, Te
         simulations: With replicates.
 
     Returns:
-        The simulations in whitened coordinates with mean and noise, x of shape (a, n,
-        q); and the leave-one-out mean squares over their expectation under the noise,
-        near 1 where smoothing misses nothing, shape (a, q).
+        The simulations of the learned model.
     """
     assert simulations.replicate is not None
     theta, complete = simulations.theta.double(), simulations.complete
@@ -66,16 +84,18 @@ def declare(simulations: CandidateSimulations) -> tuple[CandidateSimulations, Te
     factor = torch.linalg.cholesky(covariance)
     average = fill(theta, torch.stack([x, again]).nanmean(0)).mT
     white = torch.linalg.solve_triangular(factor, average, upper=False).mT
+    difference = torch.linalg.solve_triangular(factor, difference.mT, upper=False).mT
     f, square = _smooth(theta, white.transpose(0, 1).flatten(1))
     mean = f.reshape(n, num_actions, q).transpose(0, 1)
     known = (simulations.completeness > 0)[..., None]
+    residual = torch.where(known, white - mean, 0.0)
     mean = torch.where(known, mean, torch.nan)
     with forked_generators(0, "smoothing"):
         x = mean + torch.randn(n, q, dtype=torch.float64)
     declared = replace(
         simulations, x=x, mean=mean, noise=GaussianNoise(1.0), replicate=None
     )
-    return declared, 2 * square.reshape(num_actions, q)
+    return Learned(declared, 2 * square.reshape(num_actions, q), difference, residual)
 
 
 def fill(theta: Tensor, x: Tensor) -> Tensor:

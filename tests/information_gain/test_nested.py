@@ -111,7 +111,7 @@ def test_noise_that_is_not_declared_is_learned():
     declared_gain, error = estimate(rows, prior)
     learned, _ = estimate(pairs, prior)
     assert ((learned - declared_gain).abs() < 3 * error + 0.2).all()
-    _, square = declare(pairs)
+    square = declare(pairs).score
     assert square.shape == (4, 6)
     assert 0.9 < float(square.median()) < 1.5
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -18,11 +20,19 @@ def test_shape_and_rows():
     gain = PosteriorGain()(ExactModel(), rows, PRIOR)
     assert gain.shape == (3, 5)
     assert gain.dtype == torch.float64
-    theta, x, action = rows.rows()
-    assert theta.shape == x.shape == (15, 2)
-    assert torch.equal(x[5:10], rows.x[1])
+    theta, action = rows.rows()
+    assert theta.shape == (15, 2)
     assert (action[5:10] == 1).all()
     assert torch.equal(theta[5:10], rows.theta)
+
+
+def test_outcomes_at_the_same_parameters_are_averaged():
+    rows, other = simulations(n=400), simulations(n=400, seed=1)
+    pairs = replace(rows, replicate=other.x)
+    again = PosteriorGain()(ExactModel(), replace(rows, x=other.x), PRIOR)
+    gain = PosteriorGain()(ExactModel(), rows, PRIOR)
+    mean = PosteriorGain()(ExactModel(), pairs, PRIOR)
+    assert torch.allclose(mean, (gain + again) / 2)
 
 
 def test_the_exact_posterior_gives_the_information():
