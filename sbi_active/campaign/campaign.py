@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,13 +13,18 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.health import Health, assess
+from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.revision import criticize, revise
 from sbi_active.campaign.state import CampaignOptions, CampaignState, Status, Trial
+from sbi_active.campaign.telling import outcome_told, same_outcome, trial_to_tell
+from sbi_active.campaign.unlike import most_unlike
 from sbi_active.designer import InformationGainDesigner, RandomDesigner
-from sbi_active.inference import ASBI, information_gained
-from sbi_active.inference.belief import require_support
-from sbi_active.inference.condition import action_rows, outcome_rows
-from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import simulate
+from sbi_active.inference.condition import action_rows
+from sbi_active.seeding import derive_seed
+
+if TYPE_CHECKING:
+    from sbi_active.criticism import Effect, Report
 
 __all__ = ["METHODS", "Campaign"]
 
@@ -81,26 +84,21 @@ class Campaign:
                 f"expected method to be one of {', '.join(map(repr, METHODS))}; got "
                 f"{method!r}; do choose one of these"
             )
-        self.simulator = simulator
-        self.prior = require_support(prior)
         self.actions = actions
         options = CampaignOptions() if options is None else options
         self.state = CampaignState(method=method, seed=seed, options=options)
-        self._inference = ASBI(
-            prior, options.density_estimator, show_progress_bars=False
-        )
+        self._learner = Learner(simulator, prior, actions, self.state)
         self._designer = (
             InformationGainDesigner(
                 actions,
                 num_samples=options.num_samples,
                 estimator=options.estimator,
                 eliminate=options.eliminate,
+                **options.engine,
             )
             if METHODS[method]
-            else RandomDesigner(actions)
+            else RandomDesigner(actions, **options.engine)
         )
-        self._x_shape = self._probe()
-        self._round_ready = False
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None
@@ -112,9 +110,31 @@ class Campaign:
     @property
     def belief(self) -> Distribution:
         """The belief after the trials in ``state.processed``; the prior before any."""
-        belief = self._inference.belief
-        assert belief is not None
-        return belief
+        return self._learner.belief
+
+    @property
+    def simulator(self) -> Callable[..., Any]:
+        """The current simulator, with the effects that were adopted."""
+        return self._learner.simulator
+
+    @simulator.setter
+    def simulator(self, simulator: Callable[..., Any]) -> None:
+        self._learner.simulator = simulator
+
+    @property
+    def prior(self) -> Distribution:
+        """The original prior, times those of the effects that were adopted."""
+        return self._learner.prior
+
+    @property
+    def health(self) -> Health:
+        """Whether the simulator still explains the trials that the belief contains.
+
+        While it is right, an "alarm" comes in at most 5 % of campaigns, however long
+        they are, and a "watch" now and then. Under an alarm the belief may be narrow
+        and wrong: do :meth:`criticize`.
+        """
+        return assess(self.state)
 
     @property
     def history(self) -> Sequence[Trial]:
@@ -140,25 +160,39 @@ class Campaign:
         trial = Trial(index, torch.empty(0))
         self.state.trials.append(trial)
         try:
-            model = self._trained(index) if METHODS[self.state.method] else None
-            with self._stage(index, "design"):
-                design = self._designer.select(
+            designer, designs = self._designer, METHODS[self.state.method]
+            if designs and self._checks(index):
+                executed = [t.action for t in self.history if t.status != "missing"]
+                places = most_unlike(
+                    self.actions,
+                    torch.stack(executed) if executed else torch.empty(0),
+                )
+                designer = RandomDesigner(places, **self.state.options.engine)
+                designs = False
+            model = self._learner.trained(index) if designs else None
+            with self.state.stage(index, "design"):
+                design = designer.select(
                     model,
-                    self.simulator,
+                    self._learner.at(index),
                     belief=self.belief,
                     seed=derive_seed(self.state.seed, "design", index),
                 )
-            self._change(
+            trial = self.state.trials[index]
+            self.state.change(
                 index,
                 action=design.action,
                 design=design,
-                num_simulations=self.state.trials[index].num_simulations
-                + design.num_simulations,
+                num_simulations=trial.num_simulations + design.num_simulations,
+                num_missing=trial.num_missing + design.num_missing,
             )
         except BaseException:
             self.state.trials.pop()
             raise
         return self.state.trials[index]
+
+    def _checks(self, index: int) -> bool:
+        every = self.state.options.check_every
+        return every is not None and (index + 1) % every == 0
 
     def tell(
         self,
@@ -191,8 +225,8 @@ class Campaign:
                 f"expected status 'ok', 'invalid' or 'missing'; got {status!r}; do "
                 "choose one of these"
             )
-        target = self._trial_to_tell(trial, action)
-        outcome = self._outcome(x, status)
+        target = trial_to_tell(self.state, trial, has_action=action is not None)
+        outcome = outcome_told(x, status, self._learner.x_shape)
         if outcome is not None and not bool(outcome.isfinite().any()):
             status = "invalid"
         executed = target.action
@@ -207,7 +241,7 @@ class Campaign:
             )
         told = replace(target, action=executed, x=outcome, status=status)
         if target.status != "pending":
-            if not _same_outcome(target, told):
+            if not same_outcome(target, told):
                 raise ValueError(
                     f"expected no second outcome for trial {target.index}; got another "
                     "one than the one recorded; do tell(x, action=...) to record a "
@@ -225,7 +259,9 @@ class Campaign:
             if trial.index in self.state.processed:
                 continue
             if trial.status != "missing":
-                self._learn_from(trial)
+                if trial.version != self.state.version.number:
+                    self._learner.score(trial)
+                self._learner.learn(self.state.trials[trial.index])
             self.state.processed.append(trial.index)
         return self.belief
 
@@ -257,137 +293,51 @@ class Campaign:
                 on_round(self.state.trials[index])
         return self.belief
 
-    def _learn_from(self, trial: Trial) -> None:
-        assert trial.x is not None
-        self._trained(trial.index)
-        before = self.belief
-        seed, options = self.state.seed, self.state.options
-        with self._stage(trial.index, "update"):
-            with forked_generators(seed, "update", trial.index):
-                belief = self._inference.update(
-                    trial.x,
-                    action=trial.action,
-                    simulator=self.simulator if options.refine else None,
-                    refinement=replace(options.refinement, **options.engine),
-                    seed=derive_seed(seed, "refine", trial.index),
-                )
-            gained = information_gained(
-                belief, before, seed=derive_seed(seed, "gain", trial.index)
-            )
-        diagnostics, trial = belief.diagnostics, self.state.trials[trial.index]
-        self._round_ready = False
-        self._change(
-            trial.index,
-            information_gained=gained,
-            num_simulations=(
-                trial.num_simulations + diagnostics.get("num_simulations", 0)
-            ),
-            num_missing=trial.num_missing + diagnostics.get("num_missing", 0),
-        )
+    def criticize(
+        self, effects: Sequence[Effect] = (), *, evaluate: bool = True
+    ) -> Report:
+        """Compare the current simulator with all trials so far.
 
-    def _trained(self, index: int) -> Any:
-        """Return the posterior trained under the current belief, training if needed."""
-        if not self._round_ready:
-            seed, options = self.state.seed, self.state.options
-            with self._stage(index, "simulation"):
-                with forked_generators(seed, "theta", index):
-                    theta = self.belief.sample((options.num_simulations,))
-                action = self.actions.sample(
-                    (options.num_simulations,), seed=derive_seed(seed, "action", index)
-                )
-                rows = simulate(
-                    self.simulator,
-                    theta,
-                    action,
-                    seed=derive_seed(seed, "x", index),
-                    **options.engine,
-                )
-                known = rows.without_missing()
-            with self._stage(index, "training"):
-                self._inference.append_simulations(
-                    known.theta, known.x, action=known.action, belief=self.belief
-                )
-                with forked_generators(seed, "train", index):
-                    self._inference.train()
-            trial = self.state.trials[index]
-            self._change(
-                index,
-                num_simulations=trial.num_simulations + len(rows),
-                num_missing=trial.num_missing + rows.counts["missing"],
-            )
-            self._round_ready = True
-        return self._inference.build_posterior()
+        Args:
+            effects: What the simulator may lack; those already adopted are left out.
+                The first library of a model counts as frozen: with another one, or
+                other priors, the report is "exploratory".
+            evaluate: As in :func:`~sbi_active.criticism.close_loop`.
 
-    def _probe(self) -> torch.Size:
-        """Return x_shape from a few simulations, which must differ by seed."""
-        seed = self.state.seed
-        with forked_generators(seed, "probe"):
-            theta = self.prior.sample((16,))
-        action = self.actions.sample((16,), seed=derive_seed(seed, "probe"))
-        rows = simulate(
+        Returns:
+            The report; :meth:`adopt` takes it.
+
+        Raises:
+            ValueError: If fewer than two trials gave a measurement, or the effects do
+                not fit.
+        """
+        self.update()
+        return criticize(
+            self.state,
             self.simulator,
-            theta,
-            action,
-            seed=derive_seed(seed, "probe", 1),
-            check_noise=True,
-            **self.state.options.engine,
+            self.prior,
+            self.actions,
+            effects=effects,
+            evaluate=evaluate,
+            designed=METHODS[self.state.method],
         )
-        return rows.x.shape[1:]
 
-    def _trial_to_tell(self, trial: Trial | int | None, action: Any) -> Trial:
-        if trial is None:
-            if self.pending is not None:
-                return self.pending
-            if action is None:
-                raise ValueError(
-                    "expected a pending trial; got none; do ask() first, or pass "
-                    "action= to record a trial that was not asked for"
-                )
-            return Trial(len(self.state.trials), torch.empty(0))
-        index = trial.index if isinstance(trial, Trial) else trial
-        if not 0 <= index < len(self.state.trials):
-            raise ValueError(
-                f"expected the index of one of {len(self.state.trials)} trials; got "
-                f"{index}; do pass the trial that ask() returned"
-            )
-        return self.state.trials[index]
+    def adopt(self, report: Report) -> Distribution:
+        """Go on with the augmented simulator of a report.
 
-    def _outcome(self, x: Any, status: Status) -> Tensor | None:
-        if status == "missing":
-            return None
-        if status == "invalid":  # numbers told along with it are no measurement
-            return torch.full(self._x_shape, torch.nan)
-        if x is None:
-            raise ValueError(
-                "expected the outcome x; got None; do tell(x), or tell(status=...) "
-                "with 'invalid' or 'missing' where there is none"
-            )
-        tensor = x if isinstance(x, Tensor) else torch.as_tensor(np.asarray(x))
-        if (
-            tensor.shape != self._x_shape
-            and tensor.numel() == self._x_shape.numel() == 1
-        ):
-            tensor = tensor.reshape(self._x_shape)
-        return outcome_rows(tensor, self._x_shape)[0]
+        All trials are inferred again, from the original prior times those of the
+        effects. A pending trial stays; surprises and health start anew.
 
-    def _change(self, index: int, **changes: Any) -> None:
-        self.state.trials[index] = replace(self.state.trials[index], **changes)
+        Args:
+            report: Of :meth:`criticize`, whose verdict names effects.
 
-    @contextmanager
-    def _stage(self, index: int, name: str) -> Iterator[None]:
-        """Add the time spent in the block to a trial's account."""
-        wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        trial = self.state.trials[index]
-        seconds, cpu_seconds = dict(trial.seconds), dict(trial.cpu_seconds)
-        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - wall
-        cpu_seconds[name] = cpu_seconds.get(name, 0.0) + time.process_time() - cpu
-        self._change(index, seconds=seconds, cpu_seconds=cpu_seconds)
+        Returns:
+            The belief over (theta, phi).
 
-
-def _same_outcome(a: Trial, b: Trial) -> bool:
-    if a.status != b.status or not torch.equal(a.action, b.action):
-        return False
-    if a.x is None or b.x is None:
-        return a.x is b.x
-    return bool(torch.allclose(a.x, b.x, equal_nan=True))
+        Raises:
+            ValueError: If the verdict names none, or the report belongs to another
+                model than the current one.
+        """
+        self.update()
+        self._learner = revise(self.state, self._learner, self.actions, report)
+        return self.belief

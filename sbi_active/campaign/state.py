@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from torch import Tensor
@@ -11,7 +14,7 @@ from sbi_active.designer import Design
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.refine import Refinement
 
-__all__ = ["CampaignOptions", "CampaignState", "Status", "Trial"]
+__all__ = ["CampaignOptions", "CampaignState", "ModelVersion", "Status", "Trial"]
 
 Status = Literal["pending", "ok", "invalid", "missing"]
 
@@ -32,7 +35,12 @@ class CampaignOptions:
             it, beliefs are chained as in the paper.
         refinement: Settings of the refinement; those of its simulations are taken from
             here.
-        num_workers: Of the simulations of training and refinement, see
+        num_scored: Simulations of each executed action, from the belief before the
+            trial, that its outcome is compared with.
+        check_every: Every so many-th trial goes where none was, instead of where most
+            is to be learned about the parameters: at as many settings as parameters
+            any simulator fits, and nothing tells that it is wrong. None never checks.
+        num_workers: Of all simulations, see
             :func:`~sbi_active.simulation.simulate`.
         time_limit: Seconds a simulated row may take; None waits for ever. With it, or
             with more than one worker, a simulator that ends its process costs a row.
@@ -46,6 +54,8 @@ class CampaignOptions:
     eliminate: bool = True
     refine: bool = True
     refinement: Refinement = Refinement()
+    num_scored: int = 2_000
+    check_every: int | None = None
     num_workers: int = 1
     time_limit: float | None = None
     num_retries: int = 0
@@ -82,6 +92,16 @@ class CampaignOptions:
                 f"expected num_simulations >= 100; got {self.num_simulations}; do use "
                 "about 5000 a round"
             )
+        if self.num_scored < 100:
+            raise ValueError(
+                f"expected num_scored >= 100; got {self.num_scored}; do use about "
+                "2000, since no tail probability is below 1 / (num_scored + 1)"
+            )
+        if self.check_every is not None and self.check_every < 1:
+            raise ValueError(
+                f"expected check_every >= 1 or None; got {self.check_every}; do use 2 "
+                "or 3 where the simulator may lack something"
+            )
 
 
 @dataclass(frozen=True)
@@ -97,11 +117,16 @@ class Trial:
             hit it, which is ignored.
         design: The design behind the action; None where the trial was not asked for.
         information_gained: Realized, KL(belief after || before) in nats.
+        surprise: Tail probability of x under the posterior predictive of the belief
+            before the trial; uniform where the simulator is right.
+        log_score: Log density of x under it, nats.
+        misfit: Tail probability of all trials so far under the belief after this one,
+            which was fitted to them; None for a belief that was not refined.
+        version: Number of the model that scored the trial.
         seconds: Wall time by stage.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
-        num_missing: Those of them lost to faults of the simulator, in training and
-            refinement.
+        num_missing: Those of them lost to faults of the simulator.
     """
 
     index: int
@@ -110,10 +135,35 @@ class Trial:
     status: Status = "pending"
     design: Design | None = None
     information_gained: float | None = None
+    surprise: float | None = None
+    log_score: float | None = None
+    misfit: float | None = None
+    version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
     num_simulations: int = 0
     num_missing: int = 0
+
+
+@dataclass(frozen=True)
+class ModelVersion:
+    """A simulator that a campaign used, and how it came to it.
+
+    Attributes:
+        number: From 0, the simulator that the campaign started with.
+        effects: All that were adopted so far, in the order of their parameters.
+        digest: Hash of noise, library and priors behind the adoption; "" at first.
+        num_trials: Told before it was adopted.
+        misfit: As in :class:`Trial`, of the trials that the version was given.
+        examined: Digests of the comparisons of this version with trials, in order.
+    """
+
+    number: int = 0
+    effects: tuple[str, ...] = ()
+    digest: str = ""
+    num_trials: int = 0
+    misfit: float | None = None
+    examined: tuple[str, ...] = ()
 
 
 @dataclass
@@ -126,6 +176,7 @@ class CampaignState:
         options: Sizes and estimators.
         trials: In the order in which they were asked for or told.
         processed: Indices of trials that the belief contains, in order of use.
+        versions: Lineage of the simulator, the current one last.
     """
 
     method: str
@@ -133,3 +184,30 @@ class CampaignState:
     options: CampaignOptions
     trials: list[Trial] = field(default_factory=list)
     processed: list[int] = field(default_factory=list)
+    versions: list[ModelVersion] = field(default_factory=lambda: [ModelVersion()])
+
+    @property
+    def version(self) -> ModelVersion:
+        """The current model."""
+        return self.versions[-1]
+
+    @property
+    def measured(self) -> Sequence[Trial]:
+        """The trials that the belief contains, those without a fault, in order."""
+        used = [self.trials[i] for i in self.processed]
+        return [t for t in used if t.status in ("ok", "invalid")]
+
+    def change(self, index: int, **changes: Any) -> None:
+        """Replace entries of a trial."""
+        self.trials[index] = replace(self.trials[index], **changes)
+
+    @contextmanager
+    def stage(self, index: int, name: str) -> Iterator[None]:
+        """Add the time spent in the block to a trial's account."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        trial = self.trials[index]
+        seconds, cpu_seconds = dict(trial.seconds), dict(trial.cpu_seconds)
+        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - wall
+        cpu_seconds[name] = cpu_seconds.get(name, 0.0) + time.process_time() - cpu
+        self.change(index, seconds=seconds, cpu_seconds=cpu_seconds)

@@ -20,6 +20,7 @@ ACTIONS = DiscreteActions([0.1, 1.0, 3.0])
 OPTIONS = CampaignOptions(
     num_simulations=600,
     num_samples=100,
+    num_scored=200,
     density_estimator=MixtureDensity(
         hidden_features=(32,), num_components=2, num_iterations=400, learning_rate=3e-3
     ),
@@ -51,8 +52,9 @@ def test_ask_tell_update():
     assert abs(float(belief.mean) - 0.5) < 0.1
     trial = c.history[0]
     assert trial.information_gained > 0.5
-    assert {*trial.cpu_seconds} == {"simulation", "training", "design", "update"}
-    spent = belief.diagnostics["num_simulations"]
+    stages = {"simulation", "training", "design", "scoring", "update"}
+    assert {*trial.cpu_seconds} == stages
+    spent = belief.diagnostics["num_simulations"] + OPTIONS.num_scored
     assert trial.num_simulations == 600 + trial.design.num_simulations + spent
     assert belief.label == "refined"
 

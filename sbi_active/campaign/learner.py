@@ -1,0 +1,223 @@
+"""Inference of a campaign on one version of its simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
+from sbi_active.campaign.score import score_outcome
+from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.inference import ASBI, information_gained
+from sbi_active.inference.belief import require_support
+from sbi_active.inference.rounds import Observation
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
+
+__all__ = ["Learner"]
+
+
+class Learner:
+    """Trains, scores and updates for a campaign, and writes it to the campaign's state.
+
+    Args:
+        simulator: ``simulator(theta, action)``. One with a ``next_index`` that matters
+            is simulated at the index of each trial.
+        prior: Over its parameters.
+        actions: Of the campaign.
+        state: Of the campaign.
+
+    Attributes:
+        x_shape: Of an outcome.
+
+    Raises:
+        ValueError: If the prior has no support, or the simulator is deterministic.
+    """
+
+    def __init__(
+        self,
+        simulator: Callable[..., Any],
+        prior: Distribution,
+        actions: ActionSpace,
+        state: CampaignState,
+    ) -> None:
+        self.simulator, self.prior = simulator, require_support(prior)
+        self._actions, self._state = actions, state
+        self._inference = ASBI(
+            prior, state.options.density_estimator, show_progress_bars=False
+        )
+        self.x_shape = self._probe()
+        seed = derive_seed(state.seed, "index")
+        self._has_index = depends_on_index(simulator, prior, actions, seed=seed)
+        self._round_ready = False
+
+    @property
+    def belief(self) -> Distribution:
+        """The belief after the trials learned so far; the prior before any."""
+        belief = self._inference.belief
+        assert belief is not None
+        return belief
+
+    def at(self, index: int) -> Callable[..., Any]:
+        """Return the simulator of the trial of an index."""
+        return at_index(self.simulator, index) if self._has_index else self.simulator
+
+    def score(self, trial: Trial) -> None:
+        """Compare a trial with what the belief before it predicts."""
+        assert trial.x is not None
+        state = self._state
+        with state.stage(trial.index, "scoring"):
+            score = score_outcome(
+                trial.x,
+                trial.action,
+                self.at(trial.index),
+                self.belief,
+                num_samples=state.options.num_scored,
+                seed=derive_seed(state.seed, "score", trial.index),
+                engine=state.options.engine,
+            )
+        self._account(
+            trial.index,
+            score.num_simulations,
+            score.num_missing,
+            surprise=score.surprise,
+            log_score=score.log_score,
+            version=state.version.number,
+        )
+
+    def learn(self, trial: Trial) -> None:
+        """Bring the belief up to date with one more trial."""
+        assert trial.x is not None
+        if not self._has_index:
+            self.trained(trial.index)
+        before = self.belief
+        state = self._state
+        seed, options = state.seed, state.options
+        with state.stage(trial.index, "update"):
+            if self._has_index:
+                earlier = [t for t in state.measured if t.index != trial.index]
+                belief = self._infer([*earlier, trial], trial.index)
+            else:
+                with forked_generators(seed, "update", trial.index):
+                    belief = self._inference.update(
+                        trial.x,
+                        action=trial.action,
+                        simulator=self.simulator if options.refine else None,
+                        refinement=replace(options.refinement, **options.engine),
+                        seed=derive_seed(seed, "refine", trial.index),
+                    )
+            gained = information_gained(
+                belief, before, seed=derive_seed(seed, "gain", trial.index)
+            )
+        self._round_ready = False
+        figures = belief.diagnostics
+        self._account(
+            trial.index,
+            figures.get("num_simulations", 0),
+            figures.get("num_missing", 0),
+            information_gained=gained,
+            misfit=misfit(figures),
+        )
+
+    def infer(self, trials: Sequence[Trial]) -> Any:
+        """Replace the belief by that of these trials, from scratch; return it."""
+        self._round_ready = False
+        return self._infer(trials, len(trials))
+
+    def _infer(self, trials: Sequence[Trial], key: int) -> Any:
+        simulator: Any = self.simulator
+        if self._has_index:
+            simulator = IndexedSimulator(simulator)
+        observed = []
+        for trial in trials:
+            assert trial.x is not None
+            place = torch.tensor([float(trial.index)]) if self._has_index else None
+            action = trial.action if place is None else torch.cat([trial.action, place])
+            observed.append(Observation(action, trial.x.float()))
+        state = self._state
+        options = state.options
+        return self._inference.update_all(
+            observed,
+            simulator,
+            refinement=replace(options.refinement, **options.engine),
+            seed=derive_seed(state.seed, "infer", state.version.number, key),
+        )
+
+    def trained(self, index: int) -> Any:
+        """Return the posterior trained under the current belief, training if needed.
+
+        Args:
+            index: Of the trial that the work is for.
+        """
+        state = self._state
+        if not self._round_ready:
+            seed, options = state.seed, state.options
+            with state.stage(index, "simulation"):
+                with forked_generators(seed, "theta", index):
+                    theta = self.belief.sample(torch.Size([options.num_simulations]))
+                action = self._actions.sample(
+                    (options.num_simulations,), seed=derive_seed(seed, "action", index)
+                )
+                rows = simulate(
+                    self.at(index),
+                    theta,
+                    action,
+                    seed=derive_seed(seed, "x", index),
+                    **options.engine,
+                )
+                known = rows.without_missing()
+            with state.stage(index, "training"):
+                self._inference.append_simulations(
+                    known.theta, known.x, action=known.action, belief=self.belief
+                )
+                with forked_generators(seed, "train", index):
+                    self._inference.train()
+            self._account(index, len(rows), rows.counts["missing"])
+            self._round_ready = True
+        return self._inference.build_posterior()
+
+    def _account(
+        self, index: int, num_simulations: int, num_missing: int, **changes: Any
+    ) -> None:
+        trial = self._state.trials[index]
+        self._state.change(
+            index,
+            num_simulations=trial.num_simulations + num_simulations,
+            num_missing=trial.num_missing + num_missing,
+            **changes,
+        )
+
+    def _probe(self) -> torch.Size:
+        """Return x_shape from a few simulations, which must differ by seed."""
+        seed = self._state.seed
+        with forked_generators(seed, "probe"):
+            theta: Tensor = self.prior.sample(torch.Size([16]))
+        action = self._actions.sample((16,), seed=derive_seed(seed, "probe"))
+        rows = simulate(
+            self.simulator,
+            theta,
+            action,
+            seed=derive_seed(seed, "probe", 1),
+            check_noise=True,
+            **self._state.options.engine,
+        )
+        return rows.x.shape[1:]
+
+
+def misfit(diagnostics: dict[str, Any]) -> float | None:
+    """Return a belief's tail probability, of all trials or the worst, both counted.
+
+    Args:
+        diagnostics: Of the belief; without tail probabilities there is none.
+    """
+    if "tail_probability" not in diagnostics:
+        return None
+    each = diagnostics["tail_probability_of_trial"]
+    worst = min(diagnostics["tail_probability"], len(each) * min(each))
+    return min(1.0, 2 * float(worst))

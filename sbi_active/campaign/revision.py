@@ -1,0 +1,122 @@
+"""A campaign's simulator compared with its trials, and replaced."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.campaign.learner import Learner, misfit
+from sbi_active.campaign.state import CampaignState, ModelVersion
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation import SimulatorModel
+
+if TYPE_CHECKING:
+    from sbi_active.criticism import Effect, Report
+
+__all__ = ["criticize", "revise"]
+
+
+def criticize(
+    state: CampaignState,
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    actions: ActionSpace,
+    *,
+    effects: Sequence[Effect],
+    evaluate: bool,
+    designed: bool,
+) -> Report:
+    """Return the report of a campaign's trials, and note the comparison in its state.
+
+    Args:
+        state: Of the campaign.
+        simulator: The current one; a plain callable is the draw.
+        prior: Of its parameters.
+        actions: The permitted ones.
+        effects: What it may lack.
+        evaluate: Whether to report the error before and after.
+        designed: Whether the actions were chosen for information.
+    """
+    # Criticism reads results of everything below, so it is imported where it is used.
+    from sbi_active.criticism import Criticism, Trials
+
+    measured = state.measured
+    if len(measured) < 2:
+        raise ValueError(
+            f"expected at least two trials to compare; got {len(measured)}; do run "
+            "more trials first"
+        )
+    if not isinstance(simulator, SimulatorModel):
+        simulator = SimulatorModel(simulator)
+    outcomes = [t.x for t in measured if t.x is not None]
+    version = state.version
+    criticism = Criticism(
+        simulator,
+        prior,
+        Trials(
+            torch.stack([t.action for t in measured]),
+            torch.stack(outcomes),
+            index=[t.index for t in measured],
+        ),
+        effects=[e for e in effects if e.name not in version.effects],
+        actions=actions,
+        seed=derive_seed(state.seed, "criticism", len(measured)),
+    )
+    report = criticism.report(
+        evaluate=evaluate,
+        designed=designed,
+        exploratory=any(d != criticism.digest for d in version.examined),
+    )
+    examined = (*version.examined, criticism.digest)
+    state.versions[-1] = replace(version, examined=examined)
+    return report
+
+
+def revise(
+    state: CampaignState, learner: Learner, actions: ActionSpace, report: Report
+) -> Learner:
+    """Return the learner of a report's simulator, which has learned all trials.
+
+    The state gains a version; nothing changes where this raises.
+
+    Args:
+        state: Of the campaign.
+        learner: The current one.
+        actions: Of the campaign.
+        report: Whose verdict names effects.
+    """
+    chosen = report.tracing.chosen
+    if not chosen:
+        raise ValueError(
+            "expected a report whose verdict names effects; got the verdict "
+            f"{report.verdict!r}, which adds none; do criticize(effects) with further "
+            "effects, or after further trials"
+        )
+    before = state.version
+    added: Any = getattr(report.simulator, "effects", ())
+    names = [e.name for e in added if e.scope == "campaign"]
+    if report.digest not in before.examined or names != [*before.effects, *chosen]:
+        raise ValueError(
+            f"expected a report of the current model, version {before.number}; got one "
+            "of another; do criticize() again"
+        )
+    version = ModelVersion(
+        number=before.number + 1,
+        effects=(*names,),
+        digest=report.digest,
+        num_trials=len(state.measured),
+    )
+    state.versions.append(version)
+    try:
+        revised = Learner(report.simulator, report.prior, actions, state)
+        belief = revised.infer(state.measured)
+    except BaseException:
+        state.versions.pop()
+        raise
+    state.versions[-1] = replace(version, misfit=misfit(belief.diagnostics))
+    return revised

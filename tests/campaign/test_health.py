@@ -1,0 +1,127 @@
+"""Surprises, log scores and the two tests behind a campaign's health."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.integrate import quad
+from torch.distributions import MultivariateNormal, Normal
+
+from sbi_active.campaign.health import assess, log_e_value
+from sbi_active.campaign.score import score_outcome
+from sbi_active.campaign.state import (
+    CampaignOptions,
+    CampaignState,
+    ModelVersion,
+    Trial,
+)
+from sbi_active.seeding import derive_seed
+
+PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
+ACTION = torch.tensor([2.0])
+
+
+def simulator(theta, action):
+    return theta * action + 0.5 * torch.randn_like(theta)
+
+
+def score(x, simulator=simulator, seed=0, num_samples=2_000):
+    return score_outcome(
+        torch.as_tensor(x), ACTION, simulator, PRIOR, num_samples=num_samples, seed=seed
+    )
+
+
+def test_surprise_and_log_score_are_those_of_the_predictive():
+    predictive = Normal(0.0, math.sqrt(4.25))  # 2 theta + noise
+    for x in (0.5, -3.0, 5.0):
+        found = score([x])
+        tail = 2 * float(predictive.cdf(torch.tensor(-abs(x))))
+        log_p = float(predictive.log_prob(torch.tensor(x)))
+        # Binomial error of 2,000 simulations, that of their mean, one in the numerator.
+        error = math.sqrt(tail * (1 - tail) / 2_000)
+        error += 2 * math.exp(log_p) * math.sqrt(4.25 / 2_000)
+        assert found.surprise == pytest.approx(tail, abs=4 * error + 1 / 2_000)
+        assert found.log_score == pytest.approx(log_p, abs=0.2)
+    assert score([60.0]).surprise == pytest.approx(1 / 2_001)
+
+
+def test_surprises_are_uniform_where_the_simulator_is_right():
+    gen = torch.Generator().manual_seed(0)
+    p = []
+    for i in range(200):
+        x = 2 * torch.randn(1, generator=gen) + 0.5 * torch.randn(1, generator=gen)
+        p.append(score(x, seed=i, num_samples=200).surprise)
+    ordered = torch.tensor(p).sort().values
+    gap = (ordered - torch.linspace(1 / 200, 1, 200)).abs().max()
+    assert float(gap) < 1.63 / math.sqrt(200)  # Kolmogorov, level .01
+
+
+def test_a_failure_is_as_surprising_as_it_is_rare():
+    def falls_off(theta, action):
+        return torch.where(theta > 1.2816, torch.nan, simulator(theta, action))
+
+    found = score([math.nan], falls_off)
+    # One in ten fails; binomial error of 2,000.
+    assert found.surprise == pytest.approx(0.1, abs=4 * math.sqrt(0.09 / 2_000))
+    assert found.log_score == pytest.approx(math.log(0.1), abs=0.3)
+    assert score([0.0], falls_off).surprise > 0.5
+    assert score([math.nan]).surprise == pytest.approx(1 / 2_001)
+
+
+def test_a_measurement_where_simulations_never_have_one():
+    found = score([1.0], lambda t, a: torch.full_like(t, torch.nan))
+    assert found.surprise == pytest.approx(1 / 2_001)
+    assert found.log_score == -math.inf
+
+
+def test_the_e_value_has_mean_one_and_is_continuous_at_one():
+    mean, _ = quad(lambda p: math.exp(log_e_value(p)), 1e-12, 1, limit=400)
+    assert mean == pytest.approx(1 - 1 / math.log(1e12), abs=0.01)
+    assert log_e_value(1.0) == pytest.approx(math.log(0.5))
+    for p in (0.9998, 0.99995):
+        assert log_e_value(p) == pytest.approx(math.log(0.5 + (1 - p) / 6), abs=1e-5)
+
+
+def state(surprises, misfits=None, **version):
+    misfits = [None] * len(surprises) if misfits is None else misfits
+    trials = [
+        Trial(i, ACTION, torch.zeros(1), "ok", surprise=s, misfit=m, version=0)
+        for i, (s, m) in enumerate(zip(surprises, misfits, strict=True))
+    ]
+    made = CampaignState("nsbi", 0, CampaignOptions(), trials, [*range(len(trials))])
+    made.versions[-1] = replace(ModelVersion(), **version)
+    return made
+
+
+def test_health_from_surprises():
+    assert assess(state([])) == "ok"
+    assert assess(state([0.4, 0.8, 0.1])) == "ok"
+    assert assess(state([0.4, 2e-3])) == "watch"
+    assert assess(state([0.4, 5e-4, 5e-3])) == "alarm"
+    # An alarm stays; another model starts anew.
+    assert assess(state([0.4, 5e-4, 5e-3, *[0.9] * 20])) == "alarm"
+    assert assess(state([0.4, 5e-4, 5e-3], number=1)) == "ok"
+
+
+def test_health_from_misfit():
+    assert assess(state([0.5, 0.5], [0.5, 0.05])) == "ok"
+    assert assess(state([0.5, 0.5], [0.5, 0.01])) == "watch"
+    assert assess(state([0.5, 0.5], [0.5, 1e-3])) == "alarm"
+    assert assess(state([0.5], [0.5], misfit=1e-3)) == "alarm"
+
+
+@pytest.mark.parametrize("effect", [0.0, 1.5])
+def test_alarms_are_rare_unless_predictions_fail(effect):
+    """Predictions with standard normal errors, and with a shift in them."""
+    alarms, num = 0, 400
+    for i in range(num):
+        gen = torch.Generator().manual_seed(derive_seed(i, "errors"))
+        z = effect + torch.randn(12, generator=gen).double()
+        p = (2 * Normal(0.0, 1.0).cdf(-z.abs())).clamp_min(1e-9).tolist()
+        alarms += assess(state(p)) == "alarm"
+    if effect:
+        assert alarms > 0.5 * num
+    else:  # the level, and 3 of its binomial errors
+        level = 0.025
+        assert alarms / num < level + 3 * math.sqrt(level * (1 - level) / num)

@@ -1,0 +1,203 @@
+"""A campaign that compares its simulator with its trials and goes on with another."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    Refinement,
+    SimulatorModel,
+)
+from sbi_active.campaign.unlike import most_unlike
+from sbi_active.criticism import Effect
+
+PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
+ACTIONS = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
+MODEL = SimulatorModel(
+    lambda theta, action: theta * action,
+    noise=GaussianNoise(0.1),
+    parameter_names=["slope"],
+)
+OPTIONS = CampaignOptions(
+    num_simulations=400,
+    num_samples=100,
+    num_scored=400,
+    density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
+    refinement=Refinement(num_histories=300),
+)
+SHIFT = 0.8
+
+
+def normal(sd):
+    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
+
+
+def effect(name, apply, sd=1.0):
+    return Effect(name, hook="observation", prior=normal(sd), null=0.0, apply=apply)
+
+
+BIAS = effect("bias", lambda x, phi, action, context: x + phi)
+DRIFT = effect(
+    "drift", lambda x, phi, action, context: x + phi * context.index[:, None]
+)
+LIBRARY = [BIAS, DRIFT]
+
+
+def campaign(simulator=MODEL, **changes):
+    return Campaign(
+        simulator, PRIOR, ACTIONS, method="nsbi", options=replace(OPTIONS, **changes)
+    )
+
+
+def tell(c, shift=SHIFT, actions=(1.0, -2.0, 2.0, -1.0, 2.0), per_trial=0.0):
+    gen = torch.Generator().manual_seed(3)
+    for i, action in enumerate(actions):
+        x = 0.5 * action + shift + per_trial * i + 0.1 * torch.randn(1, generator=gen)
+        c.tell(x, action=[action])
+
+
+@pytest.fixture(scope="module")
+def adopted():
+    c = campaign()
+    tell(c)
+    c.update()
+    before, health = c.belief, c.health
+    report = c.criticize(LIBRARY, evaluate=False)
+    c.adopt(report)
+    return c, before, health, report
+
+
+def test_a_hidden_bias_alarms_and_is_adopted(adopted):
+    c, before, health, report = adopted
+    assert health == "alarm"
+    assert report.verdict == "bias"
+    # The right slope, on the bare simulator, lies far outside the belief.
+    log_p = before.log_prob(torch.tensor([0.5]))
+    assert bool(log_p < before.log_prob(before.sample((500,))).quantile(0.02))
+    assert c.simulator is report.simulator
+    assert c.prior is report.prior
+    # Five measurements of noise .1: below .1 each.
+    truth = torch.tensor([0.5, SHIFT])
+    assert bool(((c.belief.mean - truth).abs() < 4 * 0.1).all())
+    assert float(c.belief.log_prob(truth)) > 0
+    assert c.health == "ok"
+
+
+def test_trials_are_scored_before_they_are_used(adopted):
+    c, *_ = adopted
+    scores = [t.surprise for t in c.history]
+    assert all(0 < s <= 1 for s in scores)
+    assert min(scores) < 0.01
+    assert all(t.version == 0 for t in c.history)
+    assert all(t.log_score is not None for t in c.history)
+
+
+def test_the_lineage_is_in_the_state(adopted):
+    c, _, _, report = adopted
+    first, second = c.state.versions
+    assert (first.number, first.effects, first.examined) == (0, (), (report.digest,))
+    assert (second.number, second.effects, second.num_trials) == (1, ("bias",), 5)
+    assert second.digest == report.digest
+    assert second.misfit > 0.01
+
+
+def test_the_report_says_how_actions_were_chosen():
+    c = Campaign(MODEL, PRIOR, ACTIONS, options=OPTIONS)
+    tell(c, actions=(1.0, -2.0, 2.0))
+    report = c.criticize([BIAS], evaluate=False)
+    assert any("chosen for information" in w for w in report.warnings)
+    assert not report.exploratory
+    assert not c.criticize([BIAS], evaluate=False).exploratory
+    assert c.criticize(LIBRARY, evaluate=False).exploratory  # another library
+
+
+def test_a_campaign_goes_on_after_an_adoption(adopted):
+    c, *_ = adopted
+    trial = c.ask()
+    c.tell(0.5 * trial.action + SHIFT)
+    c.update()
+    told = c.history[-1]
+    assert told.version == 1
+    assert told.surprise > 1e-2
+    again = c.criticize(LIBRARY, evaluate=False)
+    assert again.verdict == "none"
+    with pytest.raises(ValueError, match="expected a report whose verdict names eff"):
+        c.adopt(again)
+
+
+def test_a_report_of_another_model_is_refused(adopted):
+    c, _, _, report = adopted
+    with pytest.raises(ValueError, match="expected a report of the current model, ver"):
+        c.adopt(report)
+    assert len(c.state.versions) == 2
+
+
+@pytest.mark.slow
+def test_a_drift_is_inferred_at_the_index_of_each_trial():
+    c = campaign()
+    tell(c, shift=0.0, per_trial=0.4, actions=(1.0, -2.0, 2.0, -1.0, 2.0, -2.0))
+    c.update()
+    report = c.criticize(LIBRARY, evaluate=False)
+    assert report.verdict == "drift"
+    c.adopt(report)
+    # Slope and drift, from six measurements of noise .1.
+    assert c.belief.mean.tolist() == pytest.approx([0.5, 0.4], abs=0.1)
+    trial = c.ask()
+    c.tell(0.5 * trial.action + 0.4 * trial.index)
+    c.update()
+    assert c.history[-1].surprise > 0.05
+    assert c.belief.mean.tolist() == pytest.approx([0.5, 0.4], abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_failed_adoption_changes_nothing(monkeypatch):
+    c = campaign()
+    tell(c)
+    report = c.criticize(LIBRARY, evaluate=False)
+    belief = c.belief
+
+    def fails(*arguments, **options):
+        raise RuntimeError("out of licenses")
+
+    monkeypatch.setattr("sbi_active.campaign.learner.Learner.infer", fails)
+    with pytest.raises(RuntimeError, match="licenses"):
+        c.adopt(report)
+    assert c.belief is belief
+    assert c.simulator is MODEL
+    assert len(c.state.versions) == 1
+
+
+def test_too_few_trials_to_compare():
+    c = campaign()
+    tell(c, actions=(1.0,))
+    with pytest.raises(ValueError, match="expected at least two trials to compare; g"):
+        c.criticize(LIBRARY)
+
+
+def test_every_second_trial_may_go_where_none_was():
+    c = Campaign(MODEL, PRIOR, ACTIONS, options=replace(OPTIONS, check_every=2))
+    actions = []
+    for _ in range(4):
+        actions.append(float(c.ask().action))
+        c.tell([0.5 * actions[-1]])
+    for index, (action, trial) in enumerate(zip(actions, c.history, strict=True)):
+        unlike = most_unlike(ACTIONS, torch.tensor(actions[:index])[:, None])
+        is_check = index % 2 == 1
+        assert trial.design.expected_information_gain.isnan().all() == is_check
+        if is_check:
+            assert action in unlike.values[:, 0].tolist()
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="expected num_scored >= 100; got 5"):
+        CampaignOptions(num_scored=5)
+    with pytest.raises(ValueError, match="expected check_every >= 1 or None; got 0"):
+        CampaignOptions(check_every=0)
