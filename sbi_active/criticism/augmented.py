@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.model import NOISE_STREAM
 
-__all__ = ["AugmentedSimulator"]
+__all__ = ["AugmentedSimulator", "takes_times"]
 
 #: Rows on which an effect is compared with the simulator without it.
 NUM_CHECKED = 16
@@ -51,6 +52,8 @@ class AugmentedSimulator(SimulatorModel):
     Attributes:
         base: The simulator without any effect.
         effects: All effects.
+        takes_times: Whether the simulator's function has an argument ``times``, shape
+            (n, k), for the times at which each row is measured.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class AugmentedSimulator(SimulatorModel):
         if isinstance(model, AugmentedSimulator):
             base, before = model.base, model.effects
         self.base: SimulatorModel = base
+        self.takes_times = takes_times(base)
         self.effects = [*before, *effects]
         require_distinct(self.effects)
         self.next_index = next_index
@@ -241,6 +245,9 @@ class AugmentedSimulator(SimulatorModel):
         for effect in self._active("action", phi):
             action = effect.apply(action, phi[effect.name], commanded, context)
         changed: dict[str, Any] = {**(keywords or {})}
+        if self.takes_times and context.times is not None:
+            # The simulator is read where the trial was, not on a grid of its own.
+            changed.setdefault("times", context.times.expand(len(theta), -1))
         for effect in self._active("dynamics", phi):
             changed = effect.apply(changed, phi[effect.name], commanded, context)
         x = self.base._run(theta, action, seeds, changed)
@@ -302,3 +309,12 @@ def _difference(reference: Tensor, at_null: Any, effect: Effect) -> float:
         if bool(gap.isfinite().all()):
             difference = min(difference, float(gap.max()))
     return difference
+
+
+def takes_times(model: SimulatorModel) -> bool:
+    """Return whether the simulator is to be asked for each trial's own times.
+
+    A ``functools.partial`` that binds ``times`` has decided them.
+    """
+    bound = getattr(inspect.unwrap(model.fn), "keywords", {})
+    return "times" in model.effect_names and "times" not in bound

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.detection import THRESHOLD
 from sbi_active.criticism.errors import log_sum_exp
-from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.rival_set import HOPELESS, RivalSet
 from sbi_active.seeding import derive_seed
 
 __all__ = ["grow"]
@@ -50,7 +50,7 @@ def grow(
     beam = [(n,) for n in sorted(singles, key=singles.__getitem__)[::-1][:BEAM]]
     for _ in range(MAX_EFFECTS - 1):
         level: dict[tuple[str, ...], float] = {}
-        for names in beam:
+        for names in _worthy(rivals, beam):
             for extra in _promising(rivals, names):
                 larger = tuple(n for n in rivals.effects if n in (*names, extra))
                 if frozenset(larger) in seen:
@@ -66,6 +66,21 @@ def grow(
         found |= {" + ".join(names): value for names, value in level.items()}
         beam = sorted(level, key=level.__getitem__)[::-1][:BEAM]
     return found
+
+
+def _worthy(rivals: RivalSet, beam: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return the sets to add to: all, or once one fits, those not far behind it."""
+    fits = [names for names in beam if not _is_far(rivals, names)]
+    if not fits:
+        return beam
+    best = max(rivals.evidence(names).log_evidence for names in fits)
+    return [n for n in beam if rivals.evidence(n).log_evidence > best - HOPELESS]
+
+
+def _is_far(rivals: RivalSet, names: tuple[str, ...]) -> bool:
+    """Return whether a set is far from a fit."""
+    num = len(rivals.measurements)
+    return rivals.evidence(names).best_chi_square > num + FAR * np.sqrt(2 * num)
 
 
 def _best_part(rivals: RivalSet, names: tuple[str, ...]) -> float:
@@ -84,8 +99,7 @@ def _promising(rivals: RivalSet, names: tuple[str, ...]) -> list[str]:
     that says nothing, and every effect is promising.
     """
     rival = rivals.rivals.get(" + ".join(names)) or rivals.rival(names)
-    num = len(rivals.measurements)
-    if rivals.evidence(names).best_chi_square > num + FAR * np.sqrt(2 * num):
+    if _is_far(rivals, names):
         return [n for n in rivals.effects if n not in names]
     sample = rivals.samples[rival.name]
     at = sample.u[[int(np.argmax(sample.weights))]]

@@ -28,9 +28,11 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.summaries import MANY, MOST, can_summarize, summarize
 from sbi_active.criticism.tracing import trace
 from sbi_active.criticism.trials import Trials
 from sbi_active.criticism.validation import digest, require_fitting, with_noise
+from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
@@ -57,6 +59,9 @@ class Criticism:
         effects: What the simulator may lack.
         actions: The permitted actions, for what no action separates and for the next
             one; None leaves both to the trials at hand.
+        summaries: Compare at most this many summaries of x in place of all its numbers,
+            0 for none; None takes 20 where a trial has more than 500 numbers without a
+            time axis, with independent noise.
         seed: Of all draws.
 
     Raises:
@@ -90,14 +95,33 @@ class Criticism:
         *,
         effects: Sequence[Effect] = (),
         actions: ActionSpace | None = None,
+        summaries: int | None = None,
         seed: int = 0,
     ) -> None:
         model = with_noise(model, prior, trials)
         self.model, self.prior, self.trials = model, prior, trials
         self.effects, self.actions, self.seed = [*effects], actions, seed
+        self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
+        if summaries is None:
+            many = trials.x[0].numel() > MANY and can_summarize(*self._parts)
+            summaries = MOST if many else 0
+        #: Of x, that are compared in its place; 0 for all of its numbers.
+        self.num_summaries = summaries
+        if summaries:
+            short = summarize(
+                model,
+                prior,
+                trials,
+                self.effects,
+                num=summaries,
+                seed=derive_seed(seed, "summaries"),
+            )
+            self._parts = short.model, short.trials, short.effects
+            self.num_summaries = len(short.weight)
+        own, measured, some = self._parts
         self.rivals = RivalSet(
-            model, prior, trials.fit, self.effects, actions=actions, seed=seed
+            own, prior, measured.fit, some, actions=actions, seed=seed
         )
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
@@ -145,7 +169,9 @@ class Criticism:
                 f"expected effects among {', '.join(self.rivals.effects) or 'none'}; "
                 f"got {', '.join(unknown)}; do declare them in Criticism(effects=...)"
             )
-        added = [self.rivals.effects[n] for n in names] + self.rivals.nuisances
+        declared = {e.name: e for e in self.effects}  # acting on x, not its summaries
+        every = [*names, *[e.name for e in self.rivals.nuisances]]
+        added = [declared[n] for n in every]
         if not added:
             return self.model, self.prior
         index = int(self.trials.index.max()) + 1
@@ -172,25 +198,37 @@ class Criticism:
         Otherwise each trial is predicted by models that were chosen and fitted without
         it; None with fewer than four trials.
         """
-        tracing, held_out = self.trace(), self.trials.held_out
+        tracing, trials = self.trace(), self._parts[1]
+        held_out = trials.held_out
         if held_out is not None:
             return evaluate_held_out(self.rivals, tracing, held_out)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        return evaluate_left_out(self.trials.fit, self._fold)
+        return evaluate_left_out(trials.fit, self._fold)
 
     def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
+        model, _, effects = self._parts
         part = Criticism(
-            self.model, self.prior, trials, effects=self.effects, seed=self.seed
+            model, self.prior, trials, effects=effects, summaries=0, seed=self.seed
         )
         return part.rivals, trace(part.rivals, part.detect(), compare=False)
 
-    def report(self, *, evaluate: bool = True) -> Report:
+    def report(
+        self,
+        *,
+        evaluate: bool = True,
+        designed: bool = False,
+        exploratory: bool = False,
+    ) -> Report:
         """Return the report of all steps.
 
         Args:
             evaluate: Without held-out trials the error costs one verdict a trial; False
                 leaves it out.
+            designed: The trials' actions were chosen for their information, of which
+                the report then warns.
+            exploratory: Library or priors were changed after the data were seen, of
+                which it warns too.
         """
         from sbi_active.criticism.report import build_report
 
@@ -212,6 +250,18 @@ class Criticism:
             next_action=None if self.actions is None else self.next_action(),
             actions=self.actions,
             digest=self.digest,
+            designed=designed,
+            exploratory=exploratory,
+            warnings=self._given(),
+        )
+
+    def _given(self) -> tuple[str, ...]:
+        """Return what the comparison was made given, a sentence each."""
+        if not self.num_summaries:
+            return ()
+        return (
+            f"given {self.num_summaries} summaries of the {self.trials.x[0].numel()} "
+            "numbers of a trial: what they leave out was not looked at",
         )
 
 
@@ -222,8 +272,10 @@ def close_loop(
     *,
     effects: Sequence[Effect] = (),
     actions: ActionSpace | None = None,
+    summaries: int | None = None,
     seed: int = 0,
     evaluate: bool = True,
+    designed: bool = False,
 ) -> Report:
     """Find the residual, trace it to an effect, add it, and report the error.
 
@@ -233,9 +285,17 @@ def close_loop(
         trials: Measured trials.
         effects: What the simulator may lack.
         actions: The permitted actions.
+        summaries: As in :class:`Criticism`.
         seed: Of all draws.
         evaluate: As in :meth:`Criticism.report`.
+        designed: As in :meth:`Criticism.report`.
     """
     return Criticism(
-        model, prior, trials, effects=effects, actions=actions, seed=seed
-    ).report(evaluate=evaluate)
+        model,
+        prior,
+        trials,
+        effects=effects,
+        actions=actions,
+        summaries=summaries,
+        seed=seed,
+    ).report(evaluate=evaluate, designed=designed)

@@ -34,9 +34,10 @@ def detect(rivals: RivalSet) -> Detection:
     References:
         Ville, Etude critique de la notion de collectif (1939), for any stopping time.
     """
-    others = [rivals.evidence((name,)) for name in rivals.effects]
-    others += [rivals.evidence(error=e) for e in (UNEXPLAINED, SCATTER)]
     null = rivals.evidence()
+    # First what can explain anything: beside it, a hopeless effect is soon dismissed.
+    others = [rivals.evidence(error=e) for e in (UNEXPLAINED, SCATTER)]
+    others += [rivals.evidence((name,)) for name in rivals.effects]
     first = null.log_evidence
     log_b, error = bayes_factor(others, null)
     check = None

@@ -117,18 +117,18 @@ class Effect:
 
     def sample(self, num: int) -> Tensor:
         """Return draws of phi by torch's generator, shape (num, phi_dim), float64."""
-        return self.prior.sample(torch.Size([num])).double().reshape(num, -1)
+        return self.prior.sample(torch.Size([num])).double().reshape(num, self.phi_dim)
 
     def log_prob(self, phi: Tensor) -> Tensor:
         """Return the log prior density, shape (n,), float64; -inf outside."""
         shape = self.prior.batch_shape + self.prior.event_shape
         value = phi.reshape(len(phi), *shape)
-        inside = self.prior.support.check(value).reshape(len(phi), -1).all(-1)  # type: ignore[union-attr]
+        inside = self.prior.support.check(value)[:, None].flatten(1).all(-1)  # type: ignore[union-attr]
         # Outside of its support a distribution raises or gives what it likes.
         safe = torch.where(
             inside.reshape(-1, *[1] * len(shape)), value, self.prior.sample()
         )
-        density = self.prior.log_prob(safe).double().reshape(len(phi), -1).sum(-1)
+        density = self.prior.log_prob(safe).double()[:, None].flatten(1).sum(-1)
         return density.where(inside, -torch.inf)
 
     def null_phi(self, num: int, *, finite: bool = False) -> Tensor:

@@ -25,6 +25,8 @@ Array = NDArray[Any]
 
 MAX_ACTIONS = 48
 NUM_THETA = 6
+#: Share of the parameters at which two effects must look the same.
+AGREEMENT = 0.8
 #: Squared distance, in noise units over all actions, of two effects that look the same.
 SAME = 1.0
 #: Share of an effect's size that may be left of it for the effects to look the same.
@@ -59,13 +61,13 @@ def equivalent_effects(
     if rivals.model.noise is None:
         unit = np.full(len(unit), np.median(rivals.spread))
     effects = [e for e in rivals.effects.values() if e.hook != "noise"]
-    votes = np.zeros((len(effects) + 1, len(effects) + 1))
+    votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
     coordinates = SearchCoordinates(rivals.prior, (), (), len(trials))
     local = [bool(e.null_phi(1).isfinite().all()) for e in effects]
     for u in coordinates.sample(NUM_THETA, seed=derive_seed(rivals.seed, "theta")):
         left = _left_over(simulator, coordinates, u, effects, unit, rivals)
         votes += _alike(left, local)
-    same = votes >= NUM_THETA - 1
+    same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
     names = [NONE, *[e.name for e in effects]]
     return _groups(names, same)
 
@@ -117,9 +119,13 @@ def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:
 
 
 def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
-    """Return 1 for pairs (none first) of the same direction."""
+    """Return which pairs (none first) have the same direction, and which can be told.
+
+    At parameters where nothing is left of an effect, it tells nothing of a pair.
+    """
     num = len(left) + 1
-    same = np.eye(num)
+    same, told = np.eye(num), np.eye(num)
+    told[0] = told[:, 0] = 1.0
     for i, (a, whole) in enumerate(left, 1):
         size = a @ a
         nothing = size < SAME and np.sqrt(size) < RELATIVE * whole
@@ -129,13 +135,14 @@ def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
         for j, (b, other) in enumerate(left[i:], i + 1):
             if same[0, i] or same[0, j] or min(b @ b, other) == 0:
                 continue
+            told[i, j] = told[j, i] = 1.0
             if not (local[i - 1] and local[j - 1]):
                 continue
             rest = a - (a @ b) / (b @ b) * b
             distance = rest @ rest
             close = distance < SAME and distance < RELATIVE**2 * size
             same[i, j] = same[j, i] = float(close)
-    return same
+    return np.stack([same, told])
 
 
 def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
@@ -157,13 +164,11 @@ def _every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
         values = actions.sample((MAX_ACTIONS,), seed=derive_seed(rivals.seed, "every"))
     order = np.random.default_rng(rivals.seed).permutation(len(values))
     own = rivals.trials
-    template = own.x[int(own.valid.int().argmax())]
-    template = torch.where(template.isfinite(), template, torch.zeros_like(template))
+    template, first = own.template()
     times = own.sample_times
     if times is not None and times.ndim == 2:
-        first = times[int(own.valid.int().argmax())]
+        assert first is not None
         times = torch.cat([times, first.expand(len(values), -1)])
-        times = torch.where(times.isfinite(), times, first.nan_to_num())
     return Trials(
         torch.cat([own.action, values[order].double()]),
         torch.cat([own.x, template.expand(len(values), *template.shape)]),

@@ -44,6 +44,10 @@ class ErrorModel(ABC):
         It maps (..., N) to (..., N), linearly.
         """
 
+    def regimes(self) -> list[Whitener]:
+        """Return whitening transforms under which the posterior has other widths."""
+        return []
+
 
 @dataclass(frozen=True)
 class NoiseCell:

@@ -32,6 +32,7 @@ def plot_residuals(
     *,
     action_labels: Sequence[str] | None = None,
     channel_names: Sequence[str] | None = None,
+    added: str = "the effect",
 ) -> Figure:
     """Draw standardized residuals by action, trial, and channel or time.
 
@@ -43,13 +44,14 @@ def plot_residuals(
         after: Of the augmented one, the lower row; None where nothing was added.
         action_labels: One an entry of the action, with its unit.
         channel_names: One an entry of x without a time axis.
+        added: What the augmented model has more, in words.
 
     Returns:
         The figure.
     """
     rows = [(before, "bare model", BEFORE)]
     if after is not None:
-        rows.append((after, "with the effect", AFTER))
+        rows.append((after, f"with {added}", AFTER))
     labels = action_labels or [f"action {i + 1}" for i in range(before.action.shape[1])]
     shown = min(len(labels), MAX_ACTION_PANELS)
     several = before.x[0].size > 1
@@ -101,7 +103,7 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
         color=[AFTER if i else "#d8dee3" for i in inside],
     )
     for y, value in enumerate(values):
-        text = f"{value:.2f}" if value >= 0.005 else "< .01"
+        text = f"{value:.2f}" if value >= 0.005 else "< 0.01"
         ax.text(value + 0.01, y, text, va="center", fontsize=8, color="#333333")
     ax.set(xlim=(0, 1.1), xlabel="posterior probability (filled: credible set)")
     ax.set_xticks(np.linspace(0, 1, 6))
@@ -119,6 +121,8 @@ def plot_before_after(evaluation: Evaluation) -> Figure:
     Returns:
         The figure.
     """
+    from matplotlib.ticker import FuncFormatter
+
     metrics = [name for name in METRICS if name in evaluation.before]
     figure, axes = _subplots(1, len(metrics), width=2.5, height=2.7)
     for ax, name in zip(axes[0], metrics, strict=True):
@@ -137,6 +141,7 @@ def plot_before_after(evaluation: Evaluation) -> Figure:
                 ax.set_ylim(bottom=0)
         if name == "log predictive density" and _spread(-pairs[pairs < 0]) > 20:
             ax.set_yscale("symlog", linthresh=10)
+            ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         if name == "coverage":
             ax.axhline(0.9, color="#333333", lw=0.8, ls=":")
             ax.set_ylim(-0.04, 1.04)

@@ -28,6 +28,8 @@ MARGIN = 3.0
 #: Bound on exponents, so that a formula stays finite.
 LARGEST_EXPONENT = 20.0
 
+#: Cosine short of 1 at which two terms are one.
+SAME = 1e-9
 #: Degrees of freedom of a coefficient's prior: terms are often far from typical.
 TAIL = 3.0
 
@@ -65,26 +67,21 @@ def formula_effects(rivals: RivalSet) -> list[Effect]:
     amplitude = float(np.median(np.sqrt(sd * np.maximum(rivals.spread, sd))))
     if rivals.simulator.is_stochastic:
         amplitude = float(np.median(rivals.spread))
-    found = []
-    for j, name in enumerate(names):
+    x = trials.x.double().reshape(len(trials.x), -1)
+    of_action = [(name, trials.action[:, [j]], j) for j, name in enumerate(names)]
+    found, seen = [], torch.zeros(0, int(x.isfinite().sum()), dtype=torch.float64)
+    for name, value, j in [*of_action, ("x", x, None)]:
         for pattern, g in TERMS.items():
-            if pattern == "1" and j:
+            term = g(value.double()).expand_as(x)[x.isfinite()]
+            size = float(term.square().mean().sqrt())
+            if not np.isfinite(size) or size < 1e-9:
                 continue
-            size = g(trials.action[:, j]).square().mean().sqrt()
-            if not bool(torch.isfinite(size)) or float(size) < 1e-9:
-                continue
-            found.append(
-                _effect(pattern.format(name), _of_action(g, j), amplitude / float(size))
-            )
-    x = trials.x[trials.x.isfinite()]
-    for pattern, g in TERMS.items():
-        if pattern == "1":
-            continue
-        size = g(x).square().mean().sqrt()
-        if bool(torch.isfinite(size)) and float(size) >= 1e-9:
-            found.append(
-                _effect(pattern.format("x"), _of_output(g), amplitude / float(size))
-            )
+            term = term / term.norm()
+            if bool(((seen @ term).abs() > 1 - SAME).any()):
+                continue  # what a simpler formula is on these trials
+            seen = torch.cat([seen, term[None]])
+            apply = _of_output(g) if j is None else _of_action(g, j)
+            found.append(_effect(pattern.format(name), apply, amplitude / size))
     return found
 
 
@@ -107,9 +104,19 @@ def guess(rivals: RivalSet) -> tuple[tuple[str, float], ...]:
         [*effects, *rivals.nuisances],
         actions=rivals.actions,
         seed=rivals.seed,
+        reference=bar,
     )
-    gains = {e.name: others.evidence((e.name,)).log_evidence - bar for e in effects}
+    found = [others.evidence((e.name,)) for e in effects]
+    gains = {e.name: e.log_evidence - bar for e in found}
     best = sorted(gains, key=gains.__getitem__)[::-1]
+    top = others.evidence((best[0],))
+    # Of those that the Monte Carlo error leaves equal, the simplest, which comes first.
+    for evidence in found:
+        error = np.hypot(evidence.standard_error, top.standard_error)
+        if evidence.log_evidence >= top.log_evidence - 2 * error:
+            best.remove(evidence.name)
+            best.insert(0, evidence.name)
+            break
     return tuple((name, gains[name]) for name in best if gains[name] > MARGIN)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,44 +20,57 @@ Array = NDArray[Any]
 DEGREES_OF_FREEDOM = 5
 #: Particles a round, rounds at most, and the effective number that ends them.
 ROUND, MAX_ROUNDS, ENOUGH = 400, 4, 100.0
-#: Particles that get a t distribution of their own in the next round.
-NUM_KERNELS = 30
+#: Share of the particles that a later round spreads over all of its components.
+DEFENSIVE = 0.2
 #: Inflation of a fitted covariance, so that the proposal's tails are the heavier.
 INFLATION = 1.5
 
 
 @dataclass(frozen=True)
 class TMixture:
-    """Equal-weight mixture of multivariate t distributions.
+    """Mixture of multivariate t distributions.
 
     Attributes:
         means: Shape (k, dim).
         factors: Lower Cholesky factors of the scale matrices, shape (k, dim, dim).
+        weights: Sum to 1, shape (k,); None has equal ones.
     """
 
     means: Array
     factors: Array
+    weights: Array | None = None
 
     def sample(self, num: int, rng: np.random.Generator) -> Array:
         """Return draws, shape (num, dim)."""
-        which = np.arange(num) % len(self.means)
+        which = self.components(num)
         normal = rng.normal(size=(num, self.means.shape[1]))
         nu = DEGREES_OF_FREEDOM
         t = normal / np.sqrt(rng.chisquare(nu, size=(num, 1)) / nu)
         return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], t)
 
+    def components(self, num: int) -> NDArray[np.int64]:
+        """Return the component of each draw, in proportion to the weights, (num,)."""
+        if self.weights is None:
+            return np.arange(num) % len(self.means)
+        ladder = (0.5 + np.arange(num)) / num
+        which = np.searchsorted(np.cumsum(self.weights), ladder)
+        return np.minimum(which, len(self.means) - 1)
+
     def log_prob(self, u: Array) -> Array:
         """Return log densities, shape (n,)."""
-        nu, dim = DEGREES_OF_FREEDOM, u.shape[1]
+        return log_sum_exp(self.log_parts(u), axis=0)
+
+    def log_parts(self, u: Array) -> Array:
+        """Return log of weight times density of each component, shape (k, n)."""
+        nu, dim, k = DEGREES_OF_FREEDOM, u.shape[1], len(self.means)
         norm = gammaln(0.5 * (nu + dim)) - gammaln(0.5 * nu)
         norm -= 0.5 * dim * np.log(nu * np.pi)
-        parts = []
-        for mean, factor in zip(self.means, self.factors, strict=True):
-            y = np.linalg.solve(factor, (u - mean).T)
-            log_det = np.log(np.diag(factor)).sum()
-            tail = 0.5 * (nu + dim) * np.log1p((y**2).sum(0) / nu)
-            parts.append(norm - log_det - tail)
-        return log_sum_exp(np.stack(parts), axis=0) - np.log(len(parts))
+        weights = np.full(k, 1 / k) if self.weights is None else self.weights
+        apart = (u - self.means[:, None]).transpose(0, 2, 1)
+        y = np.linalg.solve(self.factors, apart)
+        log_det = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
+        tail = 0.5 * (nu + dim) * np.log1p((y**2).sum(1) / nu)
+        return norm + (np.log(weights) - log_det)[:, None] - tail
 
 
 @dataclass(frozen=True)
@@ -83,24 +97,32 @@ class ImportanceSample:
 
 
 def importance_sample(
-    rival: Rival, proposal: TMixture, *, rng: np.random.Generator
+    rival: Rival,
+    proposal: TMixture,
+    *,
+    rng: np.random.Generator,
+    local: Callable[[], TMixture] | None = None,
+    enough: float = ENOUGH,
 ) -> ImportanceSample:
     r"""Return the evidence :math:`Z = E_q[p(x | z) p(z) / q(z)]`.
 
-    Where one round leaves few effective particles, the next proposes from t
-    distributions around the weighted sample; all rounds count, each particle weighted
-    by the mixture of all their proposals.
+    Where one round leaves few effective particles, the next proposes from ``local``,
+    and further ones from the same with the weights of its components adapted; all
+    rounds count, each particle weighted by the mixture of all their proposals.
 
     Args:
         rival: The model.
         proposal: The first round's.
         rng: Source of the draws.
+        local: Returns the second round's; None repeats the first, adapted.
+        enough: Effective sample size that ends the rounds.
 
     References:
-        Cornuet et al., Scandinavian Journal of Statistics 39 (2012).
+        Cappe et al., Statistics and Computing 18 (2008); Cornuet et al., Scandinavian
+        Journal of Statistics 39 (2012).
     """
     proposals, parts, targets = [], [], []
-    for _ in range(MAX_ROUNDS):
+    for i in range(MAX_ROUNDS):
         u = proposal.sample(ROUND, rng)
         target = rival.log_prior(u)
         inside = np.isfinite(target)
@@ -110,9 +132,12 @@ def importance_sample(
         parts.append(u)
         targets.append(target)
         sample = _weighted(parts, targets, proposals)
-        if sample.effective_sample_size >= ENOUGH:
+        if sample.effective_sample_size >= enough:
             break
-        proposal = _adapted(sample, rng)
+        if i == 0 and local is not None:
+            proposal = local()
+        else:
+            proposal = _adapted(sample, proposal)
     return sample
 
 
@@ -133,23 +158,12 @@ def _weighted(
     return ImportanceSample(u, weights, float(total - np.log(n)), error, effective)
 
 
-def _adapted(sample: ImportanceSample, rng: np.random.Generator) -> TMixture:
-    """Return t distributions around the whole sample and many of its particles.
-
-    The small ones follow a curved ridge, such as that of an effect which a parameter
-    can imitate; the wide one keeps the tails.
-    """
-    dim = sample.u.shape[1]
+def _adapted(sample: ImportanceSample, proposal: TMixture) -> TMixture:
+    """Return the proposal with the weights that its components' particles deserve."""
+    parts = proposal.log_parts(sample.u)
+    share = np.exp(parts - log_sum_exp(parts, axis=0))
     # Tempered weights: few particles must not shrink the next proposal to a point.
     flat = np.sqrt(sample.weights)
-    flat = flat / flat.sum()
-    mean = flat @ sample.u
-    centred = sample.u - mean
-    cov = (flat[:, None] * centred).T @ centred + 1e-12 * np.eye(dim)
-    factor = np.linalg.cholesky(cov)
-    heavy = sample.u[rng.choice(len(sample.u), NUM_KERNELS, p=flat)]
-    width = (4 / ((dim + 2) * NUM_KERNELS)) ** (1 / (dim + 4))
-    return TMixture(
-        np.concatenate([mean[None], heavy]),
-        np.stack([factor * np.sqrt(INFLATION), *[factor * width] * NUM_KERNELS]),
-    )
+    weights = share @ (flat / flat.sum())
+    weights = (1 - DEFENSIVE) * weights / weights.sum() + DEFENSIVE / len(weights)
+    return TMixture(proposal.means, proposal.factors, weights)

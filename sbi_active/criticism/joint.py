@@ -54,7 +54,7 @@ class JointPrior(Distribution):
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = torch.Size(sample_shape)
         num = shape.numel()
-        theta = self.prior.sample(torch.Size([num])).reshape(num, -1)
+        theta = self.prior.sample(torch.Size([num])).reshape(num, self.sizes[0])
         phi = [effect.sample(num).to(theta.dtype) for effect in self.effects]
         return torch.cat([theta, *phi], -1).reshape(*shape, sum(self.sizes))
 
@@ -63,7 +63,7 @@ class JointPrior(Distribution):
         theta, *phi = rows.split(self.sizes, -1)
         inside = _rows(self.prior.support.check(theta))  # type: ignore[union-attr]
         safe = torch.where(inside[:, None], theta, self.prior.sample(torch.Size([1])))
-        total = self.prior.log_prob(safe).reshape(len(rows), -1).sum(-1)
+        total = self.prior.log_prob(safe)[:, None].flatten(1).sum(-1)
         for effect, part in zip(self.effects, phi, strict=True):
             total = total + effect.log_prob(part).to(total.dtype)
         return total.where(inside, -torch.inf).reshape(value.shape[:-1])
@@ -95,7 +95,7 @@ def joint_prior(prior: Distribution, effects: Sequence[Effect]) -> JointPrior:
 
 
 def _rows(inside: Tensor) -> Tensor:
-    return inside.reshape(len(inside), -1).all(-1)
+    return inside[:, None].flatten(1).all(-1)
 
 
 def _elementwise(support: Any) -> constraints.Constraint:

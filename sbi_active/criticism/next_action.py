@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.criticism.errors import log_sum_exp
+from sbi_active.criticism.outside import outside_candidates
 from sbi_active.criticism.predictive import predict
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, NextAction, Tracing
 from sbi_active.criticism.rival_set import RivalSet
 from sbi_active.criticism.trials import Trials
+from sbi_active.design import Design
+from sbi_active.designer import InformationGainDesigner
 from sbi_active.seeding import derive_seed
 
-__all__ = ["choose_action"]
+__all__ = ["PredictedRival", "choose_action"]
 
 Array = NDArray[Any]
 
@@ -26,8 +31,62 @@ MAX_RIVALS = 8
 #: Information below which no action is worth a trial, nats.
 NOTHING = 0.02
 MAX_CANDIDATES = 64
-#: Directions of the predictions in which rivals are compared.
-MAX_DIRECTIONS = 6
+#: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
+#: three quarters fit a density, which needs some tens.
+SAMPLES_PER_RIVAL = 160
+
+
+class PredictedRival:
+    """A rival of the closed loop, as the designer wants it.
+
+    Args:
+        rivals: The models.
+        name: Of this one, as in ``tracing.probabilities``.
+        probability: Of this one, those of all rivals adding up to one.
+        candidates: All actions that will be asked for, shape (a, action_dim). They are
+            predicted together, each as the next trial.
+    """
+
+    def __init__(
+        self, rivals: RivalSet, name: str, probability: float, candidates: Tensor
+    ) -> None:
+        self.rivals, self.name, self.probability = rivals, name, probability
+        self.candidates = candidates
+        self._trials = _following(rivals, candidates)
+        self._draws: tuple[tuple[int, int], Tensor] | None = None
+
+    def predict(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
+        """Return draws from the posterior predictive, shape (n, q).
+
+        Args:
+            action: One of the candidates, shape (action_dim,).
+            num_samples: n.
+            seed: Of the draws.
+        """
+        if self._draws is None or self._draws[0] != (num_samples, seed):
+            self._draws = (num_samples, seed), self._predict(num_samples, seed)
+        same = (self.candidates == action.to(self.candidates)).all(-1)
+        return self._draws[1][:, int(same.int().argmax())]
+
+    def _predict(self, num_samples: int, seed: int) -> Tensor:
+        """Return outcomes of every candidate, shape (n, a, q); NaN without one."""
+        parts = self.name.split(" + ")
+        prediction = predict(
+            self.rivals,
+            self._trials,
+            names=tuple(n for n in parts if n in self.rivals.effects),
+            error=self.name if self.name in (UNEXPLAINED, SCATTER) else None,
+            num_draws=num_samples,
+            seed=seed,
+            scored=False,
+        )
+        num = len(self._trials)
+        x = np.where(prediction.valid[:, prediction.trial], prediction.x, np.nan)
+        each = np.split(
+            np.arange(len(prediction.trial)),
+            np.cumsum(np.bincount(prediction.trial, minlength=num))[:-1],
+        )
+        return torch.from_numpy(np.stack([x[:, at] for at in each], 1))
 
 
 def choose_action(
@@ -35,101 +94,122 @@ def choose_action(
 ) -> NextAction:
     r"""Return the action of the largest information about the model index.
 
-    .. math::
-        I(k; x | \xi) \ge \sum_k p_k\, E_{p(x | k, \xi)}\left[\log
-        \frac{q(x | k, \xi)}{\sum_j p_j\, q(x | j, \xi)}\right]
-
-    for any densities q; here kernel estimates of each rival's posterior predictive on
-    one half of its draws, scored on the other, and the other way round.
+    It is a lower bound on :math:`I(k; x | \xi)` from draws of each rival's posterior
+    predictive, chosen on one half of them and reported on the other. Where it is below
+    .02 nats for every permitted action, or some of the rivals are equivalent, actions
+    beyond the permitted range are tried: one that separates them is named.
 
     Args:
         rivals: The models.
         tracing: Their probabilities.
         actions: The permitted ones.
-
-    References:
-        Barber & Agakov, Advances in Neural Information Processing Systems 16 (2003).
     """
     if isinstance(actions, DiscreteActions) and len(actions) <= MAX_CANDIDATES:
-        candidates = actions.values.double()
+        candidates = actions.values
     else:
         seed = derive_seed(rivals.seed, "candidates")
-        candidates = actions.sample((MAX_CANDIDATES,), seed=seed).double()
+        candidates = actions.sample((MAX_CANDIDATES,), seed=seed)
     named = [n for n, p in tracing.probabilities.items() if p > NEGLIGIBLE][:MAX_RIVALS]
-    p = np.array([tracing.probabilities[n] for n in named])
-    gains = np.zeros(len(candidates))
+    gain = np.zeros(len(candidates))
+    action = None
     if len(named) > 1:
-        following = _following(rivals, candidates)
-        draws = [_draws(rivals, name, following) for name in named]
-        trial = draws[0][1]
-        for a in range(len(candidates)):
-            gains[a] = _information([d[:, trial == a] for d, _ in draws], p / p.sum())
-    best = int(np.argmax(gains))
-    worth = gains[best] >= NOTHING
-    return NextAction(
-        action=candidates[best].numpy() if worth else None,
-        candidates=candidates.numpy(),
-        information_gain=gains,
+        p = np.array([tracing.probabilities[n] for n in named])
+        design = _select(rivals, named, p / p.sum(), candidates)
+        gain = design.expected_information_gain.clamp_min(0.0).numpy()
+        if gain[design.index] >= NOTHING:
+            action = design.action.double().numpy()
+    found = NextAction(
+        action=action,
+        candidates=candidates.double().numpy(),
+        information_gain=gain,
         separates=(*named,),
     )
+    if len(named) < 2:
+        return found
+    groups = [g & {*named} for g in tracing.equivalent]
+    if action is None:
+        groups = [frozenset(named)]
+    groups = [g for g in groups if len(g) > 1]
+    found = replace(found, inseparable=(*groups,))
+    return _look_outside(rivals, found, groups, actions, candidates)
 
 
-def _following(rivals: RivalSet, candidates: torch.Tensor) -> Trials:
+def _look_outside(
+    rivals: RivalSet,
+    found: NextAction,
+    groups: Sequence[frozenset[str]],
+    actions: ActionSpace,
+    candidates: Tensor,
+) -> NextAction:
+    """Return the choice with an action that is not permitted, if one separates."""
+    if not groups:
+        return found
+    others = outside_candidates(actions, candidates, limit=MAX_CANDIDATES)
+    others = _simulated(rivals, others)
+    if len(others) == 0:
+        return found
+    for group in groups:
+        names = [n for n in found.separates if n in group]
+        equal = np.full(len(names), 1 / len(names))
+        design = _select(rivals, names, equal, others)
+        gain = float(design.expected_information_gain[design.index])
+        error = float(design.standard_error[design.index])
+        if gain - 2 * error >= NOTHING and gain > found.outside_gain:
+            found = replace(
+                found,
+                outside=design.action.double().numpy(),
+                outside_separates=(*names,),
+                outside_gain=gain,
+            )
+    return found
+
+
+def _select(
+    rivals: RivalSet, names: Sequence[str], p: Array, candidates: Tensor
+) -> Design:
+    models = [
+        PredictedRival(rivals, name, float(share), candidates)
+        for name, share in zip(names, p, strict=True)
+    ]
+    designer = InformationGainDesigner(
+        DiscreteActions(candidates),
+        num_samples=SAMPLES_PER_RIVAL * len(models),
+        eliminate=False,  # a part of the samples would be too few for densities
+    )
+    seed = derive_seed(rivals.seed, "next action", *names)
+    return designer.select(models, target="model", seed=seed)
+
+
+def _simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
+    """Return the candidates at which the bare model gives numbers.
+
+    Beyond the permitted range a simulator may fail in any way.
+    """
+    kept = []
+    with torch.no_grad():
+        for action in candidates:
+            try:
+                prediction = predict(
+                    rivals,
+                    _following(rivals, action[None]),
+                    num_draws=4,
+                    scored=False,
+                )
+            except Exception:  # noqa: BLE001  (a user's simulator)
+                continue
+            if np.isfinite(prediction.x).all() and prediction.valid.all():
+                kept.append(action)
+    return torch.stack(kept) if kept else candidates[:0]
+
+
+def _following(rivals: RivalSet, candidates: Tensor) -> Trials:
     """Return each candidate as if it were the next trial."""
     own, num = rivals.trials, len(candidates)
-    row = int(own.valid.int().argmax())
-    x = own.x[row].nan_to_num()
-    times = own.sample_times
-    if times is not None and times.ndim == 2:
-        times = times[row].nan_to_num().expand(num, -1)
+    x, times = own.template()
     return Trials(
-        candidates,
+        candidates.double(),
         x.expand(num, *x.shape),
         index=torch.full((num,), float(own.index.max()) + 1),
         sample_times=times,
         repeat_of=torch.full((num,), -1),
     )
-
-
-def _draws(rivals: RivalSet, name: str, trials: Trials) -> tuple[Array, Array]:
-    parts = name.split(" + ")
-    names = tuple(n for n in parts if n in rivals.effects)
-    error = name if name in (UNEXPLAINED, SCATTER) else None
-    prediction = predict(rivals, trials, names=names, error=error)
-    return prediction.x / np.exp(np.log(prediction.sd).mean(0)), prediction.trial
-
-
-def _information(draws: list[Array], p: Array) -> float:
-    """Return the cross-fitted bound for one action from each rival's draws."""
-    draws = _compressed(draws)
-    half = min(len(d) for d in draws) // 2
-    total = 0.0
-    for fit, score in (
-        (slice(0, half), slice(half, None)),
-        (slice(half, None), slice(0, half)),
-    ):
-        for k in range(len(draws)):
-            x = draws[k][score]
-            log_q = np.stack([_kernel_density(d[fit], x) for d in draws])
-            mixture = log_sum_exp(log_q + np.log(p)[:, None], axis=0)
-            total += 0.5 * p[k] * float((log_q[k] - mixture).mean())
-    return max(total, 0.0)
-
-
-def _compressed(draws: list[Array]) -> list[Array]:
-    """Return the draws along the few directions in which the rivals differ most."""
-    if draws[0].shape[1] <= MAX_DIRECTIONS:
-        return draws
-    pooled = np.concatenate(draws)
-    middle = pooled.mean(0)
-    _, _, directions = np.linalg.svd(pooled - middle, full_matrices=False)
-    return [(d - middle) @ directions[:MAX_DIRECTIONS].T for d in draws]
-
-
-def _kernel_density(points: Array, x: Array) -> Array:
-    """Return log densities at x, shape (s, d), of a Gaussian kernel estimate."""
-    n, d = points.shape
-    width = points.std(0) * (4 / ((d + 2) * n)) ** (1 / (d + 4)) + 1e-9
-    z = (x[:, None] - points[None]) / width
-    log_k = -0.5 * (z**2).sum(-1) - np.log(width).sum() - 0.5 * d * np.log(2 * np.pi)
-    return log_sum_exp(log_k, axis=1) - np.log(n)

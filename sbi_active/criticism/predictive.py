@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.errors import NoiseGrid, log_sum_exp
 from sbi_active.criticism.noise_grid import declared_noise
+from sbi_active.criticism.outcomes import log_outcomes
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.rival import Rival
 from sbi_active.criticism.rival_set import RivalSet
@@ -35,6 +36,8 @@ class Prediction:
         log_density: Of the measurements, of each trial, shape (t,), nats.
         trial: Trial of each number, shape (N,).
         position: Of each number in the flattened x, shape (N,).
+        valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
+        probability_valid: That it has one, given the draw, shape (n, t).
     """
 
     mean: Array
@@ -43,6 +46,8 @@ class Prediction:
     log_density: Array
     trial: Array
     position: Array
+    valid: Array
+    probability_valid: Array
 
 
 def predict(
@@ -51,6 +56,9 @@ def predict(
     *,
     names: tuple[str, ...] = (),
     error: str | None = None,
+    num_draws: int = NUM_DRAWS,
+    seed: int | None = None,
+    scored: bool = True,
 ) -> Prediction:
     """Return the posterior predictive of a rival.
 
@@ -60,12 +68,16 @@ def predict(
             with the residual process of "unexplained" conditioned on them.
         names: Effects of the rival.
         error: None, "unexplained" or "scatter".
+        num_draws: From the posterior, n.
+        seed: Of the draws; None is that of the models.
+        scored: Whether to compute ``log_density``, which is empty without.
     """
     name = rivals.evidence(names, error=error).name
     rival, sample = rivals.rivals[name], rivals.samples[name]
-    rng = np.random.default_rng(derive_seed(rivals.seed, "predictive", name))
-    u = sample.draws(NUM_DRAWS, rng)
-    own_residual = rival.residual(u)[0]
+    seed = rivals.seed if seed is None else seed
+    rng = np.random.default_rng(derive_seed(seed, "predictive", name))
+    u = sample.draws(num_draws, rng)
+    own_residual = rival.residual(u, penalized=False)[0]
     target = rivals.trials if trials is None else trials
     simulator = TrialSimulator(
         rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")
@@ -73,29 +85,37 @@ def predict(
     m = simulator.measurements
     theta, phi = rival.coordinates.split(u)
     if trials is not None:
-        with forked_generators(rivals.seed, "fresh nuisances"):
+        with forked_generators(seed, "fresh nuisances"):
             for effect in rivals.nuisances:  # an unseen trial draws its own
-                fresh = effect.sample(NUM_DRAWS * len(target))
-                phi[effect.name] = fresh.reshape(NUM_DRAWS, len(target), -1)
-    mean, unit, _ = simulator.predict(theta, phi)
-    mean = np.where(np.isfinite(mean), mean, np.nanmean(mean, 0))
-    factor = simulator.noise_scale(phi, NUM_DRAWS)
-    factor = np.ones_like(mean) if factor is None else factor
-    factor = factor if unit is None else factor * unit
-    extra = np.zeros(len(m))
-    if isinstance(rival.error, ResidualProcess):
-        action = rivals.scaled_actions(target)
-        shift, extra = rival.error.condition(own_residual, m, action)
-        mean = mean + shift
+                fresh = effect.sample(num_draws * len(target))
+                phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
+    mean, unit, probability = simulator.predict(theta, phi)
     noise = declared_noise(
         rivals.model.noise, m, seed=derive_seed(rivals.seed, "noise")
     )
+    factor = simulator.noise_scale(phi, num_draws)
+    factor = np.ones_like(mean) if factor is None else factor
+    factor = factor if unit is None else factor * unit
+    center, spread = rivals.prior_predictive(simulator)
+    missing = ~np.isfinite(mean)
+    if missing.any():  # all that is known of such a number is the prior predictive
+        wide = spread / np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
+        mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
+    flags = [
+        log_outcomes(p[:, None], v[None])
+        for p, v in zip(probability.T, m.valid, strict=True)
+    ]
+    extra = np.zeros(len(m))
+    if isinstance(rival.error, ResidualProcess):
+        action = rivals.scaled_actions(target)
+        shift, extra = rival.error.condition(own_residual, m, action, spread=spread)
+        mean = mean + shift
     cells, scales = _drawn_cells(rival, own_residual, rng)
     errors, sd = _errors(noise, cells, scales, mean.shape, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
     density = []
-    for t in range(len(target)):
+    for t in range(len(target) if scored else 0):
         at = m.trial == t
         residual = (m.x - mean)[:, at] / np.where(extra[at] > 0, 1.0, factor[:, at])
         each = [
@@ -103,9 +123,17 @@ def predict(
             for c, s, r, w in zip(cells, scales, residual, sd, strict=True)
         ]
         log_scale = np.where(extra[at] > 0, 0.0, np.log(factor[:, at])).sum(1)
-        density.append(log_sum_exp(np.array(each) - log_scale) - np.log(NUM_DRAWS))
+        each = np.array(each) - log_scale + flags[t]
+        density.append(log_sum_exp(each) - np.log(num_draws))
     return Prediction(
-        mean, sd, mean + errors, np.array(density, dtype=float), m.trial, m.position
+        mean,
+        sd,
+        mean + errors,
+        np.array(density, dtype=float),
+        m.trial,
+        m.position,
+        rng.uniform(size=probability.shape) < probability,
+        probability,
     )
 
 

@@ -13,12 +13,8 @@ from sbi_active.criticism.figures import (
     plot_probabilities,
     plot_residuals,
 )
-from sbi_active.criticism.sections import (
-    Section,
-    sections,
-    summary_sentence,
-    verdict_line,
-)
+from sbi_active.criticism.headline import added, summary_sentence, verdict_line
+from sbi_active.criticism.sections import Section, sections
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,9 +24,11 @@ if TYPE_CHECKING:
 __all__ = ["figures", "to_html", "to_markdown", "to_text"]
 
 CAPTIONS = {
-    "residuals": "Residuals, refitted, in standard deviations of the predictive.",
+    "residuals": "Residuals of the models refitted to all trials, in standard "
+    "deviations of the prediction; the band is two of them. Each row has its scale.",
     "probabilities": "Posterior probability of the models that were tried.",
-    "before_after": "Scores of each trial; bars are over all of them.",
+    "before_after": "One line a scored trial; the bars are over all of them. "
+    "Lower is better for the first two, higher for the third; the dotted line is 90 %.",
 }
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #20262b; max-width: 60rem;
@@ -58,6 +56,7 @@ def figures(report: Report) -> dict[str, Figure]:
             report.residuals_after,
             action_labels=report.action_labels,
             channel_names=report.channel_names,
+            added=added(report),
         ),
         "probabilities": plot_probabilities(report.tracing),
     }

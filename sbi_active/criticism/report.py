@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
+import cloudpickle
 import numpy as np
 import pandas as pd
-from scipy.stats import rankdata
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism import rendering
+from sbi_active.criticism.cautions import find_warnings
+from sbi_active.criticism.headline import verdict_line
 from sbi_active.criticism.results import (
     NONE,
-    SCATTER,
     UNEXPLAINED,
     Detection,
     Evaluation,
@@ -23,14 +25,11 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.sections import verdict_line
 from sbi_active.criticism.trials import Trials
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["Report", "build_report", "find_warnings"]
+__all__ = ["Report", "build_report"]
 
-FEW_TRIALS = 5
-ALIASED = 0.9  # |rank correlation| of an action with the order of the trials
 GUESS = 3.0  # nats above "unexplained", from which a formula is printed
 
 
@@ -78,6 +77,11 @@ class Report:
 
     def __repr__(self) -> str:
         return f"Report({verdict_line(self)!r})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Effects are lambdas and local functions as a rule, which pickle refuses.
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        return _restored, (cloudpickle.dumps(parts),)
 
     @property
     def verdict(self) -> str:
@@ -213,7 +217,14 @@ def build_report(
         pairs = zip(actions.names, actions.units, strict=True)
         labels = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
     found = find_warnings(
-        trials, residuals, tracing, exploratory=exploratory, designed=designed
+        trials,
+        residuals,
+        tracing,
+        detection=detection,
+        residuals_after=residuals_after,
+        effects=getattr(prior, "effects", ()),
+        exploratory=exploratory,
+        designed=designed,
     )
     channels = simulator.channel_names
     return Report(
@@ -234,80 +245,8 @@ def build_report(
     )
 
 
-def find_warnings(
-    trials: Trials,
-    residuals: Residuals,
-    tracing: Tracing,
-    *,
-    exploratory: bool = False,
-    designed: bool = False,
-) -> tuple[str, ...]:
-    """Return what limits the conclusions, a sentence each.
-
-    Args:
-        trials: The measured trials.
-        residuals: Of the bare model.
-        tracing: Which effect the data point to.
-        exploratory: What was frozen was changed after the data were seen.
-        designed: Actions were chosen for their information.
-    """
-    fit = trials.fit
-    found = []
-    if residuals.noise != "declared":
-        found.append(
-            "noise undeclared: it is estimated from the data, and an effect that looks "
-            "like noise in them cannot be told from it"
-        )
-    if len(fit) < FEW_TRIALS:
-        found.append(
-            f"fewer than {FEW_TRIALS} trials ({len(fit)}): several effects may explain "
-            "as few"
-        )
-    if _aliased(fit):
-        found.append(
-            "drift aliased with the order of actions: they were executed in sorted "
-            "order, so that what grows with time looks like what grows with the action"
-        )
-    edge = [e.name for e in tracing.estimates if e.at_edge and e.name in tracing.chosen]
-    if edge:
-        found.append(
-            f"phi at its prior's edge ({', '.join(edge)}): the effect is stronger than "
-            "declared, or stands in for another"
-        )
-    if designed:
-        found.append(
-            "actions chosen for information and not for deployment: the error before "
-            "and after is that of such actions"
-        )
-    if not tracing.robust:
-        found.append(
-            "not robust to its prior: effect priors a third or three times as wide "
-            "give another verdict"
-        )
-    if tracing.verdict == UNEXPLAINED:
-        found.append(
-            "no declared effect explains the data: the residual process in its place "
-            "does not extrapolate"
-        )
-    if tracing.verdict == SCATTER:
-        found.append("scatter is larger than the declared noise, which is no cause")
-    if exploratory:
-        found.append(
-            "exploratory: library or priors were changed after the data were seen, so "
-            "the false-alarm rate is not what is stated"
-        )
-    return tuple(found)
-
-
-def _aliased(trials: Trials) -> bool:
-    """Return whether an entry of the action goes with the order of execution."""
-    order = rankdata(trials.index.numpy())
-    for value in trials.action.numpy().T:
-        ranks = rankdata(value)
-        varies = len(ranks) > 2 and ranks.std() > 0
-        if varies and abs(np.corrcoef(order, ranks)[0, 1]) > ALIASED:
-            return True
-    return False
+def _restored(parts: bytes) -> Report:
+    return Report(**cloudpickle.loads(parts))
 
 
 def _moments(draws: np.ndarray) -> list[float]:

@@ -1,13 +1,15 @@
 r"""A Gaussian process over the action and time: what no declared effect explains.
 
 .. math::
-    r = a\, s\, g(\xi, t) + \epsilon, \qquad
+    r = a\, b\, g(\xi, t) + \epsilon, \qquad
     g \sim \mathcal{GP}\Bigl(0, \exp\bigl(-\tfrac{|\Delta\xi|^2}{2 \ell^2}
     - \tfrac{\Delta t^2}{2 \ell_t^2}\bigr)\Bigr),
 
-independent in each channel, with the noise's standard deviation s. The length
-:math:`\ell` takes two values, the amplitude a is log-uniform from the size of the noise
-to that of the prior predictive; both are summed out.
+independent in each channel. The unit b is the noise's standard deviation, or it is
+proportional to the deviation of the prior predictive: what is missing from a simulator
+that multiplies or shifts an input grows with the output. The length :math:`\ell` takes
+two values, the amplitude a is log-uniform from the size of the noise to that of the
+prior predictive; all are summed out.
 
 References:
     Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
@@ -16,6 +18,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -51,6 +54,7 @@ class _Basis:
 
     cell: int
     length: float
+    is_relative: bool
     log_weight: float
     directions: Array  # Q, (N, m), orthonormal
     variances: Array  # v, (m,)
@@ -65,6 +69,8 @@ class ResidualProcess(ErrorModel):
         action: Of each trial, in ranges of the action space, shape (t, action_dim).
         largest: Upper end of the amplitude, in standard deviations of the noise.
         lengths: Length scales, in ranges of the action space.
+        spread: Deviation of the prior predictive, shape (N,); None has the noise as the
+            only unit.
     """
 
     def __init__(
@@ -75,15 +81,21 @@ class ResidualProcess(ErrorModel):
         action: Array,
         largest: float,
         lengths: tuple[float, ...] = LENGTHS,
+        spread: Array | None = None,
     ) -> None:
-        self.noise, self.measurements = noise, measurements
+        self.noise, self.measurements, self.spread = noise, measurements, spread
         self.amplitudes = np.geomspace(1.0, max(largest, 3.0), NUM_AMPLITUDES)
         # With an unknown size of the noise, the amplitude is a multiple of it.
         self._log_amplitude = -np.log(NUM_AMPLITUDES)
         typical = np.exp(np.mean([np.log(c.sd) for c in noise.cells], 0))
         self._bases: list[_Basis] = []
-        for length in lengths:
-            features = typical[:, None] * _features(measurements, action, length)
+        units = {False: typical}
+        if spread is not None:
+            units[True] = self._relative(spread, typical)
+        for length, relative in product(lengths, units):
+            features = units[relative][:, None] * _features(
+                measurements, action, length
+            )
             for k, cell in enumerate(noise.cells):
                 whitened = cell.whiten(features.T).T
                 values, vectors = np.linalg.eigh(whitened.T @ whitened)
@@ -92,7 +104,8 @@ class ResidualProcess(ErrorModel):
                     _Basis(
                         k,
                         length,
-                        float(noise.log_prior[k] - np.log(len(lengths))),
+                        relative,
+                        float(noise.log_prior[k] - np.log(len(lengths) * len(units))),
                         whitened @ (vectors[:, keep] / np.sqrt(values[keep])),
                         values[keep],
                     )
@@ -108,8 +121,24 @@ class ResidualProcess(ErrorModel):
     def whitener(self, residual: Array) -> Whitener:
         joint = np.stack([self._joint(residual[None], b)[0] for b in self._bases])
         place = np.unravel_index(np.argmax(joint), joint.shape)
-        basis, a = self._bases[place[0]], self.amplitudes[place[1]]
-        cell, scale = self.noise.cells[basis.cell], self.noise.scales[place[2]]
+        basis = self._bases[place[0]]
+        return self._whitener(
+            basis, self.amplitudes[place[1]], self.noise.scales[place[2]]
+        )
+
+    def regimes(self) -> list[Whitener]:
+        # A large process leaves the parameters wide, a small one narrow.
+        cell = int(np.argmax(self.noise.log_prior))
+        scale = float(np.median(self.noise.scales))
+        return [
+            self._whitener(basis, a, scale)
+            for basis in self._bases
+            if basis.cell == cell
+            for a in self.amplitudes[::2]
+        ]
+
+    def _whitener(self, basis: _Basis, a: float, scale: float) -> Whitener:
+        cell = self.noise.cells[basis.cell]
         shrink = 1 / np.sqrt(1 + a**2 * basis.variances) - 1
 
         def whiten(residual: Array) -> Array:
@@ -119,7 +148,12 @@ class ResidualProcess(ErrorModel):
         return whiten
 
     def condition(
-        self, residual: Array, new: Measurements, action: Array
+        self,
+        residual: Array,
+        new: Measurements,
+        action: Array,
+        *,
+        spread: Array | None = None,
     ) -> tuple[Array, Array]:
         r"""Return the process at new actions, given residuals, by its best amplitude.
 
@@ -131,6 +165,7 @@ class ResidualProcess(ErrorModel):
             residual: Of the measurements at hand, shape (n, N).
             new: Measurements to predict, M.
             action: Of all trials, those at hand first, in ranges of the action space.
+            spread: Of the new measurements, shape (M,), where there is one of the old.
 
         Returns:
             Means, shape (n, M), and standard deviations, shape (M,).
@@ -143,14 +178,18 @@ class ResidualProcess(ErrorModel):
         own = self._points(self.measurements, action, basis.length)
         there = self._points(new, action[-new.shape[0] :], basis.length)
         sd, new_sd = cell.sd * scale, np.full(len(new), np.median(cell.sd) * scale)
-        within = a**2 * _kernel(own, own) * np.outer(sd, sd)
-        across = a**2 * _kernel(there, own) * np.outer(new_sd, sd)
+        unit, new_unit = sd, new_sd
+        if basis.is_relative and spread is not None and self.spread is not None:
+            unit = self._relative(self.spread, sd)
+            new_unit = unit[0] / self.spread[0] * spread
+        within = a**2 * _kernel(own, own) * np.outer(unit, unit)
+        across = a**2 * _kernel(there, own) * np.outer(new_unit, unit)
         whitened = cell.whiten(cell.whiten(within).T) / scale**2
         inverse = np.linalg.inv(whitened + np.eye(len(sd)))
         weight = (cell.whiten(across) / scale) @ inverse
         mean = (cell.whiten(residual) / scale) @ weight.T
         explained = np.einsum("mi,mi->m", weight, cell.whiten(across) / scale)
-        return mean, np.sqrt(np.maximum((a * new_sd) ** 2 - explained, 0.0))
+        return mean, np.sqrt(np.maximum((a * new_unit) ** 2 - explained, 0.0))
 
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
@@ -162,6 +201,10 @@ class ResidualProcess(ErrorModel):
         basis, _, scale = np.unravel_index(best, joint.shape[1:])
         cells = np.array([b.cell for b in self._bases])[basis]
         return cells, self.noise.scales[scale]
+
+    def _relative(self, spread: Array, sd: Array) -> Array:
+        """Return the spread, in the median as large as the noise."""
+        return spread * np.median(sd / spread)
 
     def _points(
         self, m: Measurements, action: Array, length: float

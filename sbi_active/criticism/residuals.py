@@ -54,6 +54,7 @@ def find_residuals(
         ),
         correlation=_correlation(rivals, prediction),
         noise=kind,
+        probability_valid=prediction.probability_valid.mean(0),
     )
 
 
@@ -82,7 +83,7 @@ def _prequential(
     rng = np.random.default_rng(rivals.seed)
     prior = rival.coordinates.sample(NUM_PRIOR, seed=rivals.seed)
     u = np.concatenate([prior, rivals.samples[rival.name].draws(NUM_PRIOR, rng)])
-    residual, log_scale, _ = rival.residual(u)
+    residual, log_scale, _ = rival.residual(u, penalized=False)
     # The process is left out: what is asked is how the simulator predicts.
     noise = rivals.noise
     log_l = noise.log_likelihood(residual) - log_scale

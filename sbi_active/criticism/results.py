@@ -42,6 +42,8 @@ class Residuals:
             without a time axis.
         noise: "declared", "estimated" (from repeats or the trajectories themselves), or
             "stochastic" (the simulator is the draw).
+        probability_valid: That each trial has a measurement, shape (t,); None where it
+            was not computed.
     """
 
     action: Array
@@ -54,6 +56,7 @@ class Residuals:
     prequential: Array
     correlation: float
     noise: Literal["declared", "estimated", "stochastic"]
+    probability_valid: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +132,6 @@ class Estimate:
         sd: Of phi given the effect alone, shape (phi_dim,).
         effective_sample_size: Of its evidence.
         engine: Of its evidence.
-        at_edge: phi lies at the edge of its prior.
     """
 
     name: str
@@ -142,7 +144,6 @@ class Estimate:
     sd: Array
     effective_sample_size: float
     engine: str
-    at_edge: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,9 +216,19 @@ class NextAction:
         candidates: Shape (a, action_dim).
         information_gain: Lower bound on I(model; x | action) a candidate, nats.
         separates: Names that remain in question.
+        inseparable: Groups of them that no permitted action separates.
+        outside: An action that is not permitted and separates such a group, shape
+            (action_dim,); None where none was found, or none was looked for.
+        outside_separates: The group that it separates; empty without.
+        outside_gain: Lower bound on the information about which of the group is right,
+            all taken as equally likely, nats; 0 without.
     """
 
     action: Array | None
     candidates: Array
     information_gain: Array
     separates: tuple[str, ...] = field(default_factory=tuple)
+    inseparable: tuple[frozenset[str], ...] = ()
+    outside: Array | None = None
+    outside_separates: tuple[str, ...] = ()
+    outside_gain: float = 0.0

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.criticism.effects import Effect
-from sbi_active.criticism.errors import ErrorModel, Whitener
+from sbi_active.criticism.errors import ErrorModel, NoiseGrid, Whitener
+from sbi_active.criticism.outcomes import DISAGREEMENT, log_outcomes
 from sbi_active.criticism.scales import SearchCoordinates
 from sbi_active.criticism.trial_simulator import TrialSimulator
 
@@ -18,8 +19,8 @@ __all__ = ["Rival"]
 
 Array = NDArray[Any]
 
-#: Odds that a trial has no outcome where the simulator has one, or vice versa.
-DISAGREEMENT = 0.02
+#: Bound on a residual, so that its square is finite.
+LARGEST = 1e100
 
 
 class Rival:
@@ -32,8 +33,11 @@ class Rival:
         effects: Effects that this rival has.
         nuisances: Effects of scope "trial", which every rival has.
         error: Distribution of the residual.
-        spread: Deviation of the prior predictive, shape (N,): the residual where the
-            simulator gives no number.
+        spread: Deviation of the prior predictive, shape (N,), which is the density of a
+            number where the simulator gives none.
+        center: Its mean, shape (N,).
+        disagreement: Probabilities, equally likely, that a trial has no outcome where
+            the simulator has one, or vice versa.
 
     Attributes:
         coordinates: Of z.
@@ -49,9 +53,13 @@ class Rival:
         nuisances: Sequence[Effect] = (),
         error: ErrorModel,
         spread: Array,
+        center: Array | None = None,
+        disagreement: Sequence[float] = (DISAGREEMENT,),
     ) -> None:
         self.name, self.effects = name, (*effects,)
         self.simulator, self.error, self.spread = simulator, error, spread
+        self.center = np.zeros(len(spread)) if center is None else center
+        self.disagreement = disagreement
         self.coordinates = SearchCoordinates(
             prior, effects, nuisances, len(simulator.trials)
         )
@@ -88,37 +96,54 @@ class Rival:
         flags = np.repeat([True, *own], joint.sizes)
         return np.concatenate([flags, np.ones(self.dim - len(flags), bool)])
 
-    def residual(self, u: Array) -> tuple[Array, Array, Array]:
+    def residual(
+        self, u: Array, *, penalized: bool = True
+    ) -> tuple[Array, Array, Array]:
         """Return residuals in units of the declared noise.
 
         Args:
             u: Shape (n, dim).
+            penalized: Where the simulator gives no number, a search needs a residual
+                that drives it away: the spread of the prior predictive, in units of the
+                noise. False gives what the likelihood has there, the prior predictive
+                itself as the number's distribution.
 
         Returns:
             Observation minus prediction divided by the effects' factor on the noise,
-            shape (n, N); log of these factors, summed, shape (n,); log odds of which
-            trials have an outcome, shape (n,), 0 where all agree.
+            shape (n, N); log of these factors, summed, shape (n,); log probability of
+            which trials have an outcome, shape (n,).
         """
         theta, phi = self.coordinates.split(u)
-        mean, sd, valid = self.simulator.predict(theta, phi)
-        x = self.simulator.measurements.x
-        residual = np.where(np.isfinite(mean), x - mean, self.spread)
+        mean, sd, probability = self.simulator.predict(theta, phi)
+        m, missing = self.simulator.measurements, ~np.isfinite(mean)
+        residual = np.where(missing, self.spread, m.x - mean)
         log_scale = np.zeros(len(u))
         scale = self.simulator.noise_scale(phi, len(u))
         if sd is not None:
             sd = np.where(np.isfinite(sd), sd, self.spread)
             scale = sd if scale is None else scale * sd
+        if missing.any() and not penalized:
+            residual = np.where(missing, m.x - self.center, residual)
+            wide = self.spread / self._unit
+            scale = np.where(missing, wide, 1.0 if scale is None else scale)
         if scale is not None:
             scale = np.maximum(scale, 1e-12)
             residual, log_scale = residual / scale, np.log(scale).sum(1)
-        agree = valid == self.simulator.measurements.valid
-        log_agree = np.where(agree, 0.0, np.log(DISAGREEMENT))
-        return residual, log_scale, log_agree.sum(1)
+        flags = log_outcomes(probability, m.valid, self.disagreement)
+        residual = np.clip(residual, -LARGEST, LARGEST)
+        return residual, log_scale, flags
+
+    @property
+    def _unit(self) -> Array:
+        """Typical standard deviation of the noise, shape (N,)."""
+        noise = getattr(self.error, "noise", self.error)
+        assert isinstance(noise, NoiseGrid)
+        return np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
 
     def log_likelihood(self, u: Array) -> Array:
         """Return log p(x | z), shape (n,)."""
-        residual, log_scale, log_agree = self.residual(u)
-        log_p = self.error.log_likelihood(residual) - log_scale + log_agree
+        residual, log_scale, flags = self.residual(u, penalized=False)
+        log_p = self.error.log_likelihood(residual) - log_scale + flags
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def log_prior(self, u: Array) -> Array:

@@ -13,12 +13,22 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.augmented import AugmentedSimulator
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.errors import ErrorModel
-from sbi_active.criticism.importance import ImportanceSample, importance_sample
-from sbi_active.criticism.least_squares import find_modes, probe_step
+from sbi_active.criticism.importance import (
+    ENOUGH,
+    ImportanceSample,
+    importance_sample,
+)
+from sbi_active.criticism.least_squares import (
+    along_ridges,
+    find_modes,
+    probe_step,
+)
 from sbi_active.criticism.noise_grid import declared_noise, scattered
+from sbi_active.criticism.outcomes import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
 from sbi_active.criticism.rival import Rival
+from sbi_active.criticism.scales import SearchCoordinates
 from sbi_active.criticism.tempering import temper
 from sbi_active.criticism.trial_simulator import TrialSimulator
 from sbi_active.criticism.trials import Trials
@@ -31,7 +41,10 @@ Array = NDArray[Any]
 
 NUM_DRAWS = 400
 #: Below this effective sample size importance sampling is not trusted.
-TOO_FEW = 30.0
+TOO_FEW = 20.0
+#: Nats by which a largest likelihood stays below another model's evidence, so that its
+#: own evidence need not be precise.
+HOPELESS = 30.0
 NUM_SPREAD = 200
 #: Searches that start at posteriors of smaller rivals.
 NUM_NEAR = 8
@@ -48,11 +61,14 @@ class RivalSet:
         actions: The permitted ones, for the length scales of the residual process; None
             takes the range of the trials.
         seed: Of all draws.
+        reference: Log evidence of a model outside the set that these compete with.
 
     Attributes:
         effects: Effects of scope "campaign", by name.
         noise: Distribution of the errors of the bare model.
-        spread: Deviation of the prior predictive, shape (N,).
+        center: Mean of the prior predictive, shape (N,).
+        spread: Its deviation, shape (N,).
+        can_fail: Whether a trial, or one of the prior predictive, has no outcome.
         step: Of finite differences.
         is_smooth: Whether derivatives mean anything.
         evidences: Of the rivals that were asked for, by name.
@@ -68,7 +84,9 @@ class RivalSet:
         *,
         actions: ActionSpace | None = None,
         seed: int = 0,
+        reference: float = -np.inf,
     ) -> None:
+        self.reference = reference
         self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
         self.actions = actions
         self.effects = {e.name: e for e in effects if e.scope == "campaign"}
@@ -83,7 +101,8 @@ class RivalSet:
         self.noise = declared_noise(
             model.noise, self.measurements, seed=derive_seed(seed, "noise")
         )
-        self.spread = self._prior_spread()
+        self.center, self.spread = self.prior_predictive(self.simulator)
+        self.can_fail = not trials.valid.all() or self.simulator.failed
         self.step, self.is_smooth = probe_step(
             self.rival(()), seed=derive_seed(seed, "probe")
         )
@@ -114,6 +133,12 @@ class RivalSet:
             nuisances=self.nuisances,
             error=model,
             spread=self.spread,
+            center=self.center,
+            disagreement=(
+                UNKNOWN_RATES
+                if error == UNEXPLAINED and self.can_fail
+                else (DISAGREEMENT,)
+            ),
         )
 
     def residual_process(self) -> ResidualProcess:
@@ -125,6 +150,7 @@ class RivalSet:
                 self.measurements,
                 action=self.scaled_actions(),
                 largest=float(np.median(self.spread / sd)),
+                spread=None if self.simulator.is_stochastic else self.spread,
             )
         return self._process
 
@@ -181,10 +207,28 @@ class RivalSet:
         near = self._starts(rival, seed)
         modes = find_modes(rival, step=self.step, seed=seed, near=near)
         rng = np.random.default_rng(seed)
-        sample = importance_sample(rival, modes.proposal, rng=rng)
-        if sample.effective_sample_size >= TOO_FEW:
+        hopeless = self._is_hopeless(rival, modes.u)
+        sample = importance_sample(
+            rival,
+            modes.proposal,
+            rng=rng,
+            local=lambda: along_ridges(rival, modes, step=self.step, rng=rng),
+            enough=1.0 if hopeless else ENOUGH,
+        )
+        if hopeless or sample.effective_sample_size >= TOO_FEW:
             return sample, "least squares"
         return temper(rival, seed=seed), "tempering"
+
+    def _is_hopeless(self, rival: Rival, modes: Array) -> bool:
+        """Return whether even the largest likelihood is far below a known evidence.
+
+        An evidence is an average of likelihoods, so that no precision of it matters.
+        """
+        if rival.has_noise_effect:  # whose coordinates the search leaves alone
+            return False
+        known = [e.log_evidence for e in self.evidences.values()]
+        best = max([*known, self.reference])
+        return bool(rival.log_likelihood(modes).max() < best - HOPELESS)
 
     def _starts(self, rival: Rival, seed: int) -> Array | None:
         """Return points at posteriors of smaller rivals, the rest from the prior.
@@ -240,7 +284,7 @@ class RivalSet:
             theta_names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
         names = [*theta_names, *[n for e in rival.effects for n in e.phi_names]]
         own = sum(joint.sizes)
-        residual = rival.residual(best)[0]
+        residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
         return Evidence(
             name=rival.name,
@@ -254,22 +298,18 @@ class RivalSet:
             best_chi_square=float(min(square)),
         )
 
-    def _prior_spread(self) -> Array:
-        """Return the prior predictive's deviation of each number, shape (N,)."""
-        ones = np.ones(len(self.measurements))
-        rival = Rival(
-            "prior",
-            simulator=self.simulator,
-            prior=self.prior,
-            effects=(),
-            nuisances=self.nuisances,
-            error=self.noise,
-            spread=ones,
-        )
-        u = rival.coordinates.sample(NUM_SPREAD, seed=derive_seed(self.seed, "spread"))
-        mean, _, _ = self.simulator.predict(*rival.coordinates.split(u))
+    def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
+        """Return mean and deviation of each number before the data, shapes (N,)."""
+        c = SearchCoordinates(self.prior, (), self.nuisances, len(simulator.trials))
+        u = c.sample(NUM_SPREAD, seed=derive_seed(self.seed, "spread"))
+        mean, _, _ = simulator.predict(*c.split(u))
         finite = np.isfinite(mean).any(0)
-        spread = np.zeros(len(self.measurements))
+        center, spread = np.zeros((2, mean.shape[1]))
+        center[finite] = np.nanmean(mean[:, finite], axis=0)
         spread[finite] = np.nanstd(mean[:, finite], axis=0)
         typical = np.median(spread[spread > 0]) if (spread > 0).any() else 1.0
-        return np.maximum(spread, 1e-3 * typical)
+        if finite.any() and not finite.all():
+            # No draw gives a number there: any that the others give is as good.
+            center[~finite] = np.mean(center[finite])
+            spread[~finite] = np.hypot(typical, np.std(center[finite]))
+        return center, np.maximum(spread, 1e-3 * typical)

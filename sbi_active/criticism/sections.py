@@ -9,14 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sbi_active.criticism.figures import METRICS
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
+from sbi_active.criticism.headline import added, number, probability
+from sbi_active.criticism.results import (
+    NONE,
+    Array,
+    Evaluation,
+)
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report import Report
 
-__all__ = ["Section", "sections", "summary_sentence", "verdict_line"]
+__all__ = ["Section", "sections"]
 
 SHOWN = 0.01  # probability from which a set of several effects stands in the table
+FEW_PAIRS = 8  # scored trials below which the pairs stand in place of an interval
 
 
 @dataclass(frozen=True)
@@ -40,24 +46,6 @@ class Section:
     figure: str | None = None
 
 
-def verdict_line(report: Report) -> str:
-    """Return the verdict with what limits it, in one line."""
-    tracing, verdict = report.tracing, report.verdict
-    probability = tracing.probabilities.get(verdict)
-    stated = "" if probability is None else f" (P = {_probability(probability)})"
-    line = f"Verdict: {verdict}{stated}"
-    if report.guess is not None:
-        line += f", a guess, not declared: {report.guess}"
-    if not tracing.robust:
-        line += ", not robust to its prior"
-    named = {*tracing.chosen} or {verdict}
-    groups = [group for group in tracing.equivalent if group & named]
-    same = sorted(frozenset().union(*groups) - named)
-    if same:
-        line += f"; no permitted action tells it from {', '.join(same)}"
-    return line
-
-
 def sections(report: Report) -> Iterator[Section]:
     """Yield the parts of a report in order."""
     if report.warnings:
@@ -71,52 +59,26 @@ def sections(report: Report) -> Iterator[Section]:
     yield _record(report)
 
 
-def summary_sentence(report: Report) -> str:
-    """Return what the verdict says, in a sentence or two."""
-    detection, trials = report.detection, f"{report.num_trials} trials"
-    against = (
-        f"log Bayes factor {detection.log_bayes_factor:.1f} +- "
-        f"{detection.standard_error:.1f} nats against the bare model; an alarm needs "
-        f"{detection.threshold:.1f} at the lower end, {detection.lower:.1f}"
-    )
-    if report.verdict == NONE:
-        return f"The bare model explains the {trials} ({against})."
-    if report.verdict == UNEXPLAINED:
-        return (
-            f"The bare model misses the {trials} ({against}), and so does every "
-            "declared effect."
-        )
-    if report.verdict == SCATTER:
-        return (
-            f"The {trials} scatter more than declared ({against}), and no effect "
-            "explains it."
-        )
-    sentences = [
-        f"{e.name}: {e.describe}."
-        for e in report.tracing.estimates
-        if e.name in report.tracing.chosen and e.describe
-    ]
-    first = f"The bare model misses the {trials} ({against})."
-    return " ".join([first, *sentences])
-
-
 def _effects(report: Report) -> Section:
     """Return every model alone, and the sets of effects that have a share."""
     tracing = report.tracing
-    header = ("model", "P", "P in any set", "phi", "log BF", "ESS", "engine", "90 %")
+    any_set = any(" + " in name for name in tracing.probabilities)
+    shares = ("P in any set",) if any_set else ()
+    header = ("model", "P", *shares, "phi", "log BF", "ESS", "engine", "90 % set")
     estimates = {e.name: e for e in tracing.estimates}
     null = tracing.evidences[NONE].log_evidence
     rows, left_out = [], 0
-    for name, probability in tracing.probabilities.items():
-        if " + " in name and probability < SHOWN and name != tracing.verdict:
+    for name, p in tracing.probabilities.items():
+        if " + " in name and p < SHOWN and name != tracing.verdict:
             left_out += 1
             continue
-        inclusion, phi, fit = "", "", ("", "", "")
+        inclusion, phi, fit = ("",) * any_set, "", ("", "", "")
         if name in estimates:
             e = estimates[name]
             pairs = zip(e.mean, e.sd, strict=True)
             phi = ", ".join(_with_error(m, sd) for m, sd in pairs) + f" {e.units}"
-            inclusion = _probability(tracing.inclusion.get(name, probability))
+            share = probability(tracing.inclusion.get(name, p))
+            inclusion = (share,) * any_set
         if name in tracing.evidences:
             found = tracing.evidences[name]
             fit = (
@@ -125,16 +87,19 @@ def _effects(report: Report) -> Section:
                 found.engine,
             )
         inside = "yes" if name in tracing.credible_set else ""
-        cells = (name, _probability(probability), inclusion, phi.strip(), *fit, inside)
-        rows.append((probability, cells))
+        cells = (name, probability(p), *inclusion, phi.strip(), *fit, inside)
+        rows.append((p, cells))
     rows.sort(key=lambda row: -row[0])
     text = [
-        "phi is that of the effect alone; log BF against the bare model, in nats; the "
-        "last column marks the 90 % credible set."
+        "P: probability of the model given the trials. phi: strength of the effect "
+        "if it alone is added. log BF: log Bayes factor against the bare model, nats. "
+        "ESS: effective samples behind it. 90 % set: the smallest set of models that "
+        "holds 90 % of the probability."
     ]
     if left_out:
         text.append(
-            f"{left_out} sets of several effects have less than {SHOWN:g} each."
+            f"{left_out} sets of several effects have P < {SHOWN:g} each and are left "
+            "out."
         )
     if report.guess is not None:
         text.append(
@@ -161,9 +126,8 @@ def _equivalences(report: Report) -> Section:
         for group in tracing.near
         if group not in tracing.equivalent
     ]
-    text = (
-        () if items else ("Every pair of models is separated by a permitted action.",)
-    )
+    by = "these trials" if report.next_action is None else "a permitted action"
+    text = () if items else (f"Every pair of models is separated by {by}.",)
     return Section("Equivalence sets", text=text, items=tuple(items))
 
 
@@ -180,11 +144,22 @@ def _residuals(report: Report) -> Section:
     if report.residuals_after is not None:
         after = report.residuals_after
         rows.append(
-            ("with the effect", describe(after.refitted), describe(after.prequential))
+            (
+                f"with {added(report)}",
+                describe(after.refitted),
+                describe(after.prequential),
+            )
         )
     detection = report.detection
+    noise = {
+        "declared": "The noise is declared.",
+        "estimated": "The noise is estimated from repeated trials.",
+        "stochastic": "The noise is the simulator's own.",
+    }[before.noise]
     text = [
-        f"Noise {before.noise}. Chi-square of the bare model "
+        "Observation minus prediction, in standard deviations of the prediction: about "
+        "1, and 5 % beyond 2, where the model holds.",
+        f"{noise} Chi-square of the bare model "
         f"{detection.chi_square:.1f} on {detection.degrees_of_freedom} degrees of "
         f"freedom, p {_p_value(detection.p_value)}.",
     ]
@@ -203,46 +178,76 @@ def _errors(report: Report) -> Section:
     rows = [
         (
             METRICS.get(str(name), str(name)),
-            _number(before),
-            _number(after),
-            _number(ratio),
-            "" if interval is None else " to ".join(map(_number, interval)),
+            number(before),
+            number(after),
+            number(ratio),
+            "" if interval is None else " to ".join(map(number, interval)),
         )
         for name, before, after, ratio, interval in report.before_after.itertuples(
             index=False
         )
     ]
     num = len(evaluation.trials)
-    text = [f"{num} trials, {evaluation.scheme}: none had a part in what scores it."]
-    if num < 8:
+    if evaluation.scheme == "held out":
+        text = [f"{num} held-out trials, which had no part in choosing or fitting."]
+    else:
+        same = sum(verdict == report.verdict for verdict in evaluation.selected)
+        text = [
+            f"{num} trials, each predicted by models that were chosen and fitted "
+            f"without it ({evaluation.scheme}); {same} of {num} such verdicts are "
+            f"{report.verdict}, that of all trials."
+        ]
+    text.append(
+        "The third number is after / before for the RMSE and the energy score, and "
+        "after - before for the other two."
+    )
+    pairs: list[str] = []
+    if num < FEW_PAIRS:
         text.append(
-            "Below 8 trials an interval over trials covers too little; the pairs are "
-            "in the figure."
+            f"Below {FEW_PAIRS} trials an interval over trials covers too little; "
+            "these are the pairs:"
         )
-    header = (
-        "metric",
-        "before",
-        "after",
-        "after / before, or difference",
-        "90 % interval",
-    )
+        pairs = _pairs(evaluation)
+    header = ("metric", "before", "after", "ratio or difference", "90 % interval")
     return Section(
-        title, tuple(text), header=header, rows=tuple(rows), figure="before_after"
+        title,
+        tuple(text),
+        items=tuple(pairs),
+        header=header,
+        rows=tuple(rows),
+        figure="before_after",
     )
+
+
+def _pairs(evaluation: Evaluation) -> list[str]:
+    """Return the RMSE and the log density of each scored trial, before and after."""
+    found = []
+    for i, trial in enumerate(evaluation.trials):
+        each = [
+            f"{METRICS[name]} {number(float(evaluation.before[name][i]))} -> "
+            f"{number(float(evaluation.after[name][i]))}"
+            for name in ("rmse", "log predictive density")
+        ]
+        which = "held-out trial" if evaluation.scheme == "held out" else "trial"
+        found.append(f"{which} {int(trial)}: {', '.join(each)}")
+    return found
 
 
 def _parameters(report: Report) -> Section:
+    header = ["parameter", "bare model", f"with {added(report)}"]
     rows = []
     for name, before, before_sd, after, after_sd in report.parameters.itertuples(
         index=False
     ):
         cells = _with_error(before, before_sd), _with_error(after, after_sd)
         rows.append((str(name), *cells))
-    return Section(
-        "Parameters before and after",
-        header=("parameter", "bare model", "with the effect"),
-        rows=tuple(rows),
-    )
+    if report.verdict == NONE:
+        return Section(
+            "Parameters",
+            header=(*header[:2],),
+            rows=tuple(row[:2] for row in rows),
+        )
+    return Section("Parameters before and after", header=(*header,), rows=tuple(rows))
 
 
 def _next(report: Report) -> Section:
@@ -253,26 +258,43 @@ def _next(report: Report) -> Section:
         )
     best = float(np.nanmax(chosen.information_gain, initial=0.0))
     if chosen.action is None:
-        text = (
+        text = [
             "Stop: no permitted action tells more about which model is right than "
             f"{max(best, 0.001):.3f} nats."
+        ]
+    else:
+        question = f" between {_joined(chosen.separates)}" if chosen.separates else ""
+        text = [
+            f"{_action(report, chosen.action)}: at least {best:.2f} nats{question} (a "
+            "lower bound)."
+        ]
+    if chosen.outside is not None:
+        text.append(
+            f"Outside the permitted actions, {_action(report, chosen.outside)} would "
+            f"tell {_joined(chosen.outside_separates)} apart: at least "
+            f"{chosen.outside_gain:.2f} nats."
         )
-        return Section(title, (text,))
-    action = ", ".join(
-        f"{label} = {value:g}"
-        for label, value in zip(report.action_labels, chosen.action, strict=True)
-    )
-    question = f" between {_joined(chosen.separates)}" if chosen.separates else ""
-    return Section(
-        title, (f"{action}: at least {best:.2f} nats{question} (a lower bound).",)
-    )
+    return Section(title, tuple(text))
+
+
+def _action(report: Report, action: Array) -> str:
+    pairs = zip(report.action_labels, action, strict=True)
+    return ", ".join(f"{label} = {value:.4g}" for label, value in pairs)
 
 
 def _record(report: Report) -> Section:
     spent = sum(e.num_simulations for e in report.tracing.evidences.values())
-    items = [f"evidences cost {spent} trial simulations"]
+    items = [f"evidence cost {spent:,} simulated trials"]
     if report.digest:
         items.append(f"frozen before the data: {report.digest}")
+    tempered = sorted(
+        name for name, e in report.tracing.evidences.items() if e.engine == "tempering"
+    )
+    if tempered:
+        items.append(
+            f"evidence by tempering, where least squares and importance sampling did "
+            f"not serve: {', '.join(tempered)}"
+        )
     if report.detection.null_cross_check is not None:
         items.append(
             f"log evidence of the bare model {report.detection.null_log_evidence:.2f}, "
@@ -285,16 +307,6 @@ def _joined(names: Sequence[str] | frozenset[str]) -> str:
     return (
         " = ".join(sorted(names)) if isinstance(names, frozenset) else ", ".join(names)
     )
-
-
-def _probability(value: float) -> str:
-    if value < 0.005:
-        return "< .01"
-    return "> .99" if value > 0.995 else f"{value:.2f}"
-
-
-def _number(value: float) -> str:
-    return "" if np.isnan(value) else f"{value:.3g}"
 
 
 def _with_error(mean: float, sd: float) -> str:

@@ -41,12 +41,14 @@ def temper(rival: Rival, *, seed: int) -> ImportanceSample:
         seed: Of all draws.
 
     References:
-        Del Moral, Doucet & Jasra, Journal of the Royal Statistical Society B 68 (2006).
+        Del Moral, Doucet & Jasra, Journal of the Royal Statistical Society B 68 (2006);
+        Lee & Whiteley, Biometrika 105 (2018), for the variance.
     """
     rng = np.random.default_rng(seed)
     u = rival.coordinates.sample(NUM_PRIOR, seed=seed)
     log_l = rival.log_likelihood(u)
     log_z, variance, b, width = 0.0, 0.0, 0.0, 2.0 / np.sqrt(rival.dim)
+    ancestor = np.arange(len(u))
     for _ in range(MAX_STEPS):
         step = _step(log_l, 1 - b)
         log_w = step * log_l
@@ -59,14 +61,18 @@ def temper(rival: Rival, *, seed: int) -> ImportanceSample:
         ladder = (rng.uniform() + np.arange(NUM_PARTICLES)) / NUM_PARTICLES
         which = np.minimum(np.searchsorted(np.cumsum(w), ladder), len(w) - 1)
         u, log_l, b = u[which], log_l[which], b + step
+        ancestor = ancestor[which]
         u, log_l, width = _move(rival, u, log_l, min(b, 1.0), factor, width, rng)
         if b >= 1 - 1e-12:
             break
     else:
         # Never reached b = 1: the likelihood has no mass where the prior has some.
         return ImportanceSample(u, np.full(len(u), 1 / len(u)), -np.inf, np.inf, 0.0)
-    # The particles of a step are not independent: twice the ideal variance.
-    error = float(np.sqrt(2 * variance))
+    # The particles of a step are not independent: twice the ideal variance, or what the
+    # descendants of the same ancestor share where moves hardly spread them.
+    _, family = np.unique(ancestor, return_counts=True)
+    shared = ((family / len(u)) ** 2).sum()
+    error = float(np.sqrt(max(2 * variance, shared)))
     weights = np.full(len(u), 1 / len(u))
     distinct = float(len(np.unique(u[:, 0])))
     return ImportanceSample(u, weights, float(log_z), error, distinct)

@@ -24,7 +24,6 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rival_set import RivalSet
-from sbi_active.seeding import forked_generators
 
 __all__ = ["log_priors", "trace"]
 
@@ -34,8 +33,6 @@ PROBABILITY_OF_NONE = 0.5
 MASS = 0.9  # of the credible set
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
-#: Quantile of the prior beyond which an estimate lies at its edge.
-EDGE = 0.99
 
 
 def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
@@ -81,7 +78,8 @@ def trace(
     if detection.alarm:
         log_p |= grow(rivals, {n: log_p[n] for n in rivals.effects}, prior)
     probabilities = _normalized(log_p)
-    verdict = _verdict(probabilities, alarm=detection.alarm)
+    equivalent = equivalent_effects(rivals, actions) if compare else ()
+    verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
     chosen = () if verdict in (NONE, UNEXPLAINED, SCATTER) else (*verdict.split(" + "),)
     inclusion = {
         name: sum(p for k, p in probabilities.items() if name in k.split(" + "))
@@ -93,11 +91,11 @@ def trace(
         probabilities=probabilities,
         inclusion=inclusion,
         credible_set=_credible_set(probabilities),
-        equivalent=equivalent_effects(rivals, actions) if compare else (),
+        equivalent=equivalent,
         near=equivalent_effects(rivals, None) if compare else (),
         estimates=_estimates(rivals, inclusion),
         evidences={**rivals.evidences},
-        robust=_is_robust(rivals, log_p, verdict, prior),
+        robust=_is_robust(rivals, log_p, equivalent, verdict, prior),
     )
 
 
@@ -109,10 +107,27 @@ def _normalized(log_p: dict[str, float]) -> dict[str, float]:
     return {names[i]: float(p[i]) for i in order}
 
 
-def _verdict(probabilities: dict[str, float], *, alarm: bool) -> str:
+def _verdict(
+    probabilities: dict[str, float],
+    equivalent: Sequence[frozenset[str]],
+    *,
+    alarm: bool,
+) -> str:
+    """Return the most probable rival of the most probable class of equivalent ones."""
     if not alarm:
         return NONE
-    return max((n for n in probabilities if n != NONE), key=probabilities.__getitem__)
+    groups = [group for group in equivalent if NONE not in group]
+    classes: dict[frozenset[str], dict[str, float]] = {}
+    for name, p in probabilities.items():
+        if name == NONE:
+            continue
+        parts = name.split(" + ")
+        key = frozenset(
+            min(next((g for g in groups if part in g), {part})) for part in parts
+        )
+        classes.setdefault(key, {})[name] = p
+    best = max(classes.values(), key=lambda members: sum(members.values()))
+    return max(best, key=best.__getitem__)
 
 
 def _credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
@@ -143,29 +158,17 @@ def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate,
                 sd=phi.std(0),
                 effective_sample_size=evidence.effective_sample_size,
                 engine=evidence.engine,
-                at_edge=_at_edge(effect, phi.mean(0)),
             )
         )
     return (*sorted(found, key=lambda e: -e.probability),)
 
 
-def _at_edge(effect: Effect, mean: Array) -> bool:
-    """Return whether phi lies further from the null than almost all of its prior."""
-    with forked_generators(0, "edge"):
-        draws = effect.sample(2_000).numpy()
-    null = effect.null_phi(1).numpy()[0]
-    finite = np.isfinite(null)
-    distance = np.abs(draws - np.where(finite, null, 0.0))
-    own = np.abs(mean - np.where(finite, null, 0.0))
-    beyond = (own > np.quantile(distance, EDGE, axis=0)) & finite
-    # From an infinite null the far end is the one away from it.
-    low, high = np.quantile(draws, [1 - EDGE, EDGE], axis=0)
-    far = np.where(null > 0, mean < low, mean > high) & ~finite
-    return bool((beyond | far).any())
-
-
 def _is_robust(
-    rivals: RivalSet, log_p: dict[str, float], verdict: str, prior: dict[str, float]
+    rivals: RivalSet,
+    log_p: dict[str, float],
+    equivalent: Sequence[frozenset[str]],
+    verdict: str,
+    prior: dict[str, float],
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
     for factor in RESCALED:
@@ -179,7 +182,7 @@ def _is_robust(
         ]
         log_b = log_sum_exp(np.array(singles)) - np.log(len(singles))
         alarm = bool(log_b - (log_p[NONE] - prior[NONE]) > THRESHOLD)
-        if _verdict(_normalized(scaled), alarm=alarm) != verdict:
+        if _verdict(_normalized(scaled), equivalent, alarm=alarm) != verdict:
             return False
     return True
 

@@ -20,6 +20,8 @@ Array = NDArray[Any]
 
 #: Draws a row from which a stochastic simulator's mean and deviation are taken.
 NUM_REPLICATES = 32
+#: Draws with a number from which a mean and a deviation are taken, at least.
+FEWEST = 4
 #: Numbers of x in memory at once.
 CHUNK = 8_000_000
 
@@ -40,6 +42,7 @@ class TrialSimulator:
     Attributes:
         measurements: What is predicted.
         num_simulations: Trials simulated so far.
+        failed: Whether any of them had no outcome.
         is_stochastic: Whether the simulator is the draw.
 
     References:
@@ -51,13 +54,15 @@ class TrialSimulator:
     ) -> None:
         self.model, self.trials, self.seed = model, trials, seed
         times = model.sample_times
+        if model.takes_times and trials.sample_times is not None:
+            times = None  # it is asked for the trials' own
         self._model_times = None if times is None else times.double().numpy()
         names = () if model.noise is None else model.noise.parameter_names
         self.measurements = Measurements.of(
             trials, self._model_times, is_sequence="correlation_time" in names
         )
         self.is_stochastic = model.noise is None
-        self.num_simulations = 0
+        self.num_simulations, self.failed = 0, False
         self._dtype = torch.float64
 
     def __len__(self) -> int:
@@ -65,7 +70,7 @@ class TrialSimulator:
 
     def predict(
         self, theta: Tensor, phi: dict[str, Tensor]
-    ) -> tuple[Array, Array | None, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array | None, Array]:
         """Return what the simulator predicts for the measured numbers.
 
         Args:
@@ -74,8 +79,8 @@ class TrialSimulator:
 
         Returns:
             The mean, shape (n, N), NaN where the simulator gives no number; the
-            deviation, shape (n, N), None where the noise is declared; whether each
-            trial has an outcome, shape (n, t).
+            deviation, shape (n, N), None where the noise is declared; the probability
+            that each trial has an outcome, shape (n, t).
         """
         m = self.measurements
         repeats = NUM_REPLICATES if self.is_stochastic else 1
@@ -105,7 +110,7 @@ class TrialSimulator:
 
     def _predict(
         self, theta: Tensor, phi: dict[str, Tensor], repeats: int
-    ) -> tuple[Array, Array | None, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array | None, Array]:
         n, t = len(theta), len(self.trials)
         self.num_simulations += n * t * repeats
         action, index, times = self._rows(n, repeats)
@@ -118,11 +123,12 @@ class TrialSimulator:
             x = self._simulate(rows, tiled, action, index, times, seeds)
         x = x.reshape(n, repeats, t, *x.shape[1:])
         flat = self._at_measured_times(x)  # (n, repeats, t * numbers)
-        valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1) > 0.5
+        valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1)
+        self.failed |= bool((valid < 1).any())
         picked = flat[..., self.measurements.position]
         if not self.is_stochastic:
             return picked[:, 0], None, valid
-        return picked.mean(1), picked.std(1, ddof=1) + 1e-12, valid
+        return *_moments(picked), valid
 
     def _simulate(
         self,
@@ -160,7 +166,7 @@ class TrialSimulator:
         index = self.trials.index.repeat(tiles)
         times = self.trials.sample_times
         if times is not None and times.ndim == 2:
-            times = times.repeat(tiles, 1)
+            times = _held(times).repeat(tiles, 1)
         return action, index, times if self._model_times is None else None
 
     def _tiled(self, phi: dict[str, Tensor], repeats: int) -> dict[str, Tensor]:
@@ -193,8 +199,38 @@ class TrialSimulator:
         return simulated.reshape(n, repeats, -1)
 
 
+def _held(times: Tensor) -> Tensor:
+    """Return times, shape (t, k), with the last of each row in place of its padding."""
+    last = times.nan_to_num(-torch.inf).amax(-1, keepdim=True)
+    last = last.where(last.isfinite(), torch.zeros_like(last))
+    return times.where(times.isfinite(), last)
+
+
+def _moments(x: Array) -> tuple[Array, Array]:
+    """Return mean and deviation over replicates, shape (n, r, N), of those with x.
+
+    NaN where fewer than a quarter of them, and at least 4, give a number.
+    """
+    finite = np.isfinite(x)
+    count = finite.sum(1)
+    enough = count >= max(FEWEST, x.shape[1] // 4)
+    safe = np.maximum(count, 2)
+    mean = np.where(finite, x, 0.0).sum(1) / safe
+    square = np.where(finite, x - mean[:, None], 0.0) ** 2
+    sd = np.sqrt(square.sum(1) / (safe - 1)) + 1e-12
+    return np.where(enough, mean, np.nan), np.where(enough, sd, np.nan)
+
+
 def _interpolate(x: Array, own: Array, stamps: Array) -> Array:
     """Return x, shape (n, r, t, k, ...), linearly at stamps (t, m); ends are held."""
+    step = np.diff(own).max()
+    low, high = np.nanmin(stamps), np.nanmax(stamps)
+    if low < own[0] - step or high > own[-1] + step:
+        raise ValueError(
+            f"expected sample_times within those of the simulator, {own[0]:g} to "
+            f"{own[-1]:g}; got {low:g} to {high:g}; do simulate for longer, or leave "
+            "the samples beyond out"
+        )
     safe = np.where(np.isfinite(stamps), stamps, own[0])
     at = np.clip(np.searchsorted(own, safe, side="right") - 1, 0, len(own) - 2)
     weight = np.clip((safe - own[at]) / (own[at + 1] - own[at]), 0.0, 1.0)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from sbi_active.criticism.tables import read_wide_table
 
 __all__ = ["Role", "Trials"]
 
@@ -114,6 +117,17 @@ class Trials:
                 f"{lost}; do hold out other trials"
             )
 
+    @classmethod
+    def from_csv(cls, path: str | Path) -> Trials:
+        r"""Return the trials of a CSV file with one row a trial.
+
+        Args:
+            path: Of a file with columns "action_\*" and "x_\*", and optionally "role",
+                "index" and "repeat_of", the index of the trial that is repeated. An
+                empty cell of x is what was not measured.
+        """
+        return cls(**read_wide_table(path).arguments)
+
     def __len__(self) -> int:
         return len(self.x)
 
@@ -151,6 +165,20 @@ class Trials:
     def held_out(self) -> Trials | None:
         """The held-out trials; None where there are none."""
         return self._of("held out") if self.held_out_positions else None
+
+    def template(self) -> tuple[Tensor, Tensor | None]:
+        """Return a trial in which all is measured that any trial has, and its times.
+
+        Returns:
+            Zeros of the shape of one x, NaN where the longest trial has no sample; its
+            sample times, shape (k,), NaN there too, or None.
+        """
+        x, times = torch.zeros_like(self.x[0]), self.sample_times
+        if times is None or times.ndim == 1:
+            return x, times
+        longest = times[int(times.isfinite().sum(-1).argmax())]
+        sampled = longest.isfinite().reshape(-1, *[1] * (x.ndim - 1))
+        return x.where(sampled, torch.nan), longest
 
     def select(self, positions: Any) -> Trials:
         """Return some trials, with their indices.
@@ -203,6 +231,22 @@ class Trials:
                 f"shape {tuple(self.x.shape)}; got {tuple(tensor.shape)}; do give one "
                 "an entry of x's first axis"
             )
+        stamps = tensor.expand(len(self), k)
+        measured = self.x.isfinite().reshape(len(self), k, -1).any(-1)
+        for i in range(len(self)):
+            if bool((measured[i] & ~stamps[i].isfinite()).any()):
+                raise ValueError(
+                    f"expected as many sample_times as samples in each trial; got "
+                    f"{int(stamps[i].isfinite().sum())} for "
+                    f"{int(measured[i].nonzero().max()) + 1} samples in trial {i}; do "
+                    "give one an entry of x's first axis"
+                )
+            own = stamps[i][stamps[i].isfinite()]
+            if bool((own.diff() <= 0).any()):
+                raise ValueError(
+                    f"expected sample_times that increase; got {own.tolist()[:6]}... "
+                    f"in trial {i}; do sort its samples by time"
+                )
         return tensor
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.criticism.augmented import AugmentedSimulator
+from sbi_active.criticism.augmented import AugmentedSimulator, takes_times
 from sbi_active.criticism.effects import Effect, require_distinct
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
 from sbi_active.criticism.trials import Trials
@@ -29,7 +30,8 @@ def with_noise(
 ) -> SimulatorModel:
     """Return the model with noise from repeats where it is deterministic without."""
     theta, action = _some_rows(prior, trials)
-    if model.noise is not None or not model.is_deterministic(theta, action):
+    times = _times(model, len(theta))
+    if model.noise is not None or not model.is_deterministic(theta, action, **times):
         return model
     fit = trials.fit
     first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
@@ -94,9 +96,11 @@ def require_fitting(
             f"expected actions of dimension {trials.action.shape[1]}, that of the "
             f"trials; got {actions.action_dim}; do give the space they were drawn from"
         )
+    if actions is not None:
+        _warn_outside(trials, actions)
     theta, action = _some_rows(prior, trials)
     if model.noise is not None:
-        x = model.mean(theta, action)
+        x = model.mean(theta, action, **_times(model, len(theta)))
         if not bool(x.isfinite().any()):
             raise ValueError(
                 "expected a simulator that gives numbers at the trials' actions; got "
@@ -104,6 +108,27 @@ def require_fitting(
             )
     # Compares every effect with the simulator at its null.
     AugmentedSimulator(model, effects, check=(theta, action))
+
+
+def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
+    """Warn of actions that are not permitted; they are simulated all the same."""
+    dtype = torch.get_default_dtype()
+    outside = ~torch.as_tensor(actions.contains(trials.action.to(dtype)))
+    if not bool(outside.any()):
+        return
+    places = outside.nonzero()[:, 0].tolist()
+    warnings.warn(
+        f"the executed action {trials.action[places[0]].tolist()} of trial {places[0]} "
+        f"is not in {actions} (trials {places}); it is simulated where it was executed",
+        stacklevel=5,
+    )
+
+
+def _times(model: SimulatorModel, num: int) -> dict[str, Tensor]:
+    """Return the model's sample times where its function takes them, (num, k)."""
+    if not takes_times(model) or model.sample_times is None:
+        return {}
+    return {"times": model.sample_times.expand(num, -1)}
 
 
 def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor]:

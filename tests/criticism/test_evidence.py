@@ -163,3 +163,59 @@ def test_noise_without_size_is_refused():
     m = Measurements.of(Trials([0.0, 1.0], [0.0, 1.0]))
     with pytest.raises(ValueError, match="expected measurement noise with a standard"):
         declared_noise(GaussianNoise(0.0), m)
+
+
+def test_a_curved_ridge_has_the_right_evidence():
+    # theta (1 + phi) is all that the data see: the ridge is a hyperbola.
+    gain = Effect(
+        "gain",
+        hook="observation",
+        prior=Normal(0.0, 0.2),
+        null=0.0,
+        apply=lambda x, phi, action, context: x * (1 + phi),
+    )
+    sd = 1e-3
+    x = 2.0 * ACTION + sd * torch.linspace(-1, 1, 8)[:, None]
+    sets = RivalSet(
+        SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(sd)),
+        Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+        Trials(ACTION, x),
+        [gain],
+    )
+    evidence = sets.evidence(("gain",))
+    phi = np.linspace(-0.95, 1.5, 4_001)
+    each = [
+        multivariate_normal(
+            np.zeros(8), (1 + p) ** 2 * np.outer(XI, XI) + sd**2 * np.eye(8)
+        ).logpdf(x[:, 0].double().numpy())
+        for p in phi
+    ]
+    density = np.exp(np.array(each) - max(each) - 0.5 * (phi / 0.2) ** 2)
+    area = np.trapezoid(density, phi) / (0.2 * np.sqrt(2 * np.pi))
+    assert evidence.engine == "least squares"
+    assert evidence.log_evidence == pytest.approx(
+        max(each) + np.log(area), abs=4 * evidence.standard_error
+    )
+
+
+def test_the_residual_process_may_grow_with_the_prediction():
+    m = Measurements.of(Trials(ACTION, X))
+    noise = declared_noise(GaussianNoise(0.5), m)
+    action = ACTION.double().numpy() / 4
+    spread = np.exp(3 * XI)
+    process = ResidualProcess(
+        noise, m, action=action, largest=20.0, lengths=(0.3,), spread=spread
+    )
+    r = X[:, 0].double().numpy()
+    kernel = np.exp(-0.5 * ((action - action.T) / 0.3) ** 2)
+    relative = spread * np.median(0.5 / spread)
+    each = [
+        multivariate_normal(
+            np.zeros(8), a**2 * kernel * np.outer(b, b) + 0.25 * np.eye(8)
+        ).logpdf(r)
+        for a in np.geomspace(1, 20, 10)
+        for b in (np.full(8, 0.5), relative)
+    ]
+    expected = np.logaddexp.reduce(each) - np.log(20)
+    # Directions below 1e-5 of the variance are left out.
+    assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)

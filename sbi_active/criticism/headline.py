@@ -1,0 +1,101 @@
+"""What a report says first: the verdict with what limits it, and what was found."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.report import Report
+
+__all__ = [
+    "added",
+    "number",
+    "probability",
+    "stated",
+    "summary_sentence",
+    "verdict_line",
+]
+
+
+def verdict_line(report: Report) -> str:
+    """Return the verdict with what limits it, in one line."""
+    tracing, verdict = report.tracing, report.verdict
+    p = tracing.probabilities.get(verdict)
+    line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
+    if report.guess is not None:
+        line += f", a guess, not declared: {report.guess}"
+    if not tracing.robust:
+        line += ", not robust to its prior"
+    named = {*tracing.chosen} or {verdict}
+    groups = [group for group in tracing.equivalent if group & named]
+    same = sorted(frozenset().union(*groups) - named)
+    if same:
+        line += f"; no permitted action tells it from {', '.join(same)}"
+    return line
+
+
+def added(report: Report) -> str:
+    """Return what was added to the bare model, in words."""
+    words = {
+        NONE: "nothing",
+        UNEXPLAINED: "a residual process",
+        SCATTER: "larger noise",
+    }
+    return words.get(report.verdict, report.verdict)
+
+
+def summary_sentence(report: Report) -> str:
+    """Return what was found, in a few sentences."""
+    detection, trials = report.detection, f"{report.num_trials} trials"
+    against = (
+        f"log Bayes factor against it {detection.log_bayes_factor:.1f} nats, at least "
+        f"{detection.lower:.1f}; {detection.threshold:.1f} raises the alarm"
+    )
+    if report.verdict == NONE:
+        return f"The bare model explains the {trials} ({against})."
+    found = [f"The bare model misses the {trials} ({against})."]
+    if report.verdict == UNEXPLAINED:
+        found.append("No declared effect explains what it misses.")
+    elif report.verdict == SCATTER:
+        found.append(
+            "They scatter more than the declared noise, and no declared effect "
+            "explains it."
+        )
+    others = [n for n in report.credible_set if n != report.verdict]
+    if others:
+        shares = [f"{n} ({stated(report.probabilities[n])})" for n in others]
+        found.append(f"Not excluded: {', '.join(shares)}.")
+    found += [
+        f"{e.name}: {e.describe}."
+        for e in report.tracing.estimates
+        if e.name in report.tracing.chosen and e.describe
+    ]
+    if report.evaluation is not None:
+        rmse = report.before_after.set_index("metric").loc["rmse"]
+        found.append(
+            f"With {added(report)}, the RMSE on trials that had no part in it goes "
+            f"from {number(float(rmse['before']))} to {number(float(rmse['after']))}."
+        )
+    return " ".join(found)
+
+
+def stated(value: float) -> str:
+    """Return a probability as an equation."""
+    text = probability(value)
+    return f"P {text}" if text[0] in "<>" else f"P = {text}"
+
+
+def probability(value: float) -> str:
+    """Return a probability in digits that mean something."""
+    if value < 0.005:
+        return "< .01"
+    return "> .99" if value > 0.995 else f"{value:.2f}"
+
+
+def number(value: float) -> str:
+    """Return a number with three digits; nothing for NaN."""
+    return "" if np.isnan(value) else f"{value:.3g}"

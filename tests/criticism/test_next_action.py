@@ -1,0 +1,167 @@
+"""The next action: the model index as the designer's target."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.next_action import PredictedRival, choose_action
+from sbi_active.criticism.outside import outside_candidates
+from sbi_active.information_gain import ModelIndexGain, RivalSampler
+
+NOISE = 0.1
+PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
+FORWARD = DiscreteActions([1.0, 1.5, 2.0, 2.5, 3.0])
+BOTH = DiscreteActions([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+MODEL = SimulatorModel(
+    lambda theta, xi: theta * xi + 0 * xi, noise=GaussianNoise(NOISE)
+)
+
+
+def normal(sd):
+    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
+
+
+def effect(name, apply):
+    return Effect(name, hook="observation", prior=normal(1.0), null=0.0, apply=apply)
+
+
+#: Forward, a slope by distance is a slope.
+TILT = effect("tilt", lambda x, phi, action, context: x + phi * action.abs())
+BIAS = effect("bias", lambda x, phi, action, context: x + phi)
+GAIN = effect("gain", lambda x, phi, action, context: x * (1 + phi))
+
+
+def criticism(action, x, effects, actions):
+    gen = torch.Generator().manual_seed(0)
+    action = torch.tensor(action)
+    x = torch.as_tensor(x) + NOISE * torch.randn(len(action), generator=gen)
+    return Criticism(MODEL, PRIOR, Trials(action, x), effects=effects, actions=actions)
+
+
+def only(c, *names):
+    """Return the tracing with these rivals alone."""
+    tracing = c.trace()
+    kept = {k: p for k, p in tracing.probabilities.items() if k in names}
+    return replace(tracing, probabilities=kept)
+
+
+def test_rivals_predict_their_posterior_predictive():
+    action = torch.tensor([1.0, 2.0, 3.0, 2.0])
+    c = criticism(action.tolist(), 0.7 * action, [BIAS], FORWARD)
+    c.trace()
+    rival = PredictedRival(c.rivals, "none", 0.5, FORWARD.values)
+    x = rival.predict(torch.tensor([2.5]), 4_000, 3)
+    assert x.shape == (4_000, 1)
+    assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3))
+    assert not torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 4))
+    # Least squares in one parameter; errors of the mean and of the deviation.
+    fit = c.rivals.trials
+    square = float((fit.action**2).sum())
+    slope = float((fit.action * fit.x).sum()) / square
+    sd = NOISE * (1 + 2.5**2 / square) ** 0.5
+    assert float(x.mean()) == pytest.approx(2.5 * slope, abs=5 * sd / 4_000**0.5)
+    assert float(x.std()) == pytest.approx(sd, rel=5 / 8_000**0.5 + 0.02)
+
+
+def test_the_gain_is_that_of_two_known_densities():
+    """Bias free against none, at two actions, beside a numerical integral."""
+    c = criticism([1.0, 2.0, 3.0, 2.0], [0.7, 1.4, 2.1, 1.4], [BIAS], BOTH)
+    c.trace()
+    names = ("none", "bias")
+    candidates = BOTH.values[[0, 3]]
+    rivals = [PredictedRival(c.rivals, n, 0.5, candidates) for n in names]
+    sampler = RivalSampler(rivals, candidates, 0)
+    simulations = sampler.draw(1_000, torch.arange(2), replicates=False)
+    gain = ModelIndexGain(sampler.probability)(None, simulations, None)
+    for a, rows in enumerate(gain):
+        draws = [r.predict(candidates[a], 10_000, 9)[:, 0].double() for r in rivals]
+        grid = torch.linspace(-15, 15, 20_001).double()
+        p = [Normal(d.mean(), d.std()).log_prob(grid).exp() for d in draws]
+        middle = (p[0] + p[1]) / 2
+        exact = sum(0.5 * q * (q / middle).log().nan_to_num(0, 0, 0) for q in p)
+        exact = float(torch.trapezoid(exact, grid))
+        error = float(rows.std()) / len(rows) ** 0.5
+        assert float(rows.mean()) < exact + 4 * error + 0.01
+        assert float(rows.mean()) > 0.8 * exact - 4 * error - 0.03
+
+
+def test_pushed_one_way_the_other_way_separates_a_tilt():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD)
+    chosen = c.next_action()
+    assert chosen.inseparable == (frozenset({"none", "tilt"}),)
+    assert chosen.outside is not None
+    assert float(chosen.outside[0]) < 0
+    assert {*chosen.outside_separates} == {"none", "tilt"}
+    assert chosen.outside_gain > 0.1
+
+
+def test_where_rivals_predict_the_same_it_stops():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD)
+    chosen = choose_action(c.rivals, only(c, "none", "tilt"), FORWARD)
+    assert chosen.action is None
+    assert chosen.information_gain.max() < 0.02
+    assert chosen.separates == ("none", "tilt")
+    assert chosen.outside is not None
+
+
+def test_pushed_both_ways_the_other_way_is_chosen():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], BOTH)
+    chosen = c.next_action()
+    assert chosen.action is not None
+    assert float(chosen.action[0]) < 0
+    assert chosen.inseparable == ()
+    assert chosen.outside is None
+
+
+def test_where_no_action_separates_none_is_named():
+    action = [-3.0, 2.0, 3.0, -2.0]
+    c = criticism(action, 0.7 * torch.tensor(action), [GAIN], BOTH)
+    assert frozenset({"none", "gain"}) in c.trace().equivalent
+    chosen = choose_action(c.rivals, only(c, "none", "gain"), BOTH)
+    assert chosen.action is None
+    assert chosen.inseparable == (frozenset({"none", "gain"}),)
+    assert chosen.outside is None
+
+
+def test_a_simulator_that_fails_outside_its_range_names_nothing():
+    def forward_only(theta, xi):
+        if bool((xi <= 0).any()):
+            raise ValueError("the gripper pushes forward")
+        return theta * xi
+
+    model = SimulatorModel(forward_only, noise=GaussianNoise(NOISE))
+    action = torch.tensor([1.0, 2.0, 3.0, 2.0])
+    c = Criticism(
+        model, PRIOR, Trials(action, 0.7 * action), effects=[TILT], actions=FORWARD
+    )
+    chosen = c.next_action()
+    assert chosen.action is None
+    assert chosen.outside is None or float(chosen.outside[0]) > 0
+
+
+def test_the_same_seed_gives_the_same_choice():
+    action = [1.0, 2.0, 3.0]
+    gains = [
+        criticism(action, [0.7, 1.4, 2.1], [BIAS, TILT], BOTH)
+        .next_action()
+        .information_gain
+        for _ in range(2)
+    ]
+    assert np.array_equal(*gains)
+
+
+def test_actions_outside_are_not_permitted_and_near_ones_come_first():
+    actions = DiscreteActions([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])
+    found = outside_candidates(actions, actions.values, limit=6)
+    assert found.shape == (6, 2)
+    assert not bool(actions.contains(found).any())
+    assert len(found.unique(dim=0)) == 6

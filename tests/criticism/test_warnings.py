@@ -1,0 +1,240 @@
+"""Every warning from a loop that deserves it, and not from one that does not."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+from torch.distributions import Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
+from sbi_active.criticism import Effect, Report, Trials, close_loop
+
+ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
+PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
+NOISE = 0.1
+TRUE = torch.tensor([[1.0, -0.5]], dtype=torch.float64)
+SPREAD = torch.tensor([5, 12, 0, 9, 14, 2, 16, 7, 11, 3, 8, 15, 1, 13, 4, 10, 6])
+
+
+def curve(theta, action, cubic=0.0):
+    xi = action[:, 0]
+    return (theta[:, 0] * xi + theta[:, 1] * xi**2 + cubic * xi**3)[:, None]
+
+
+def staircase(theta, action):
+    """Nothing that a derivative describes, with steps far larger than the noise."""
+    return torch.round(3e3 * curve(theta, action)) / 3e3
+
+
+def both(action):
+    return 0.8 - 0.4 * action**3
+
+
+TIMES = torch.linspace(0.05, 2.0, 40)
+
+
+def decay(theta, action):
+    return action * theta[:, :1] * torch.exp(-theta[:, 1:] * TIMES.to(theta))
+
+
+def normal(sd: float) -> Independent:
+    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
+
+
+def bias(sd: float = 1.0) -> Effect:
+    return Effect(
+        "bias",
+        hook="observation",
+        prior=normal(sd),
+        null=0.0,
+        apply=lambda x, phi, action, context: x + phi,
+    )
+
+
+CUBIC = Effect(
+    "cubic",
+    hook="dynamics",
+    prior=normal(0.5),
+    null=0.0,
+    apply=lambda value, phi, action, context: {**value, "cubic": phi[:, 0]},
+)
+
+
+@dataclass(frozen=True)
+class World:
+    """What is measured, and what it is compared with; all but one part as usual."""
+
+    fn: Callable[..., Tensor] = curve
+    noise: float = NOISE
+    declared: bool = True
+    missing: Callable[[Tensor], Tensor | float] = lambda xi: 0.8
+    scatter: float = 1.0
+    num: int = 10
+    in_order: bool = False
+    repeats: int = 0
+    effects: tuple[Effect, ...] = (bias(), CUBIC)
+    designed: bool = False
+
+    def report(self) -> Report:
+        gen = torch.Generator().manual_seed(1)
+        action = ACTIONS.values[SPREAD[: self.num]].double()
+        action = action.sort(0).values if self.in_order else action
+        action = torch.cat([action, action[:1].expand(self.repeats, 1)])
+        noise = torch.randn(len(action), 1, generator=gen, dtype=torch.float64)
+        x = self.fn(TRUE, action) + self.missing(action)
+        x = x + self.scatter * self.noise * noise
+        declared = GaussianNoise(self.noise) if self.declared else None
+        return close_loop(
+            SimulatorModel(self.fn, noise=declared),
+            PRIOR,
+            Trials(action, x),
+            effects=self.effects,
+            evaluate=False,
+            designed=self.designed,
+        )
+
+
+def trajectories(
+    *, stamped: bool, noise=GaussianNoise, correlation=0.95, summaries=None
+) -> Report:
+    gen = torch.Generator().manual_seed(0)
+    action = torch.tensor([[1.0], [-1.0], [2.0], [-2.0], [1.5], [-1.5]])
+    fresh = torch.randn(len(action), len(TIMES), generator=gen)
+    error = fresh.clone()
+    for k in range(1, len(TIMES)):
+        scaled = (1 - correlation**2) ** 0.5 * fresh[:, k]
+        error[:, k] = correlation * error[:, k - 1] + scaled
+    x = decay(torch.tensor([[1.0, 0.8]]), action) + 0.05 * error
+    return close_loop(
+        SimulatorModel(decay, noise=noise(0.05)),
+        BoxUniform(torch.tensor([0.2, 0.2]), torch.tensor([3.0, 3.0])),
+        Trials(action, x, sample_times=TIMES if stamped else None),
+        effects=[bias(0.2)],
+        summaries=summaries,
+        evaluate=False,
+    )
+
+
+usual = World()
+assumed = partial(StudentTNoise, df=5.0)
+
+#: Words of the warning: a case that deserves it, and one that comes near.
+CASES: dict[str, tuple[Callable[[], Report], Callable[[], Report]]] = {
+    "noise undeclared": (
+        replace(usual, declared=False, repeats=6).report,
+        replace(usual, repeats=6).report,
+    ),
+    "fewer than 5 trials": (replace(usual, num=4).report, replace(usual, num=5).report),
+    "drift aliased with the order of actions": (
+        replace(usual, in_order=True).report,
+        usual.report,
+    ),
+    "phi at its prior's edge (bias)": (
+        replace(
+            usual,
+            num=12,
+            effects=(bias(0.25), CUBIC),
+            missing=lambda a: 0.8 - 0.4 * a**3,
+        ).report,
+        replace(
+            usual,
+            num=12,
+            effects=(bias(0.5), CUBIC),
+            missing=lambda a: 0.8 - 0.4 * a**3,
+        ).report,
+    ),
+    "chosen for information and not for deployment": (
+        replace(usual, designed=True).report,
+        usual.report,
+    ),
+    "not robust to its prior": (
+        replace(usual, missing=lambda a: 0.15).report,
+        usual.report,
+    ),
+    "evidence uncertain of": (
+        replace(
+            usual, fn=staircase, noise=1e-7, effects=(bias(),), missing=lambda a: 0.0
+        ).report,
+        replace(usual, effects=(bias(),), missing=lambda a: 0.0).report,
+    ),
+    "two estimates of the bare model's evidence differ": (
+        replace(
+            usual, fn=staircase, noise=1e-7, effects=(bias(),), missing=lambda a: 0.0
+        ).report,
+        usual.report,
+    ),
+    "does not extrapolate": (
+        replace(usual, num=14, missing=lambda a: 0.8 * torch.sin(4 * a)).report,
+        usual.report,
+    ),
+    "which is no cause": (
+        replace(usual, num=14, missing=lambda a: 0.0, scatter=6.0).report,
+        usual.report,
+    ),
+    "independent errors forced on a trajectory": (
+        partial(trajectories, stamped=False),
+        partial(trajectories, stamped=True),
+    ),
+    "summaries of the 40 numbers of a trial": (
+        partial(trajectories, stamped=False, correlation=0.0, summaries=5),
+        partial(trajectories, stamped=False, correlation=0.0),
+    ),
+    "do declare GaussianNoise or AutocorrelatedNoise": (
+        partial(trajectories, stamped=True, noise=assumed),
+        partial(trajectories, stamped=True, noise=assumed, correlation=0.0),
+    ),
+}
+
+
+@cache
+def the_usual_report() -> Report:
+    return usual.report()
+
+
+@pytest.mark.parametrize("words", [*CASES])
+def test_each_warning_has_its_case(words):
+    deserved, near = CASES[words]
+    report = deserved()
+    assert len([w for w in report.warnings if words in w]) == 1
+    assert f"- {next(w for w in report.warnings if words in w)}" in str(report)
+    other = the_usual_report() if near == usual.report else near()
+    assert not any(words in w for w in other.warnings)
+
+
+def test_the_usual_case_has_no_warnings():
+    report = the_usual_report()
+    assert report.verdict == "bias"
+    assert report.warnings == ()
+
+
+def test_the_verdict_line_says_where_it_is_not_robust():
+    report = replace(usual, missing=lambda a: 0.15).report()
+    assert "not robust to its prior" in str(report).splitlines()[0]
+    assert "not robust" not in str(the_usual_report())
+
+
+def test_the_edge_is_that_of_phi_among_all_effects_that_were_added():
+    def parabola(theta, action, cubic=0.0):
+        return theta[:, :1] * action + cubic * action**2
+
+    effect = replace(
+        CUBIC,
+        name="quadratic",
+        prior=normal(1.0),
+        apply=lambda value, phi, action, context: {**value, "cubic": phi},
+    )
+    world = World(
+        fn=parabola,
+        num=12,
+        missing=lambda a: 0.5 + 1.7 * a**2,
+        effects=(bias(0.5), effect),
+    )
+    report = world.report()
+    alone = {e.name: e.mean[0] for e in report.tracing.estimates}
+    assert report.verdict == "bias + quadratic"
+    assert alone["bias"] > 0.5 * 2.58  # where it must do the work of both
+    assert not any("edge" in w for w in report.warnings)
