@@ -10,7 +10,7 @@ import torch
 from benchmarks.criticism.cases import Case, extend
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.scores import counted
-from sbi_active.criticism import close_loop
+from sbi_active.criticism import Criticism
 
 __all__ = ["ACTIVE_COLUMNS", "score_active"]
 
@@ -48,7 +48,7 @@ def score_active(case: Case, number: int) -> list[dict[str, object]]:
             model, count = counted(problem.model)
             start = time.process_time()
             try:
-                report = close_loop(
+                criticism = Criticism(
                     model,
                     problem.prior,
                     problem.trials,
@@ -56,23 +56,26 @@ def score_active(case: Case, number: int) -> list[dict[str, object]]:
                     actions=problem.actions,
                     seed=number,
                 )
+                tracing = criticism.trace()
+                chosen = None
+                if policy == "chosen" and num < len(every):
+                    chosen = criticism.next_action().action
             except Exception as error:  # a crash is a result of the benchmark
                 row["failure"] = f"{type(error).__name__}: {error}"[:300]
                 break
             world = case.truth.world
-            stated = merged(world, report.probabilities)
+            stated = merged(world, tracing.probabilities)
             truth = merged(world, {true_name(world, *case.truth.names): 1.0})
             row |= {
                 "cpu_seconds": time.process_time() - start,
                 "trial_simulations": count(),
-                "verdict": report.verdict,
+                "verdict": tracing.verdict,
                 "top": next(iter(stated)) == next(iter(truth)),
                 "probability": stated.get(next(iter(truth)), 0.0),
             }
             if num == len(every):
                 break
             following = every[num]
-            chosen = report.next_action
-            if policy == "chosen" and chosen is not None and chosen.action is not None:
-                following = torch.as_tensor(chosen.action).float()
+            if chosen is not None:
+                following = torch.as_tensor(chosen).float()
     return rows

@@ -153,7 +153,7 @@ def make_world() -> World:
         formulas={
             "bias": frozenset({"1"}),
             "quadratic": frozenset({"xi^2"}),
-            "step": frozenset({"step", "sign"}),
+            "step": frozenset({"step(xi)", "sign(xi)"}),
             "power": frozenset({"|xi|^1.5"}),
         },
     )
