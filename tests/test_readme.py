@@ -22,6 +22,8 @@ def test_readme(capsys):
     assert "Design(action [3], EIG" in printed
     assert "theta[theta_1]" in printed
     assert len(namespace["campaign"].history) == 3
+    assert namespace["report"].verdict == "bias"
+    assert "Verdict: bias (P" in printed
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -32,3 +34,15 @@ def test_simulations(capsys):
     assert "{'ok': 3, 'invalid': 0, 'missing': 0}" in printed
     # A quarter of the prior's rows lie in the narrower box, all with the same weight.
     assert 80 < namespace["reused"].effective_sample_size < 170
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_closing_the_loop(capsys):
+    namespace = run(ROOT / "docs" / "closing_the_loop.md")
+    printed = capsys.readouterr().out
+    assert printed.startswith("unexplained\nVerdict: drag (P > .99)")
+    table = namespace["report"].before_after.set_index("metric")
+    # Four numbers with a noise of 5 mm: the standard error of their RMSE is 1.8 mm.
+    assert table.loc["rmse", "after"] < 0.005 + 4 * 0.0018
+    assert table.loc["rmse", "ratio"] < 0.5
+    assert namespace["page"].exists()
