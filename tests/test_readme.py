@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[1]
 
@@ -46,3 +47,7 @@ def test_closing_the_loop(capsys):
     assert table.loc["rmse", "after"] < 0.005 + 4 * 0.0018
     assert table.loc["rmse", "ratio"] < 0.5
     assert namespace["page"].exists()
+    assert printed.splitlines()[-2:] == ["alarm", "('drag',)"]
+    truth = torch.tensor([0.4, 0.3])
+    belief = namespace["campaign"].belief
+    assert ((belief.mean - truth).abs() < 4 * belief.variance.sqrt()).all()
