@@ -66,7 +66,7 @@ class InformationGainDesigner:
         TypeError: If the action space is not discrete.
 
     Example:
-        >>> from sbi_active import GaussianNoise, SimulatorModel
+        >>> from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
         >>> prior = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
         >>> designer = InformationGainDesigner(
         ...     DiscreteActions([0.1, 1.0, 4.0]), num_samples=400)
