@@ -339,5 +339,5 @@ class Campaign:
                 model than the current one.
         """
         self.update()
-        self._learner = revise(self.state, self._learner, self.actions, report)
+        self._learner = revise(self.state, self.actions, report)
         return self.belief

@@ -77,16 +77,13 @@ def criticize(
     return report
 
 
-def revise(
-    state: CampaignState, learner: Learner, actions: ActionSpace, report: Report
-) -> Learner:
+def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learner:
     """Return the learner of a report's simulator, which has learned all trials.
 
     The state gains a version; nothing changes where this raises.
 
     Args:
         state: Of the campaign.
-        learner: The current one.
         actions: Of the campaign.
         report: Whose verdict names effects.
     """

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import torch
-from scipy.special import digamma
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -26,7 +25,6 @@ __all__ = ["EntropyGain", "conditional_entropy", "with_control"]
 
 LOG_2PI_E = math.log(2 * math.pi) + 1
 NOISE_DRAWS = 16  # of the declared noise, for its entropy
-LOG_SQUARE_MEAN = float(digamma(0.5) + math.log(2))  # E log z^2, z standard normal
 LOG_SQUARE_VARIANCE = math.pi**2 / 2  # Var log z^2
 FEW = 20  # outcomes too few for either entropy
 SIGNIFICANT = 4.0  # standard errors of the kurtosis

@@ -78,9 +78,10 @@ def test_standard_errors_cover(world, estimator):
     at_most = len(ACTIONS) * 0.0027
     test = binomtest(beyond, num_seeds, at_most, alternative="greater")
     assert test.pvalue > 0.001
-    # A deviation of one and no bias, within three Monte Carlo errors; and a tenth, as
-    # entropies of few valid outcomes are known to be short of theirs.
-    assert (z.std(0) < 1.1 + 3 / (2 * num_seeds) ** 0.5).all()
+    # A deviation of one and no bias, within three Monte Carlo errors; but entropies of
+    # few valid outcomes are known to be short of theirs by up to a tenth.
+    known = 1.1 if isinstance(estimator, EntropyGain) else 1.0
+    assert (z.std(0) < known + 3 / (2 * num_seeds) ** 0.5).all()
     assert (z.mean(0).abs() < 0.25 + 3 / num_seeds**0.5).all()
     # negative control: what validity alone tells is far off
     gap = world.exact()["counted"] - world.exact()["validity"]
