@@ -10,7 +10,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.campaign import Campaign, CampaignOptions, Trial
+from sbi_active.campaign import Campaign, CampaignOptions, StopRules, Trial
 from sbi_active.designer import Design, InformationGainDesigner, RandomDesigner
 from sbi_active.inference import (
     ASBI,
@@ -55,6 +55,7 @@ __all__ = [
     "Refinement",
     "Simulations",
     "SimulatorModel",
+    "StopRules",
     "StudentTNoise",
     "Trial",
     "estimate_noise",

@@ -7,5 +7,13 @@ from sbi_active.campaign.state import (
     ModelVersion,
     Trial,
 )
+from sbi_active.campaign.stopping import StopRules
 
-__all__ = ["Campaign", "CampaignOptions", "CampaignState", "ModelVersion", "Trial"]
+__all__ = [
+    "Campaign",
+    "CampaignOptions",
+    "CampaignState",
+    "ModelVersion",
+    "StopRules",
+    "Trial",
+]

@@ -15,11 +15,10 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.health import Health, assess
 from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.planner import METHODS, Planner
 from sbi_active.campaign.revision import criticize, revise
 from sbi_active.campaign.state import CampaignOptions, CampaignState, Status, Trial
 from sbi_active.campaign.telling import outcome_told, same_outcome, trial_to_tell
-from sbi_active.campaign.unlike import most_unlike
-from sbi_active.designer import InformationGainDesigner, RandomDesigner
 from sbi_active.inference.condition import action_rows
 from sbi_active.seeding import derive_seed
 
@@ -27,9 +26,6 @@ if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
 
 __all__ = ["METHODS", "Campaign"]
-
-#: Name of a method: whether its actions are designed.
-METHODS = {"asbi": True, "nsbi": False}
 
 
 class Campaign:
@@ -44,6 +40,8 @@ class Campaign:
         prior: Over the parameters, with a support.
         actions: What the robot may do.
         method: "asbi" designs actions, "nsbi" draws them at random.
+        effects: What the simulator may lack, see :class:`~sbi_active.criticism.Effect`.
+            With them, actions are also chosen to tell whether it does.
         seed: Of everything random; the same seed and outcomes give the same campaign.
         options: Sizes and estimators.
 
@@ -76,6 +74,7 @@ class Campaign:
         actions: ActionSpace,
         *,
         method: str = "asbi",
+        effects: Sequence[Effect] = (),
         seed: int = 0,
         options: CampaignOptions | None = None,
     ) -> None:
@@ -88,17 +87,7 @@ class Campaign:
         options = CampaignOptions() if options is None else options
         self.state = CampaignState(method=method, seed=seed, options=options)
         self._learner = Learner(simulator, prior, actions, self.state)
-        self._designer = (
-            InformationGainDesigner(
-                actions,
-                num_samples=options.num_samples,
-                estimator=options.estimator,
-                eliminate=options.eliminate,
-                **options.engine,
-            )
-            if METHODS[method]
-            else RandomDesigner(actions, **options.engine)
-        )
+        self._planner = Planner(actions, self.state, effects)
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None
@@ -127,6 +116,11 @@ class Campaign:
         return self._learner.prior
 
     @property
+    def effects(self) -> Sequence[Effect]:
+        """What the simulator may lack, as the campaign was told."""
+        return self._planner.effects
+
+    @property
     def health(self) -> Health:
         """Whether the simulator still explains the trials that the belief contains.
 
@@ -147,41 +141,52 @@ class Campaign:
         waiting = [t for t in self.state.trials if t.status == "pending"]
         return waiting[0] if waiting else None
 
-    def ask(self) -> Trial:
+    @property
+    def stop_reason(self) -> str | None:
+        """Why ``options.stop`` says to stop, after the trials the belief contains.
+
+        None while the health is not "ok": a confident wrong belief would stop first.
+        """
+        if self.health != "ok":
+            return None
+        design = None if self.pending is None else self.pending.design
+        return self.state.options.stop.reason(
+            self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
+        )
+
+    def ask(self, *, target: str | Sequence[str] = "auto") -> Trial:
         """Return the pending trial, or design the next one.
+
+        Args:
+            target: What it should tell most about: "theta", names of parameters, or
+                "model", whether the simulator lacks one of the campaign's effects and
+                which. "auto" is "theta" without effects; with them it is the one of
+                which the best action tells more, in nats, and under an alarm "model".
 
         Returns:
             The trial; execute ``trial.action``.
+
+        Raises:
+            ValueError: If the method draws its actions at random and the target is
+                another one, or "model" is asked for without effects or with fewer than
+                two trials.
         """
         if self.pending is not None:
             return self.pending
+        self._planner.require(target)
         self.update()
         index = len(self.state.trials)
-        trial = Trial(index, torch.empty(0))
-        self.state.trials.append(trial)
+        self.state.trials.append(Trial(index, torch.empty(0)))
         try:
-            designer, designs = self._designer, METHODS[self.state.method]
-            if designs and self._checks(index):
-                executed = [t.action for t in self.history if t.status != "missing"]
-                places = most_unlike(
-                    self.actions,
-                    torch.stack(executed) if executed else torch.empty(0),
-                )
-                designer = RandomDesigner(places, **self.state.options.engine)
-                designs = False
-            model = self._learner.trained(index) if designs else None
-            with self.state.stage(index, "design"):
-                design = designer.select(
-                    model,
-                    self._learner.at(index),
-                    belief=self.belief,
-                    seed=derive_seed(self.state.seed, "design", index),
-                )
+            design, purpose = self._planner.design(
+                index, target, self._learner, alarmed=self.health == "alarm"
+            )
             trial = self.state.trials[index]
             self.state.change(
                 index,
                 action=design.action,
                 design=design,
+                target=purpose,
                 num_simulations=trial.num_simulations + design.num_simulations,
                 num_missing=trial.num_missing + design.num_missing,
             )
@@ -189,10 +194,6 @@ class Campaign:
             self.state.trials.pop()
             raise
         return self.state.trials[index]
-
-    def _checks(self, index: int) -> bool:
-        every = self.state.options.check_every
-        return every is not None and (index + 1) % every == 0
 
     def tell(
         self,
@@ -274,6 +275,9 @@ class Campaign:
     ) -> Distribution:
         """Run rounds on a real system that can be called.
 
+        It ends early where :attr:`stop_reason` gives one; a trial that was designed by
+        then stays pending.
+
         An exception of the real system passes through; the trial stays pending, and
         the next ``run`` goes on with it.
 
@@ -286,7 +290,11 @@ class Campaign:
             The belief after the last trial.
         """
         for _ in range(num_rounds):
+            if self.stop_reason is not None:
+                break
             index = self.ask().index
+            if self.stop_reason is not None:
+                break
             self.tell(real_system(self.state.trials[index].action), trial=index)
             self.update()
             if on_round is not None:
@@ -294,14 +302,14 @@ class Campaign:
         return self.belief
 
     def criticize(
-        self, effects: Sequence[Effect] = (), *, evaluate: bool = True
+        self, effects: Sequence[Effect] | None = None, *, evaluate: bool = True
     ) -> Report:
         """Compare the current simulator with all trials so far.
 
         Args:
-            effects: What the simulator may lack; those already adopted are left out.
-                The first library of a model counts as frozen: with another one, or
-                other priors, the report is "exploratory".
+            effects: What the simulator may lack, None takes the campaign's; those
+                already adopted are left out. The first library of a model counts as
+                frozen: with another one, or other priors, the report is "exploratory".
             evaluate: As in :func:`~sbi_active.criticism.close_loop`.
 
         Returns:
@@ -314,10 +322,7 @@ class Campaign:
         self.update()
         return criticize(
             self.state,
-            self.simulator,
-            self.prior,
-            self.actions,
-            effects=effects,
+            self._planner.compare(self._learner, effects),
             evaluate=evaluate,
             designed=METHODS[self.state.method],
         )

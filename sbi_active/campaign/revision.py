@@ -16,31 +16,27 @@ from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
-    from sbi_active.criticism import Effect, Report
+    from sbi_active.criticism import Criticism, Effect, Report
 
-__all__ = ["criticize", "revise"]
+__all__ = ["compare", "criticize", "revise"]
 
 
-def criticize(
+def compare(
     state: CampaignState,
     simulator: Callable[..., Any],
     prior: Distribution,
     actions: ActionSpace,
     *,
     effects: Sequence[Effect],
-    evaluate: bool,
-    designed: bool,
-) -> Report:
-    """Return the report of a campaign's trials, and note the comparison in its state.
+) -> Criticism:
+    """Return the comparison of a campaign's simulator with its trials.
 
     Args:
         state: Of the campaign.
         simulator: The current one; a plain callable is the draw.
         prior: Of its parameters.
         actions: The permitted ones.
-        effects: What it may lack.
-        evaluate: Whether to report the error before and after.
-        designed: Whether the actions were chosen for information.
+        effects: What it may lack; those already adopted are left out.
     """
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
@@ -54,8 +50,8 @@ def criticize(
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)
     outcomes = [t.x for t in measured if t.x is not None]
-    version = state.version
-    criticism = Criticism(
+    adopted = state.version.effects
+    return Criticism(
         simulator,
         prior,
         Trials(
@@ -63,10 +59,24 @@ def criticize(
             torch.stack(outcomes),
             index=[t.index for t in measured],
         ),
-        effects=[e for e in effects if e.name not in version.effects],
+        effects=[e for e in effects if e.name not in adopted],
         actions=actions,
         seed=derive_seed(state.seed, "criticism", len(measured)),
     )
+
+
+def criticize(
+    state: CampaignState, criticism: Criticism, *, evaluate: bool, designed: bool
+) -> Report:
+    """Return the report of a comparison, and note it in the campaign's state.
+
+    Args:
+        state: Of the campaign.
+        criticism: From :func:`compare`.
+        evaluate: Whether to report the error before and after.
+        designed: Whether the actions were chosen for information.
+    """
+    version = state.version
     report = criticism.report(
         evaluate=evaluate,
         designed=designed,

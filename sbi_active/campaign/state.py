@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from sbi_active.campaign.stopping import StopRules
 from sbi_active.designer import Design
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.refine import Refinement
@@ -40,6 +41,8 @@ class CampaignOptions:
         check_every: Every so many-th trial goes where none was, instead of where most
             is to be learned about the parameters: at as many settings as parameters
             any simulator fits, and nothing tells that it is wrong. None never checks.
+            A campaign that is given effects turns to the model by itself.
+        stop: When :meth:`~sbi_active.Campaign.run` ends before its last round.
         num_workers: Of all simulations, see
             :func:`~sbi_active.simulation.simulate`.
         time_limit: Seconds a simulated row may take; None waits for ever. With it, or
@@ -56,6 +59,7 @@ class CampaignOptions:
     refinement: Refinement = Refinement()
     num_scored: int = 2_000
     check_every: int | None = None
+    stop: StopRules = StopRules()
     num_workers: int = 1
     time_limit: float | None = None
     num_retries: int = 0
@@ -116,6 +120,9 @@ class Trial:
             which is information; "missing" where a fault unrelated to the parameters
             hit it, which is ignored.
         design: The design behind the action; None where the trial was not asked for.
+        target: What the action was chosen for: "theta" or names of parameters, "model",
+            "check" for one where no trial was, "random"; None where it was not asked
+            for.
         information_gained: Realized, KL(belief after || before) in nats.
         surprise: Tail probability of x under the posterior predictive of the belief
             before the trial; uniform where the simulator is right.
@@ -134,6 +141,7 @@ class Trial:
     x: Tensor | None = None
     status: Status = "pending"
     design: Design | None = None
+    target: str | None = None
     information_gained: float | None = None
     surprise: float | None = None
     log_score: float | None = None

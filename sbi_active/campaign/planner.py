@@ -1,0 +1,197 @@
+"""Which trial comes next: for the parameters, or for which model is right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from sbi_active.actions import ActionSpace
+from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.revision import compare
+from sbi_active.campaign.state import CampaignState
+from sbi_active.campaign.unlike import most_unlike
+from sbi_active.design import Design, action_name
+from sbi_active.designer import InformationGainDesigner, RandomDesigner
+from sbi_active.eligibility import discrete
+from sbi_active.seeding import derive_seed
+
+if TYPE_CHECKING:
+    from sbi_active.criticism import Criticism, Effect
+
+__all__ = ["METHODS", "Planner"]
+
+#: Name of a method: whether its actions are designed.
+METHODS = {"asbi": True, "nsbi": False}
+FEWEST_TRIALS = 2  # that rivals can be compared on
+
+
+class Planner:
+    """Designs the trials of a campaign.
+
+    Args:
+        actions: The permitted ones.
+        state: Of the campaign.
+        effects: What its simulator may lack.
+
+    Attributes:
+        effects: As given.
+    """
+
+    def __init__(
+        self, actions: ActionSpace, state: CampaignState, effects: Sequence[Effect]
+    ) -> None:
+        self._actions, self._state, self.effects = actions, state, (*effects,)
+        options = state.options
+        self._designs = METHODS[state.method]
+        self._designer = (
+            InformationGainDesigner(
+                actions,
+                num_samples=options.num_samples,
+                estimator=options.estimator,
+                eliminate=options.eliminate,
+                **options.engine,
+            )
+            if self._designs
+            else RandomDesigner(actions, **options.engine)
+        )
+
+    def require(self, target: str | Sequence[str]) -> None:
+        """Raise a ValueError if a trial cannot be designed for a target."""
+        if target in ("auto", "theta"):
+            return
+        if not self._designs:
+            raise ValueError(
+                f"expected target 'auto' or 'theta', since the method "
+                f"{self._state.method!r} draws actions at random; got {target!r}; do "
+                "use the method 'asbi'"
+            )
+        told = sum(t.status in ("ok", "invalid") for t in self._state.trials)
+        if target == "model" and not (self.effects and told >= FEWEST_TRIALS):
+            lacking = f"{told} trials" if self.effects else "no effects"
+            raise ValueError(
+                f"expected effects and at least {FEWEST_TRIALS} trials for the target "
+                f"'model'; got {lacking}; do give Campaign(effects=...), and ask for "
+                "'theta' first"
+            )
+
+    def compare(
+        self, learner: Learner, effects: Sequence[Effect] | None = None
+    ) -> Criticism:
+        """Return the comparison of the current simulator with all trials.
+
+        Args:
+            learner: Of the current simulator.
+            effects: What it may lack; None takes the campaign's.
+        """
+        return compare(
+            self._state,
+            learner.simulator,
+            learner.prior,
+            self._actions,
+            effects=self.effects if effects is None else effects,
+        )
+
+    def design(
+        self,
+        index: int,
+        target: str | Sequence[str],
+        learner: Learner,
+        *,
+        alarmed: bool,
+    ) -> tuple[Design, str]:
+        """Return the design of a trial and what it is for.
+
+        Args:
+            index: Of the trial.
+            target: As in :meth:`~sbi_active.Campaign.ask`.
+            learner: Of the current simulator.
+            alarmed: Whether the simulator no longer explains the trials; then what is
+                to be learned about its parameters does not count.
+        """
+        if not self._designs:
+            return self._select(index, learner, self._designer), "random"
+        if target == "auto" and self._checks(index):
+            told = [t for t in self._state.trials if t.status in ("ok", "invalid")]
+            executed = [t.action for t in told]
+            places = most_unlike(
+                self._actions, torch.stack(executed) if executed else torch.empty(0)
+            )
+            designer = RandomDesigner(places, **self._state.options.engine)
+            return self._select(index, learner, designer), "check"
+        about_model = None
+        can_compare = self.effects and len(self._state.measured) >= FEWEST_TRIALS
+        if target == "model" or (target == "auto" and can_compare):
+            with self._state.stage(index, "criticism"):
+                about_model = _model_design(self.compare(learner), self._actions)
+        if about_model is not None and (target == "model" or alarmed):
+            return about_model, "model"
+        own = "theta" if target in ("auto", "model") else target
+        model = learner.trained(index)
+        design = self._select(index, learner, self._designer, model, target=own)
+        if about_model is not None and _gain(about_model) > _gain(design):
+            return about_model, "model"
+        return design, own if isinstance(own, str) else ", ".join(own)
+
+    def _select(
+        self,
+        index: int,
+        learner: Learner,
+        designer: Any,
+        model: Any = None,
+        **options: Any,
+    ) -> Design:
+        with self._state.stage(index, "design"):
+            return designer.select(
+                model,
+                learner.at(index),
+                belief=learner.belief,
+                seed=derive_seed(self._state.seed, "design", index),
+                **options,
+            )
+
+    def _checks(self, index: int) -> bool:
+        every = self._state.options.check_every
+        return every is not None and (index + 1) % every == 0
+
+
+def _model_design(criticism: Criticism, actions: ActionSpace) -> Design | None:
+    """Return the design that tells most about which rival is right.
+
+    Args:
+        criticism: Of all trials so far.
+        actions: The permitted ones.
+
+    Returns:
+        None where no permitted action tells anything: one rival is left, or those left
+        predict the same.
+    """
+    spent = criticism.rivals.simulator.num_simulations
+    found = criticism.next_action(actions)
+    if found.action is None:
+        return None
+    candidates = torch.as_tensor(found.candidates).float()
+    action = torch.as_tensor(found.action).float()
+    unknown = torch.full((len(candidates),), torch.nan, dtype=torch.float64)
+    return Design(
+        action=action,
+        candidates=candidates,
+        expected_information_gain=torch.as_tensor(found.information_gain),
+        standard_error=unknown,
+        difference_standard_error=unknown,
+        probability_best=unknown,
+        probability_valid=unknown,
+        bound="lower",
+        index=int((candidates == action).all(1).int().argmax()),
+        num_simulations=criticism.rivals.simulator.num_simulations - spent,
+        name=action_name(discrete(actions)),
+        estimator="ModelIndexGain",
+        stopped="budget spent",
+        notes=(f"about which is right: {', '.join(found.separates)}",),
+    )
+
+
+def _gain(design: Design) -> float:
+    """Return the chosen action's information, nats."""
+    return float(design.expected_information_gain[design.index])

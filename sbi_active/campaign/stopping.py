@@ -1,0 +1,89 @@
+"""When a campaign has learned enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch.distributions import Distribution
+
+from sbi_active.design import Design
+from sbi_active.seeding import derive_seed, forked_generators
+
+__all__ = ["StopRules"]
+
+NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopRules:
+    """Rules by which :meth:`~sbi_active.Campaign.run` ends before its last round.
+
+    Any one ends it, but none while the campaign's health is not "ok": a simulator that
+    lacks something makes a belief narrow at a wrong place, which is what both rules
+    wait for.
+
+    Attributes:
+        min_information_gain: The next trial is expected to tell less than this, nats.
+        max_sd: All parameters' standard deviations under the belief are below this:
+            one number, or one a parameter, in the parameters' units.
+
+    Example:
+        >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])
+        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2))
+    """
+
+    min_information_gain: float | None = None
+    max_sd: float | Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.max_sd, Sequence):
+            object.__setattr__(self, "max_sd", (*map(float, self.max_sd),))
+        limits = [self.min_information_gain, *self._limits()]
+        if any(limit is not None and not limit > 0 for limit in limits):
+            raise ValueError(
+                f"expected positive limits to stop at; got {self}; do leave a rule "
+                "at None that is not wanted"
+            )
+
+    def reason(
+        self, belief: Distribution, design: Design | None, *, seed: int
+    ) -> str | None:
+        """Return why to stop, or None.
+
+        Args:
+            belief: After all trials.
+            design: Of the next trial, if there is one.
+            seed: Of the belief's draws.
+
+        Raises:
+            ValueError: If ``max_sd`` has neither one number nor one a parameter.
+        """
+        if design is not None and self.min_information_gain is not None:
+            gain = float(design.expected_information_gain[design.index])
+            if gain < self.min_information_gain:
+                return (
+                    f"the next trial is expected to tell {gain:.3g} nats, less than "
+                    f"{self.min_information_gain:g}"
+                )
+        if self.max_sd is None:
+            return None
+        with forked_generators(derive_seed(seed, "stop")):
+            sd = belief.sample(torch.Size([NUM_DRAWS])).double().std(0)
+        limits = torch.tensor(self._limits(), dtype=torch.float64)
+        if len(limits) not in (1, len(sd)):
+            raise ValueError(
+                f"expected one max_sd or one for each of {len(sd)} parameters; got "
+                f"{len(limits)}; do give max_sd in the order of the parameters, those "
+                "of adopted effects last"
+            )
+        if not bool((sd < limits).all()):
+            return None
+        widths = ", ".join(f"{v:.3g}" for v in sd.tolist())
+        return f"the parameters' standard deviations are {widths}, below max_sd"
+
+    def _limits(self) -> Sequence[float]:
+        if self.max_sd is None:
+            return ()
+        return self.max_sd if isinstance(self.max_sd, Sequence) else (self.max_sd,)
