@@ -6,12 +6,13 @@ r"""A campaign that starts on the wrong simulator, is alarmed, and goes on.
 
 The numerical task, :math:`x = \theta_1 e^{3 - \xi} + \theta_2 \xi + \varepsilon`, with
 theta drawn from its prior. "hidden": the real system adds :math:`c \xi^2`, c drawn from
-N(0, 1), from the first trial on. The campaign is given the bare simulator and designs
-its actions, every second one as a check where no trial was: designed alone, actions
-repeat the two settings that tell most about two parameters, at which any two fit, and
-lambda is 0 (``--check-every 0`` shows it). After an alarm it compares the simulator
-with its trials and the library of world A, in which the quadratic is one of seven
-effects; it adopts what the verdict names. Nothing else of the truth reaches it.
+N(0, 1), from the first trial on. The campaign is given the bare simulator and the
+library of world A, in which the quadratic is one of seven effects, and designs its
+actions (``--policy auto``): for the parameters, or for which model is right where that
+tells more. After an alarm it adopts what the verdict names. Nothing else of the truth
+reaches it. Other policies: "theta" designs for the parameters alone, which repeats the
+two settings that tell most about two parameters, at which any two fit, so that lambda
+is 0; "check" does so too, but makes every second trial where none was.
 
 One row a case. Resumable: a case that stands in the CSV is not run again.
 """
@@ -40,8 +41,8 @@ __all__ = ["COLUMNS", "run_case", "summary"]
 
 RESULTS = Path(__file__).parent / "results"
 KINDS = ("hidden", "clean")
+POLICIES = ("auto", "theta", "check")
 NUM_TRIALS = 6
-CHECK_EVERY = 2
 LEVELS = (0.9, 0.99)
 NUM_DRAWS = 4_000
 COLUMNS = [
@@ -79,7 +80,7 @@ def run_case(
     number: int,
     *,
     num_trials: int = NUM_TRIALS,
-    check_every: int | None = CHECK_EVERY,
+    policy: str = "auto",
 ) -> dict[str, object]:
     """Return the row of one campaign.
 
@@ -91,7 +92,7 @@ def run_case(
         kind: "hidden" or "clean".
         number: Of the case; also the campaign's seed.
         num_trials: Trials at most.
-        check_every: As in :class:`~sbi_active.CampaignOptions`.
+        policy: Of the actions, see above.
     """
     world = get_world("A")
     theta, strength = draw_truth(kind, number)
@@ -107,8 +108,9 @@ def run_case(
         world.model,
         world.prior,
         world.actions,
+        effects=world.effects if policy == "auto" else (),
         seed=number,
-        options=CampaignOptions(check_every=check_every),
+        options=CampaignOptions(check_every=2 if policy == "check" else None),
     )
     alarm_at: int | str = ""
     while len(campaign.history) < num_trials:
@@ -285,14 +287,14 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--trials", type=int, default=NUM_TRIALS)
-    parser.add_argument("--check-every", type=int, default=CHECK_EVERY)
+    parser.add_argument("--policy", choices=POLICIES, default=POLICIES[0])
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, str]] = []
     for kind in KINDS:
-        path = arguments.out / f"campaign_{kind}.csv"
+        path = arguments.out / f"campaign_{kind}_{arguments.policy}.csv"
         done = {int(row["case"]) for row in read(path)}
         wanted = range(arguments.first, arguments.first + arguments.cases)
         if not arguments.summary and arguments.kind in (None, kind):
@@ -304,7 +306,7 @@ def main() -> None:
                         kind,
                         number,
                         num_trials=arguments.trials,
-                        check_every=arguments.check_every or None,
+                        policy=arguments.policy,
                     )
                 except Exception as error:  # a crash is a result of the benchmark
                     failure = f"{type(error).__name__}: {error}"[:300]
