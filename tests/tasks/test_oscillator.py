@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2, kstest
 from torch import Tensor
 
+from sbi_active.tasks.oscillator import nested
 from sbi_active.tasks.oscillator import reference as reference_module
 from sbi_active.tasks.oscillator.model import (
     ACTION_HIGH,
@@ -24,6 +25,7 @@ from sbi_active.tasks.oscillator.model import (
     SENSOR_RANGE,
     mean,
 )
+from sbi_active.tasks.oscillator.nested import NestedGain
 from sbi_active.tasks.oscillator.reference import OscillatorReference
 
 LOG_VOLUME = float((PRIOR_HIGH - PRIOR_LOW).double().log().sum())
@@ -362,11 +364,11 @@ def test_more_inner_draws_do_not_change_the_gain():
     """Same outer draws, so that only the inner ones differ."""
     action = ACTIONS[[16, 24]].double()
     prior = OscillatorReference([], [])
-    gain, _, bias = prior._information_gain(action, 300, 2_000, 0)
+    gain, _, bias = NestedGain(prior).estimate(action, 300, 2_000, 0)
     assert bool((bias < 0.1).all())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reference_module, "NUM_LOCAL", 1024)
-        more, _, less_bias = prior._information_gain(action, 300, 2_000, 0)
+        patch.setattr(nested, "NUM_LOCAL", 1024)
+        more, _, less_bias = NestedGain(prior).estimate(action, 300, 2_000, 0)
     assert bool((less_bias < bias).all())
     assert bool(((gain - more).abs() < 0.05).all())
 
