@@ -1,0 +1,93 @@
+"""Location and scale of outcomes given the action."""
+
+import math
+
+import pytest
+import torch
+
+from sbi_active.inference.scaling import ActionScaling, Polynomials, exponents_of
+
+
+@pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])
+def test_location_and_scale_over_four_decades(shift):
+    """The true ones within five standard errors, at -9000 with spread 15 as well."""
+    torch.manual_seed(0)
+    n = 5_000
+    action = torch.randint(21, (n, 1)).double() * 0.5 - 5
+    spread = 0.005 if shift else 3.0
+    rate = torch.exp(3 - action)
+    x = (shift + spread * torch.randn(n, 1).double()) * rate + torch.randn(n, 1)
+    scaling = ActionScaling(x, action)
+    grid = torch.linspace(-5, 5, 41, dtype=torch.float64)[:, None]  # half of it unseen
+    location, scale = scaling.location_and_scale(grid)
+    rate = torch.exp(3 - grid)
+    truth = (1 + (spread * rate) ** 2).sqrt()
+    error = truth / math.sqrt(n / 41)  # each degree of freedom sees that many rows
+    assert ((location - shift * rate).abs() < 5 * error).all()
+    assert (scale / truth).log().abs().max() < 0.35
+    z = scaling(x, action)
+    assert abs(float(z.mean())) < 5 / math.sqrt(n)
+    assert float(z.std()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_known_function_of_two_actions():
+    torch.manual_seed(0)
+    n = 4_000
+    action = torch.rand(n, 2, dtype=torch.float64)
+
+    def truth(action):
+        first, second = action.T[..., None]
+        scale = torch.cat([torch.exp(2 * first), 0.1 + second], 1)
+        return torch.cat([100 * first * second, torch.sin(3 * first)], 1), scale
+
+    location, scale = truth(action)
+    scaling = ActionScaling(location + scale * torch.randn(n, 2), action)
+    grid = torch.rand(200, 2, dtype=torch.float64)
+    found, true = scaling.location_and_scale(grid), truth(grid)
+    assert ((found[0] - true[0]) / true[1]).abs().max() < 0.5
+    assert ((found[0] - true[0]) / true[1]).square().mean().sqrt() < 0.1
+    assert (found[1] / true[1]).log().abs().mean() < 0.1
+
+
+def test_wild_outcomes_do_not_set_the_scale():
+    torch.manual_seed(0)
+    action = 2 * torch.rand(3_000, 1) - 1
+    x = action.exp() * torch.distributions.StudentT(1.0).sample((3_000, 1))
+    location, scale = ActionScaling(x, action).location_and_scale(action)
+    assert location.abs().max() < 3
+    assert scale.max() < 40  # the standard deviation is infinite
+
+
+@pytest.mark.parametrize(
+    ("x", "action"),
+    [
+        (torch.full((100, 1), 7.0), torch.rand(100, 1)),
+        (torch.randn(100, 1), torch.full((100, 1), 3.0)),
+        (torch.full((100, 2), 7.0), torch.full((100, 2), 3.0)),
+        (torch.randn(8, 1), torch.rand(8, 1)),
+    ],
+    ids=["constant x", "constant action", "both", "few rows"],
+)
+def test_degenerate_rows_are_scaled_to_finite_numbers(x, action):
+    z = ActionScaling(x, action)(x, action)
+    assert z.isfinite().all()
+    assert z.abs().max() < 10
+
+
+def test_derivatives_of_polynomials():
+    rows = torch.rand(50, 3, dtype=torch.float64)
+    exponents, sizes = exponents_of(rows, max_degree=4, max_terms=100)
+    assert sizes == [1, 4, 10, 20, 35]
+    polynomials = Polynomials(rows, exponents)
+    inside = (0.2 + 0.6 * rows[:5]).requires_grad_()
+    values, slopes = polynomials.with_jacobian(inside)
+    for j in range(35):
+        (slope,) = torch.autograd.grad(values[:, j].sum(), inside, retain_graph=True)
+        assert torch.allclose(slope, slopes[:, j])
+
+
+def test_degrees_stop_where_actions_repeat():
+    rows = torch.cartesian_prod(torch.arange(2.0), torch.arange(3.0))
+    exponents, _ = exponents_of(rows, max_degree=9, max_terms=100)
+    assert exponents.max(0).values.tolist() == [1, 2]
+    assert len(exponents) == 6
