@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from benchmarks.criticism.active import DETECTABLE
+from benchmarks.criticism.curves import SCORES, Curves
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.intervals import brier_score, rate, reliability
 from benchmarks.criticism.worlds import World
@@ -176,24 +178,23 @@ def _pair(world: World, rows: Sequence[Row]) -> list[str]:
 
 
 def _active(world: World, rows: Sequence[Row]) -> list[str]:
-    lines = ["trials, top-1 with random actions, top-1 with chosen actions"]
-    share: dict[str, dict[int, float]] = {"random": {}, "chosen": {}}
-    for num in sorted({int(r["trials"]) for r in rows}):
-        cells = []
-        for policy, shares in share.items():
-            these = [r for r in rows if r["policy"] == policy]
-            hits = [r["top"] == "True" for r in these if int(r["trials"]) == num]
-            shares[num] = float(np.mean(hits)) if hits else np.nan
-            cells.append(rate(hits))
-        lines.append(f"{num:2d}  " + "  ".join(cells))
-    last = max(share["random"])
-    target = share["random"][last]
-    reached = [n for n, s in sorted(share["chosen"].items()) if s >= target]
-    if reached:
-        lines.append(
-            f"random's top-1 at {last} trials is reached with {reached[0]} chosen ones "
-            f"({reached[0] / last:.2f})"
-        )
+    curves = Curves.of(rows)
+    lines = [
+        f"detectable (lambda > {DETECTABLE:g} with all random trials): "
+        f"{curves.num_cases} of {len({r['case'] for r in rows})} cases",
+    ]
+    if not curves.num_cases:
+        return lines
+    for score in SCORES:
+        lines += [f"{score}", "trials  random  chosen  matched by chosen trials"]
+        for num in curves.trials:
+            random, chosen = (curves.mean(score, p)[num] for p in ("random", "chosen"))
+            matched = curves.matched(score, num)
+            ratio = f"{matched:.1f} ({matched / num:.2f})"
+            cell = ratio if np.isfinite(matched) else "not reached"
+            lines.append(f"{num:6d}  {random:6.3f}  {chosen:6.3f}  {cell}")
+        low, high = curves.interval(score)
+        lines.append(f"ratio at the last, 90 % bootstrap over cases: {low}-{high}")
     return lines
 
 
@@ -230,6 +231,9 @@ def _calibration(world: World, rows: Sequence[Row]) -> list[str]:
 
 
 def _cost(rows: Sequence[Row]) -> list[str]:
+    rows = [r for r in rows if r["cpu_seconds"]]  # others were left out
+    if not rows:
+        return []
     seconds, sims = _column(rows, "cpu_seconds"), _column(rows, "trial_simulations")
     return [
         f"CPU s: median {np.median(seconds):.1f}, 95th percentile "

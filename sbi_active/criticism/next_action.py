@@ -63,13 +63,32 @@ class PredictedRival:
             num_samples: n.
             seed: Of the draws.
         """
+        return self._at(action, num_samples, seed)[0]
+
+    def predict_mean(
+        self, action: Tensor, num_samples: int, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return these draws without noise, and its standard deviations, (n, q).
+
+        Args:
+            action: As in :meth:`predict`.
+            num_samples: As there.
+            seed: As there.
+        """
+        _, mean, sd = self._at(action, num_samples, seed)
+        return mean, sd
+
+    def _at(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
         if self._draws is None or self._draws[0] != (num_samples, seed):
             self._draws = (num_samples, seed), self._predict(num_samples, seed)
         same = (self.candidates == action.to(self.candidates)).all(-1)
-        return self._draws[1][:, int(same.int().argmax())]
+        return self._draws[1][:, :, int(same.int().argmax())]
 
     def _predict(self, num_samples: int, seed: int) -> Tensor:
-        """Return outcomes of every candidate, shape (n, a, q); NaN without one."""
+        """Return outcomes, means and deviations, shape (3, n, a, q).
+
+        Outcomes are NaN where there is none.
+        """
         parts = self.name.split(" + ")
         prediction = predict(
             self.rivals,
@@ -82,11 +101,12 @@ class PredictedRival:
         )
         num = len(self._trials)
         x = np.where(prediction.valid[:, prediction.trial], prediction.x, np.nan)
+        every = np.stack([x, prediction.mean, prediction.sd])
         each = np.split(
             np.arange(len(prediction.trial)),
             np.cumsum(np.bincount(prediction.trial, minlength=num))[:-1],
         )
-        return torch.from_numpy(np.stack([x[:, at] for at in each], 1))
+        return torch.from_numpy(np.stack([every[:, :, at] for at in each], 2))
 
 
 def choose_action(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sbi_active.information_gain.reduction import Reduction
 
-__all__ = ["class_members"]
+__all__ = ["TEMPERATURES", "LogDensities", "class_members"]
 
 TEMPERATURES = (1.0, 0.5)  # powers of a density, against too much confidence
 BANDWIDTHS = (0.5, 1.0)  # of Silverman's rule

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,9 +17,16 @@ from sbi_active.information_gain.base import (
 )
 from sbi_active.information_gain.class_density import class_members
 from sbi_active.information_gain.cross_fitting import cross_fit, patterns_of_numbers
+from sbi_active.information_gain.noise_kernels import MOST_NUMBERS, noise_members
 from sbi_active.seeding import derive_seed
 
-__all__ = ["ModelIndexGain", "RivalPredictive", "RivalSampler"]
+__all__ = [
+    "ModelIndexGain",
+    "NoisyRivalPredictive",
+    "RivalPredictive",
+    "RivalSampler",
+    "RivalSimulations",
+]
 
 FEW = 16  # outcomes of one pattern and model whose numbers are not used
 
@@ -43,6 +51,41 @@ class RivalPredictive(Protocol):
             Shape (n, *x_shape), NaN where there is no measurement.
         """
         ...
+
+
+@runtime_checkable
+class NoisyRivalPredictive(RivalPredictive, Protocol):
+    """A rival that knows what its noise adds to a draw.
+
+    Its predictive density is then a mixture of the noise's, sharper than any density
+    fitted to the outcomes alone.
+    """
+
+    def predict_mean(
+        self, action: Tensor, num_samples: int, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return what the draws of ``predict`` with the same arguments are made of.
+
+        Returns:
+            The outcomes without noise, and the standard deviations of the noise in
+            them, both of the shape of the draws. A posterior draw that is used again
+            has the same outcome without noise.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class RivalSimulations(CandidateSimulations):
+    """Outcomes of rivals.
+
+    Attributes:
+        sd: Standard deviations of the noise around the mean, as x; None for unknown.
+    """
+
+    sd: Tensor | None = None
+
+    def _parts(self) -> dict[str, Tensor]:
+        return super()._parts() | ({} if self.sd is None else {"sd": self.sd})
 
 
 class RivalSampler:
@@ -85,6 +128,7 @@ class RivalSampler:
         # a rival of no probability has no part in the information
         self.rivals = [r for r, p in zip(self.rivals, values, strict=True) if p > 0]
         self.probability = self.probability[self.probability > 0] / total
+        self._is_noisy = all(isinstance(r, NoisyRivalPredictive) for r in self.rivals)
         self.num_drawn = 0
         self._num_waves = 0
 
@@ -110,21 +154,43 @@ class RivalSampler:
             if len({part.shape for part in drawn}) > 1:
                 raise ValueError(
                     "expected outcomes of one shape from all rivals; got "
-                    f"{[tuple(part.shape) for part in drawn]}; do predict the same x"
+                    f"{[tuple(part.shape[1:]) for part in drawn]}; do predict the "
+                    "same x"
                 )
-            rows.append(torch.stack(drawn, 1).flatten(0, 1))
-        self.num_drawn += len(rows) * len(rows[0])
+            rows.append(torch.stack(drawn, 2).flatten(1, 2))
+        self.num_drawn += len(rows) * rows[0].shape[1]
         index = torch.arange(len(self)).repeat(each)[:, None]
-        return CandidateSimulations(index, self.action[candidates], torch.stack(rows))
+        x, *noise = torch.stack(rows, 1)
+        mean, sd = noise or (None, None)
+        return RivalSimulations(index, self.action[candidates], x, mean=mean, sd=sd)
 
     def _predict(self, k: int, action: Tensor, num: int, seed: int) -> Tensor:
-        x = torch.as_tensor(self.rivals[k].predict(action, num, derive_seed(seed, k)))
+        """Return outcomes, and where all rivals know them their means and deviations.
+
+        Shape (1 or 3, n, *x_shape).
+        """
+        rival, own = self.rivals[k], derive_seed(seed, k)
+        x = torch.as_tensor(rival.predict(action, num, own))
         if x.ndim == 0 or len(x) != num:
             raise ValueError(
                 f"expected {num} outcomes from rival {k}; got shape {tuple(x.shape)}; "
                 "do return one row a draw"
             )
-        return (x[:, None] if x.ndim == 1 else x).float()
+        parts = [x]
+        if self._is_noisy:
+            assert isinstance(rival, NoisyRivalPredictive)
+            parts += [torch.as_tensor(p) for p in rival.predict_mean(action, num, own)]
+            if len({part.shape for part in parts}) > 1:
+                raise ValueError(
+                    f"expected means and deviations of shape {tuple(x.shape)} from "
+                    f"rival {k}; got {[tuple(p.shape) for p in parts[1:]]}; do return "
+                    "one of each a number"
+                )
+        # kernels as narrow as the noise need what a float loses of a large number
+        exact = self._is_noisy and x[0].numel() <= MOST_NUMBERS
+        dtype = torch.float64 if exact else torch.float32
+        stacked = torch.stack([part.to(dtype) for part in parts])
+        return stacked[:, :, None] if x.ndim == 1 else stacked
 
     def __len__(self) -> int:
         return len(self.rivals)
@@ -141,9 +207,11 @@ class ModelIndexGain(InformationGainEstimator):
     with v the numbers of x that are present, P_k(v) their share among the model's
     draws, and f_k a density of them: Gaussian (with one covariance or one a model) or
     by kernels, of a few discriminating numbers where x is long; :math:`\beta \le 1`
-    tempers it. All are fitted to three quarters of the draws and score the rest, in
-    turn; the kind and :math:`\beta` of a quarter are chosen on the others. It is a
-    lower bound for any q, and the information is at most the entropy of p.
+    tempers it. Where the rivals know their noise and x is short, kernels at the
+    outcomes without noise are as narrow as the noise. All are fitted to three quarters
+    of the draws and score the rest, in turn (a posterior draw that is used twice stands
+    in one of them); the kind and :math:`\beta` of a quarter are chosen on the others.
+    It is a lower bound for any q, and the information is at most the entropy of p.
 
     Args:
         probability: :math:`p_k`, shape (K,).
@@ -169,6 +237,8 @@ class ModelIndexGain(InformationGainEstimator):
         weight = self.probability[index] * num_models
         log_p = self.probability.log()
         gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
+        block = _blocks(simulations, index, num_models)
+        sd = getattr(simulations, "sd", None)
         for a, counted in enumerate(simulations.counted):
             x = simulations.x[a].flatten(1).double()
             groups = patterns_of_numbers(x, counted, 4 * FEW)
@@ -177,15 +247,47 @@ class ModelIndexGain(InformationGainEstimator):
                 label[rows] = g
             for rows, columns in groups:
                 inside = label == label[rows[0]]
+                noise = None
+                if simulations.mean is not None and sd is not None:
+                    parts = (simulations.mean[a], sd[a])
+                    center, width = (p.flatten(1)[rows][:, columns] for p in parts)
+                    noise = center.double(), width.double()
                 gain[a, rows] = weight[rows] * _score(
-                    x[rows][:, columns], index, inside & counted, counted, rows, log_p
+                    x[rows][:, columns],
+                    noise,
+                    index=index,
+                    block=block,
+                    inside=inside & counted,
+                    counted=counted,
+                    rows=rows,
+                    log_p=log_p,
                 )
         return gain
 
 
+def _blocks(
+    simulations: CandidateSimulations, index: Tensor, num_models: int
+) -> Tensor:
+    """Return numbers of blocks, shape (n,): draws that share a fold.
+
+    Where outcomes without noise are known, those are one model's that share them.
+    """
+    if simulations.mean is None:
+        return torch.arange(len(index)) // num_models
+    mean = simulations.mean.transpose(0, 1).flatten(1)
+    block = torch.empty(len(index)).long()
+    for k in range(num_models):
+        own = index == k
+        _, block[own] = mean[own].unique(dim=0, return_inverse=True)
+    return block
+
+
 def _score(
     x: Tensor,
+    noise: tuple[Tensor, Tensor] | None,
+    *,
     index: Tensor,
+    block: Tensor,
     inside: Tensor,
     counted: Tensor,
     rows: Tensor,
@@ -193,7 +295,6 @@ def _score(
 ) -> Tensor:
     """Held-out log q(k | x) - log p_k of the rows of one pattern, shape (rows,)."""
     num_models = len(log_p)
-    block = torch.arange(len(index)) // num_models
     own = index[rows]
 
     def log_shares(train: Tensor) -> Tensor:
@@ -206,7 +307,11 @@ def _score(
     def score(train: Tensor, test: Tensor) -> Tensor:
         log_prior = log_p + log_shares(train)
         count = torch.bincount(own[train], minlength=num_models)
-        members = class_members(x[train], own[train], count >= FEW)
+        enough = count >= FEW
+        members = class_members(x[train], own[train], enough)
+        if noise is not None:
+            center, width = (part[train] for part in noise)
+            members += noise_members(center, width, own[train], enough)
         scores = []
         for member in members:
             log_q = (log_prior + member(x[test])).log_softmax(1)

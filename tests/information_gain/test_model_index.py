@@ -12,6 +12,8 @@ import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.information_gain import ModelIndexGain, RivalSampler
+from sbi_active.information_gain.class_density import TEMPERATURES
+from sbi_active.information_gain.noise_kernels import noise_members
 
 ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
 X = torch.linspace(-30, 30, 60_001).double()
@@ -146,6 +148,73 @@ def test_the_designer_chooses_by_it():
     )
 
 
+@dataclass
+class Mixed:
+    """A predictive of 60 posterior draws' means, drawn again and again, and noise."""
+
+    probability: float
+    center: float
+    spread: float
+    noise: float = 1.0
+
+    def predict_mean(self, action, num_samples, seed):
+        generator = torch.Generator().manual_seed(seed)
+        mean = self.center + self.spread * torch.randn(60, generator=generator)
+        mean = mean[torch.randint(60, (num_samples,), generator=generator)]
+        mean = (mean * action)[:, None]
+        return mean, torch.full_like(mean, self.noise)
+
+    def predict(self, action, num_samples, seed):
+        mean, sd = self.predict_mean(action, num_samples, seed)
+        generator = torch.Generator().manual_seed(seed + 1)
+        return mean + sd * torch.randn(num_samples, 1, generator=generator)
+
+
+class Blind:
+    """The same outcomes, of which nothing is known."""
+
+    def __init__(self, rival):
+        self.probability, self.predict = rival.probability, rival.predict
+
+
+def test_draws_that_stand_for_the_same_parameters_tell_nothing_by_it():
+    """Two posteriors of few draws, far apart: each outcome is near one draw."""
+    rivals = [Mixed(0.5, 0.0, 50.0, 0.01)] * 2
+    gains = torch.stack([estimate(rivals, 400, seed)[0] for seed in range(8)])
+    error = gains.std(0) / 8**0.5
+    assert (gains.mean(0) < 3 * error + 0.02).all()
+
+
+def test_known_noise_makes_the_bound_tighter():
+    """Two classes of means that interleave, apart by many times the noise."""
+
+    class Comb(Mixed):
+        def predict_mean(self, action, num_samples, seed):
+            generator = torch.Generator().manual_seed(seed)
+            tooth = torch.randint(4, (num_samples, 1), generator=generator)
+            jitter = 0.1 * torch.randn(num_samples, 1, generator=generator)
+            mean = (tooth + self.center) * 20.0 * action + jitter
+            return mean, torch.ones_like(mean)
+
+    rivals = [Comb(0.5, 0.0, 0.0), Comb(0.5, 0.5, 0.0)]
+    known, error = estimate(rivals, 160)
+    blind, _ = estimate([Blind(rival) for rival in rivals], 160)
+    assert float(known[-1]) > math.log(2) - 0.15
+    assert float(known[-1]) < math.log(2) + 1e-9
+    assert float(known[-1]) > float(blind[-1]) + 3 * float(error[-1])
+
+
+def test_kernels_are_densities():
+    generator = torch.Generator().manual_seed(0)
+    mean = 3 * torch.randn(40, 1, generator=generator).double()
+    sd = torch.rand(40, 1, generator=generator).double() + 0.5
+    label = torch.arange(40) % 2
+    members = noise_members(mean, sd, label, torch.ones(2).bool())
+    for member in members[:: len(TEMPERATURES)]:  # those that are not tempered
+        mass = torch.trapezoid(member(X[:, None]).exp(), X, dim=0)
+        assert mass.tolist() == pytest.approx([1.0, 1.0], abs=1e-4)
+
+
 def test_errors():
     with pytest.raises(ValueError, match="expected two or more rivals"):
         RivalSampler(PAIR[:1], ACTIONS, 0)
@@ -164,3 +233,10 @@ def test_errors():
 
     with pytest.raises(ValueError, match=r"expected 10 outcomes from rival 1; got"):
         designer.select([PAIR[0], Short(0.5, 0.0)], target="model", seed=0)
+
+    class Bare(Mixed):
+        def predict_mean(self, action, num_samples, seed):
+            return torch.zeros(num_samples), torch.ones(num_samples)
+
+    with pytest.raises(ValueError, match="expected means and deviations of shape"):
+        designer.select([Bare(0.5, 0.0, 1.0)] * 2, target="model", seed=0)
