@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -9,18 +10,20 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.detection import THRESHOLD
 from sbi_active.criticism.errors import log_sum_exp
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
 from sbi_active.criticism.rival_set import HOPELESS, RivalSet
+from sbi_active.criticism.unknown_scale import log_evidence
 from sbi_active.seeding import derive_seed
 
-__all__ = ["grow"]
+__all__ = ["grow", "log_prior"]
 
 Array = NDArray[Any]
 
+CATCH_ALLS = (NONE, UNEXPLAINED, SCATTER)
 BEAM = 3
 MAX_EFFECTS = 4
-#: Prior cost of a further effect, nats: sets of several are as a whole about as
-#: probable as a residual that no declared effect explains.
-COST = float(np.log(5.0))
+#: All sets of one effect more are together this much less probable, nats.
+COST = float(np.log(3.0))
 #: Draws of an effect that are tried on the residual before the effect is fitted.
 NUM_TRIED = 8
 #: Deviations of the chi-square beyond which a set is far from a fit.
@@ -37,7 +40,9 @@ def grow(
 
     A beam of width 3 goes from sets of one effect to larger ones. A set counts if it
     has a Bayes factor above 20 against each of its parts that were tried with one
-    effect less; a further effect costs a factor 5 in prior probability. An effect is
+    effect less; all sets of one effect more
+    have together a third of the prior probability, so that a longer library does not
+    make several effects likelier. An effect is
     fitted beside others only if some draw of it could take as much off their residual.
 
     Args:
@@ -56,16 +61,25 @@ def grow(
                 if frozenset(larger) in seen:
                     continue
                 seen.add(frozenset(larger))
-                cost = log_sum_exp(np.array([prior[n] for n in larger]))
-                cost = cost - np.log(len(larger)) - COST * (len(larger) - 1)
-                evidence = rivals.evidence(larger).log_evidence
+                evidence = log_evidence(rivals, larger)[0]
                 if evidence - _best_part(rivals, larger) > THRESHOLD:
-                    level[larger] = cost + evidence
+                    level[larger] = log_prior(larger, prior) + evidence
         if not level:
             break
         found |= {" + ".join(names): value for names, value in level.items()}
         beam = sorted(level, key=level.__getitem__)[::-1][:BEAM]
     return found
+
+
+def log_prior(names: tuple[str, ...], prior: dict[str, float]) -> float:
+    r"""Return the log prior probability of a set of k of the n effects.
+
+    In proportion to the mean of its effects' probabilities alone, :math:`p_i`. Over all
+    sets of k these means add up to :math:`\binom{n-1}{k-1} \frac1k \sum_i p_i`.
+    """
+    num, k = sum(name not in CATCH_ALLS for name in prior), len(names)
+    log_mean = log_sum_exp(np.array([prior[name] for name in names])) - np.log(k)
+    return float(log_mean + np.log(k / comb(num - 1, k - 1)) - COST * (k - 1))
 
 
 def _worthy(rivals: RivalSet, beam: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
@@ -86,8 +100,8 @@ def _is_far(rivals: RivalSet, names: tuple[str, ...]) -> bool:
 def _best_part(rivals: RivalSet, names: tuple[str, ...]) -> float:
     """Return the largest evidence among a set's parts with one effect less."""
     parts = [" + ".join(n for n in names if n != left) for left in names]
-    known = [rivals.evidences[p] for p in parts if p in rivals.evidences]
-    return max(e.log_evidence for e in known)
+    known = [p.split(" + ") for p in parts if p in rivals.evidences]
+    return max(log_evidence(rivals, p)[0] for p in known)
 
 
 def _promising(rivals: RivalSet, names: tuple[str, ...]) -> list[str]:

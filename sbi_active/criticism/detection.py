@@ -6,8 +6,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from sbi_active.criticism.errors import log_sum_exp
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Detection, Evidence
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Detection
 from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.unknown_scale import log_evidence
 
 __all__ = ["THRESHOLD", "detect"]
 
@@ -24,7 +25,8 @@ def detect(rivals: RivalSet) -> Detection:
     .. math::
         \log B = \log \frac1m \sum_{k=1}^m Z_k - \log Z_0
 
-    over all effects, the residual process and noise inflation. Before an alarm, the
+    over all effects, with priors of unknown scale, the residual process and noise
+    inflation. Before an alarm, the
     bare model's evidence is computed again by tempering, since a mode that the
     least-squares search missed would be a false alarm.
 
@@ -36,15 +38,15 @@ def detect(rivals: RivalSet) -> Detection:
     """
     null = rivals.evidence()
     # First what can explain anything: beside it, a hopeless effect is soon dismissed.
-    others = [rivals.evidence(error=e) for e in (UNEXPLAINED, SCATTER)]
-    others += [rivals.evidence((name,)) for name in rivals.effects]
+    others = [log_evidence(rivals, error=e) for e in (UNEXPLAINED, SCATTER)]
+    others += [log_evidence(rivals, (name,)) for name in rivals.effects]
     first = null.log_evidence
-    log_b, error = bayes_factor(others, null)
+    log_b, error = bayes_factor(others, log_evidence(rivals))
     check = None
     if log_b - MARGIN * error > THRESHOLD:
         check = rivals.tempered().log_evidence
         null = rivals.evidence()
-        log_b, error = bayes_factor(others, null)
+        log_b, error = bayes_factor(others, log_evidence(rivals))
     lower = log_b - MARGIN * error
     freedom = max(len(rivals.measurements) - rivals.rival(()).dim, 1)
     return Detection(
@@ -61,13 +63,19 @@ def detect(rivals: RivalSet) -> Detection:
     )
 
 
-def bayes_factor(others: list[Evidence], null: Evidence) -> tuple[float, float]:
-    """Return the log Bayes factor of an equal mixture, and its standard error."""
-    log_z = np.array([e.log_evidence for e in others])
+def bayes_factor(
+    others: list[tuple[float, float]], null: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the log Bayes factor of an equal mixture, and its standard error.
+
+    Args:
+        others: Log evidence and its standard error, of each part of the mixture.
+        null: The same of the bare model.
+    """
+    log_z, errors = np.array(others).T
     total = log_sum_exp(log_z)
     share = np.exp(log_z - total)
-    errors = np.array([e.standard_error for e in others])
     errors = np.where(share > 0, errors, 0.0)
-    variance = (share**2 * errors**2).sum() + null.standard_error**2
-    log_b = total - np.log(len(others)) - null.log_evidence
+    variance = (share**2 * errors**2).sum() + null[1] ** 2
+    log_b = total - np.log(len(others)) - null[0]
     return float(log_b), float(np.sqrt(variance))

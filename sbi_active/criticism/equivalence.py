@@ -19,7 +19,7 @@ from sbi_active.criticism.trial_simulator import TrialSimulator
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["equivalent_effects"]
+__all__ = ["equivalent_effects", "every_action", "noise_unit"]
 
 Array = NDArray[Any]
 
@@ -52,14 +52,11 @@ def equivalent_effects(
         rivals: The models.
         actions: The permitted ones; None compares on the trials at hand.
     """
-    trials = rivals.trials if actions is None else _every_action(rivals, actions)
+    trials = rivals.trials if actions is None else every_action(rivals, actions)
     simulator = TrialSimulator(
         rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
     )
-    noise = declared_noise(rivals.model.noise, simulator.measurements)
-    unit = np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
-    if rivals.model.noise is None:
-        unit = np.full(len(unit), np.median(rivals.spread))
+    unit = noise_unit(rivals, simulator)
     effects = [e for e in rivals.effects.values() if e.hook != "noise"]
     votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
     coordinates = SearchCoordinates(rivals.prior, (), (), len(trials))
@@ -70,6 +67,15 @@ def equivalent_effects(
     same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
     names = [NONE, *[e.name for e in effects]]
     return _groups(names, same)
+
+
+def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
+    """Return what counts as large in each number of some trials, shape (N,)."""
+    noise = declared_noise(rivals.model.noise, simulator.measurements)
+    unit = np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
+    if rivals.model.noise is None:
+        unit = np.full(len(unit), np.median(rivals.spread))
+    return unit
 
 
 def _left_over(
@@ -156,7 +162,7 @@ def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
     return tuple(frozenset(g) for g in groups if len(g) > 1)
 
 
-def _every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
+def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     """Return the trials at hand and one of every permitted action, in random order."""
     if isinstance(actions, DiscreteActions) and len(actions) <= MAX_ACTIONS:
         values = actions.values

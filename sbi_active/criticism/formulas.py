@@ -18,6 +18,7 @@ from torch.distributions import Independent, StudentT
 from sbi_active.criticism.effects import Context, Effect
 from sbi_active.criticism.results import UNEXPLAINED
 from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.unknown_scale import log_evidence
 
 __all__ = ["formula_effects", "guess"]
 
@@ -106,16 +107,15 @@ def guess(rivals: RivalSet) -> tuple[tuple[str, float], ...]:
         seed=rivals.seed,
         reference=bar,
     )
-    found = [others.evidence((e.name,)) for e in effects]
-    gains = {e.name: e.log_evidence - bar for e in found}
+    found = {e.name: log_evidence(others, (e.name,)) for e in effects}
+    gains = {name: value - bar for name, (value, _) in found.items()}
     best = sorted(gains, key=gains.__getitem__)[::-1]
-    top = others.evidence((best[0],))
+    top, top_error = found[best[0]]
     # Of those that the Monte Carlo error leaves equal, the simplest, which comes first.
-    for evidence in found:
-        error = np.hypot(evidence.standard_error, top.standard_error)
-        if evidence.log_evidence >= top.log_evidence - 2 * error:
-            best.remove(evidence.name)
-            best.insert(0, evidence.name)
+    for name, (value, error) in found.items():
+        if value >= top - 2 * np.hypot(error, top_error):
+            best.remove(name)
+            best.insert(0, name)
             break
     return tuple((name, gains[name]) for name in best if gains[name] > MARGIN)
 

@@ -161,8 +161,11 @@ class Tracing:
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
         near: The same for the trials at hand alone; another action may separate them.
+            After an alarm also pairs of effects that explain the data about as well
+            (log evidence within log 20 of the best) with predictions closer than the
+            noise over the permitted actions.
         estimates: One an effect, most probable first.
-        evidences: Of every model tried, by name.
+        evidences: Of every model tried, by name, effects with priors of unknown scale.
         robust: Whether the verdict is that of effect priors a third and three times as
             wide.
         guesses: Formula effects, best first: (formula, log evidence above

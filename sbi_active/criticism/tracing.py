@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
@@ -15,15 +15,18 @@ from sbi_active.criticism.detection import THRESHOLD
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.equivalence import equivalent_effects
 from sbi_active.criticism.errors import log_sum_exp
+from sbi_active.criticism.near_aliases import near_aliases
 from sbi_active.criticism.results import (
     NONE,
     SCATTER,
     UNEXPLAINED,
     Detection,
     Estimate,
+    Evidence,
     Tracing,
 )
 from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.unknown_scale import log_evidence
 
 __all__ = ["log_priors", "trace"]
 
@@ -60,6 +63,10 @@ def trace(
 ) -> Tracing:
     """Return the probabilities of the rivals and the verdict.
 
+    The scales of the effects' priors are unknown. After an alarm the verdict is first
+    one of: declared effects, "unexplained", "scatter", each with all of its
+    probability; then, of the effects, the most probable.
+
     Args:
         rivals: The models.
         detection: Whether there is anything to trace.
@@ -74,13 +81,16 @@ def trace(
         SCATTER: prior[SCATTER] + rivals.evidence(error=SCATTER).log_evidence,
     }
     for name in rivals.effects:
-        log_p[name] = prior[name] + rivals.evidence((name,)).log_evidence
+        log_p[name] = prior[name] + log_evidence(rivals, (name,))[0]
     if detection.alarm:
         log_p |= grow(rivals, {n: log_p[n] for n in rivals.effects}, prior)
     probabilities = _normalized(log_p)
     equivalent = equivalent_effects(rivals, actions) if compare else ()
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
-    chosen = () if verdict in (NONE, UNEXPLAINED, SCATTER) else (*verdict.split(" + "),)
+    near = equivalent_effects(rivals, None) if compare else ()
+    if compare and detection.alarm:
+        near += near_aliases(rivals, actions, [*equivalent, *near])
+    chosen = _effects_of(verdict)
     inclusion = {
         name: sum(p for k, p in probabilities.items() if name in k.split(" + "))
         for name in rivals.effects
@@ -92,9 +102,9 @@ def trace(
         inclusion=inclusion,
         credible_set=_credible_set(probabilities),
         equivalent=equivalent,
-        near=equivalent_effects(rivals, None) if compare else (),
+        near=near,
         estimates=_estimates(rivals, inclusion),
-        evidences={**rivals.evidences},
+        evidences={name: _under_unknown_scale(rivals, name) for name in log_p},
         robust=_is_robust(rivals, log_p, equivalent, verdict, prior),
     )
 
@@ -113,21 +123,30 @@ def _verdict(
     *,
     alarm: bool,
 ) -> str:
-    """Return the most probable rival of the most probable class of equivalent ones."""
+    """Return the verdict: the kind of explanation, then the most probable of it.
+
+    Several effects that share the probability do not lose it to a catch-all, and
+    equivalent ones count as one.
+    """
     if not alarm:
         return NONE
+    catch_alls = {name: probabilities[name] for name in (UNEXPLAINED, SCATTER)}
+    declared = 1.0 - probabilities[NONE] - sum(catch_alls.values())
+    best = max(catch_alls, key=catch_alls.__getitem__)
+    if catch_alls[best] > declared:
+        return best
     groups = [group for group in equivalent if NONE not in group]
     classes: dict[frozenset[str], dict[str, float]] = {}
     for name, p in probabilities.items():
-        if name == NONE:
+        if name in (NONE, *catch_alls):
             continue
         parts = name.split(" + ")
         key = frozenset(
             min(next((g for g in groups if part in g), {part})) for part in parts
         )
         classes.setdefault(key, {})[name] = p
-    best = max(classes.values(), key=lambda members: sum(members.values()))
-    return max(best, key=best.__getitem__)
+    likeliest = max(classes.values(), key=lambda members: sum(members.values()))
+    return max(likeliest, key=likeliest.__getitem__)
 
 
 def _credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
@@ -153,7 +172,7 @@ def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate,
                 units=effect.units,
                 describe=effect.describe or "",
                 probability=inclusion[name],
-                log_bayes_factor=evidence.log_evidence - null,
+                log_bayes_factor=log_evidence(rivals, (name,))[0] - null,
                 mean=phi.mean(0),
                 sd=phi.std(0),
                 effective_sample_size=evidence.effective_sample_size,
@@ -172,10 +191,13 @@ def _is_robust(
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
     for factor in RESCALED:
-        scaled = {
-            name: value + _log_rescaled(rivals, name, factor)
-            for name, value in log_p.items()
-        }
+        scaled = {**log_p}
+        for name in log_p:
+            names = _effects_of(name)
+            if names:
+                own = log_evidence(rivals, names)[0]
+                other = log_evidence(rivals, names, factor=factor)[0]
+                scaled[name] = log_p[name] + other - own
         singles = [
             scaled[name] - prior[name]
             for name in [*rivals.effects, UNEXPLAINED, SCATTER]
@@ -187,25 +209,15 @@ def _is_robust(
     return True
 
 
-def _log_rescaled(rivals: RivalSet, name: str, factor: float) -> float:
-    r"""Return the change of a log evidence when the effects' priors are rescaled.
+def _under_unknown_scale(rivals: RivalSet, name: str) -> Evidence:
+    """Return a rival's record with the evidence that the probabilities rest on."""
+    found = rivals.evidences[name]
+    names = _effects_of(name)
+    if not names:
+        return found
+    value, error = log_evidence(rivals, names)
+    return replace(found, log_evidence=value, standard_error=error)
 
-    .. math::
-        \frac{Z'}{Z} = E_{p(\phi | x)}\left[\frac{p(\phi')}{s\, p(\phi)}\right], \qquad
-        \phi' = \phi_0 + (\phi - \phi_0) / s .
-    """
-    effects = [rivals.effects[n] for n in name.split(" + ") if n in rivals.effects]
-    evidence = rivals.evidences.get(name)
-    if not effects or evidence is None:
-        return 0.0
-    sizes = [e.phi_dim for e in effects]
-    phi = torch.from_numpy(evidence.draws[:, -sum(sizes) :]).split(sizes, -1)
-    ratio = torch.zeros(len(evidence.draws), dtype=torch.float64)
-    for effect, p in zip(effects, phi, strict=True):
-        null = effect.null_phi(len(p))
-        if not bool(null.isfinite().all()):
-            continue  # a scale about infinity has no meaning
-        shrunk = null + (p - null) / factor
-        ratio = ratio + effect.log_prob(shrunk) - effect.log_prob(p)
-        ratio = ratio - effect.phi_dim * np.log(factor)
-    return float(log_sum_exp(ratio.numpy()) - np.log(len(ratio)))
+
+def _effects_of(name: str) -> tuple[str, ...]:
+    return () if name in (NONE, UNEXPLAINED, SCATTER) else (*name.split(" + "),)

@@ -54,3 +54,24 @@ def test_the_verdict_line_names_the_equivalent():
     other = {"bias": "action offset", "action offset": "bias"}
     verdict = first.removeprefix("Verdict: ").split(" (P")[0]
     assert first.endswith(f"; no permitted action tells it from {other[verdict]}")
+
+
+NEAR = "speed gain", "camera scale"
+
+
+@pytest.mark.parametrize(("number", "is_near"), [(51, True), (23, False)])
+def test_world_b_speed_gain_is_nearly_camera_scale_where_data_are_weak(number, is_near):
+    """Case 23 is a scale of the camera that the trials tell from a gain of speed."""
+    case = draw_case(get_world("B"), "library", number, num_held_out=0)
+    assert case.truth.names[0] in NEAR
+    problem = case.problem
+    report = close_loop(
+        problem.model,
+        problem.prior,
+        problem.trials,
+        effects=[e for e in problem.effects if e.name in NEAR],
+        actions=problem.actions,
+        evaluate=False,
+    )
+    assert report.tracing.equivalent == ()
+    assert (frozenset(NEAR) in report.tracing.near) is is_near

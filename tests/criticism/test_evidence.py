@@ -1,18 +1,22 @@
 """Evidence against closed forms: linear models with Gaussian priors and noise."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
-from torch.distributions import Independent, Normal
+from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism.combinations import log_prior
 from sbi_active.criticism.errors import NoiseCell, NoiseGrid
 from sbi_active.criticism.measurements import Measurements
 from sbi_active.criticism.noise_grid import declared_noise
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.unknown_scale import SCALES, log_evidence
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 ACTION = torch.linspace(-2, 2, 8)[:, None]
@@ -66,6 +70,39 @@ def test_importance_sampling_gives_the_evidence(names):
     )
 
 
+@pytest.mark.parametrize("factor", [1 / 3, 1.0, 3.0])
+def test_an_unknown_scale_of_the_prior_is_summed_out(factor):
+    each = [
+        exact([XI**0, XI, XI**2], [2.0, 1.0, 0.7 * factor * s], 0.5) for s in SCALES
+    ]
+    expected = np.logaddexp.reduce(each) - np.log(len(each))
+    value, error = log_evidence(rivals(), ("curve",), factor=factor)
+    assert error < 0.2
+    assert value == pytest.approx(expected, abs=4 * error)
+
+
+def test_without_effects_there_is_no_scale():
+    some = rivals()
+    for error in (None, "scatter", "unexplained"):
+        evidence = some.evidence(error=error)
+        expected = evidence.log_evidence, evidence.standard_error
+        assert log_evidence(some, error=error, factor=3.0) == expected
+
+
+def test_a_bounded_prior_says_what_is_possible():
+    low, high = torch.full((1,), -2.0), torch.full((1,), 2.0)
+    prior = Independent(Uniform(low, high), 1)
+    own = {f: getattr(CURVE, f) for f in ("hook", "null", "apply")}
+    some = RivalSet(
+        SimulatorModel(line, noise=GaussianNoise(0.5)),
+        PRIOR,
+        Trials(ACTION, X),
+        [Effect("curve", prior=prior, **own)],
+    )
+    value, _ = log_evidence(some, ("curve",), factor=3.0)
+    assert value == pytest.approx(some.evidence(("curve",)).log_evidence, abs=1e-9)
+
+
 @pytest.mark.parametrize("names", MODELS)
 def test_tempering_gives_the_evidence(names):
     evidence = rivals().tempered(names)
@@ -80,10 +117,28 @@ def test_the_posterior_is_the_exact_one():
     precision = design.T @ design / 0.25 + np.diag([0.25, 1.0])
     mean = np.linalg.solve(precision, design.T @ X[:, 0].double().numpy() / 0.25)
     sd = np.sqrt(np.diag(np.linalg.inv(precision)))
-    # Two hundred effective draws at least, of the four hundred that are kept.
-    error = 4 * sd / np.sqrt(200)
+    assert evidence.effective_sample_size >= 100
+    # Four hundred are drawn from these with replacement, which adds to the variance.
+    error = 4 * sd * np.sqrt(1 / 100 + 1 / 400)
     assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
     assert np.all(np.abs(evidence.draws.std(0) - sd) < error)
+
+
+def test_no_parameters_are_simulated_twice():
+    sets = rivals()
+    rival, scattered = sets.rival(()), sets.rival((), error="scatter")
+    u = rival.coordinates.sample(7, seed=3)
+    before = sets.simulator.num_simulations
+    first = rival.residual(u)[0]
+    again = scattered.residual(np.concatenate([u[::-1], u[:2]]))[0]
+    assert sets.simulator.num_simulations == before + 7 * len(X)
+    np.testing.assert_array_equal(again, first[[6, 5, 4, 3, 2, 1, 0, 0, 1]])
+
+
+def test_a_smooth_rival_costs_few_simulations():
+    sets = rivals()
+    for names, error in [((), None), (("curve",), None), ((), "unexplained")]:
+        assert sets.evidence(names, error=error).num_simulations < 6_000
 
 
 def test_the_same_seed_gives_the_same_evidence():
@@ -219,3 +274,12 @@ def test_the_residual_process_may_grow_with_the_prediction():
     expected = np.logaddexp.reduce(each) - np.log(20)
     # Directions below 1e-5 of the variance are left out.
     assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
+    prior = {"none": 0.5, "unexplained": 0.1, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
+    log_p = {name: float(np.log(p)) for name, p in prior.items()}
+    sets = combinations("abcd", size)
+    total = sum(np.exp(log_prior(names, log_p)) for names in sets)
+    assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
