@@ -21,7 +21,7 @@ with warnings.catch_warnings():  # ArviZ 0.23 announces 1.0 at every import
 if TYPE_CHECKING:
     from sbi_active.campaign import Campaign
 
-__all__ = ["to_inference_data"]
+__all__ = ["pareto_smoothed", "to_inference_data"]
 
 
 def to_inference_data(
@@ -78,6 +78,33 @@ def to_inference_data(
     if campaign is not None:
         _add_trials(campaign, theta, groups, coords, dims, seed)
     return _assemble(groups, coords, dims)
+
+
+def pareto_smoothed(
+    log_likelihood: np.ndarray, *, relative_efficiency: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return smoothed log weights of leaving out each trial, and Pareto shapes k.
+
+    Args:
+        log_likelihood: Of each trial given each posterior draw, shape (n, t).
+        relative_efficiency: Effective number of draws over their number.
+
+    Returns:
+        Log weights, which sum to one over the draws, shape (n, t), and k, shape (t,).
+
+    References:
+        Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 25 (2024) 72.
+    """
+    rows = np.ascontiguousarray(log_likelihood.T, dtype=float)
+    if int(az.__version__.split(".")[0]) >= 1:
+        from arviz_stats.base import array_stats  # pyright: ignore
+
+        smoothed, k = array_stats.psislw(rows, r_eff=relative_efficiency)
+    else:
+        smoothed, k = az.psislw(-rows, reff=relative_efficiency)
+    smoothed, k = np.asarray(smoothed), np.asarray(k)
+    smoothed = smoothed - smoothed.max(1, keepdims=True)
+    return (smoothed - np.log(np.exp(smoothed).sum(1, keepdims=True))).T, k
 
 
 def _add_trials(

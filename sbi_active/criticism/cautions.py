@@ -16,6 +16,7 @@ from sbi_active.criticism.results import (
     SCATTER,
     UNEXPLAINED,
     Detection,
+    Evaluation,
     Residuals,
     Tracing,
 )
@@ -47,6 +48,7 @@ def find_warnings(
     *,
     detection: Detection | None = None,
     residuals_after: Residuals | None = None,
+    evaluation: Evaluation | None = None,
     effects: Sequence[Effect] = (),
     exploratory: bool = False,
     designed: bool = False,
@@ -59,6 +61,7 @@ def find_warnings(
         tracing: Which effect the data point to.
         detection: Whether the bare model misses the data.
         residuals_after: With the effects of the verdict.
+        evaluation: Error before and after.
         effects: Those that were added.
         exploratory: What was frozen was changed after the data were seen.
         designed: Actions were chosen for their information.
@@ -67,7 +70,7 @@ def find_warnings(
         *_of_trials(trials.fit, residuals, designed=designed),
         *_of_errors(residuals, residuals_after, tracing),
         *_of_evidence(tracing, detection),
-        *_of_verdict(tracing, effects, exploratory=exploratory),
+        *_of_verdict(tracing, effects, evaluation, exploratory=exploratory),
     )
 
 
@@ -158,8 +161,20 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
 
 
 def _of_verdict(
-    tracing: Tracing, effects: Sequence[Effect], *, exploratory: bool
+    tracing: Tracing,
+    effects: Sequence[Effect],
+    evaluation: Evaluation | None,
+    *,
+    exploratory: bool,
 ) -> Iterator[str]:
+    if tracing.chosen and evaluation is not None:
+        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
+        if rmse["after"] >= rmse["before"]:
+            yield (
+                f"{tracing.verdict} does not lower the error on trials that had no "
+                f"part in it: RMSE {rmse['before']:.3g} before and "
+                f"{rmse['after']:.3g} after"
+            )
     edge = _at_edge(tracing, effects)
     if edge:
         yield (

@@ -230,6 +230,7 @@ class Criticism:
             exploratory: Library or priors were changed after the data were seen, of
                 which it warns too.
         """
+        from sbi_active.criticism.psis_loo import leave_one_out
         from sbi_active.criticism.report import build_report
 
         tracing = self.trace()
@@ -252,6 +253,7 @@ class Criticism:
             digest=self.digest,
             designed=designed,
             exploratory=exploratory,
+            leave_one_out=leave_one_out(self.rivals, tracing),
             warnings=self._given(),
         )
 

@@ -141,7 +141,7 @@ def plot_before_after(evaluation: Evaluation) -> Figure:
                 ax.set_ylim(bottom=0)
         if name == "log predictive density" and _spread(-pairs[pairs < 0]) > 20:
             ax.set_yscale("symlog", linthresh=10)
-            ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            ax.yaxis.set_major_formatter(FuncFormatter(_signed))
         if name == "coverage":
             ax.axhline(0.9, color="#333333", lw=0.8, ls=":")
             ax.set_ylim(-0.04, 1.04)
@@ -191,7 +191,7 @@ def _residual_axis(ax: Axes, each: Array) -> None:
         ax.set_yscale("symlog", linthresh=2)
         decades = 10.0 ** np.arange(1, np.floor(np.log10(largest)) + 1)
         ticks = [*(-decades[::-1]), -2.0, 0.0, 2.0, *decades]
-        ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
+        ax.set_yticks(ticks, [_signed(t) for t in ticks])
         ax.minorticks_off()
     ax.set_ylim(-largest, largest)
     _plain(ax)
@@ -216,6 +216,10 @@ def _plain(ax: Axes) -> None:
 
 def _entries(z: Array) -> Array:
     return z.reshape(len(z), -1)
+
+
+def _signed(value: float, _: int | None = None) -> str:
+    return f"{value:g}".replace("-", "\N{MINUS SIGN}")
 
 
 def _spread(values: Array) -> float:

@@ -18,6 +18,7 @@ __all__ = [
     "stated",
     "summary_sentence",
     "verdict_line",
+    "with_error",
 ]
 
 
@@ -75,11 +76,18 @@ def summary_sentence(report: Report) -> str:
         if e.name in report.tracing.chosen and e.describe
     ]
     if report.evaluation is not None:
-        rmse = report.before_after.set_index("metric").loc["rmse"]
-        found.append(
+        rows = report.before_after.set_index("metric").to_dict("index")
+        rmse = rows["rmse"]
+        sentence = (
             f"With {added(report)}, the RMSE on trials that had no part in it goes "
-            f"from {number(float(rmse['before']))} to {number(float(rmse['after']))}."
+            f"from {number(rmse['before'])} to {number(rmse['after'])}"
         )
+        if rmse["interval"] is not None:
+            low, high = map(number, rmse["interval"])
+            sentence += (
+                f" (ratio {number(rmse['ratio'])}, 90 % interval {low} to {high})"
+            )
+        found.append(f"{sentence}.")
     return " ".join(found)
 
 
@@ -98,4 +106,23 @@ def probability(value: float) -> str:
 
 def number(value: float) -> str:
     """Return a number with three digits; nothing for NaN."""
-    return "" if np.isnan(value) else f"{value:.3g}"
+    if np.isnan(value):
+        return ""
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def with_error(mean: float, sd: float) -> str:
+    """Return a mean to the second digit of its deviation; nothing for NaN.
+
+    Example:
+        >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
+        ('0.35992 +- 0.00071', '1234 +- 57')
+    """
+    if np.isnan(mean):
+        return ""
+    size = abs(mean) + sd
+    if not (sd > 0 and 1e-4 <= size < 1e6):  # powers of ten, or no deviation
+        return f"{mean:.4g} +- {sd:.2g}"
+    exponent = int(f"{sd:.1e}".split("e")[1])  # after rounding to two digits
+    places = max(1 - exponent, 0)
+    return f"{mean:.{places}f} +- {sd:.{places}f}"

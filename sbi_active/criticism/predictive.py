@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.errors import NoiseGrid, log_sum_exp
+from sbi_active.criticism.errors import LOG_2PI, NoiseCell, NoiseGrid, log_sum_exp
 from sbi_active.criticism.noise_grid import declared_noise
 from sbi_active.criticism.outcomes import log_outcomes
 from sbi_active.criticism.residual_process import ResidualProcess
@@ -33,7 +33,8 @@ class Prediction:
         mean: Noise-free predictions, one a posterior draw, shape (n, N).
         sd: Standard deviation of the error of each number given a draw, shape (n, N).
         x: Draws with errors, shape (n, N).
-        log_density: Of the measurements, of each trial, shape (t,), nats.
+        log_likelihood: Of the measurements of each trial given the draw, noise
+            included, shape (n, t), nats.
         trial: Trial of each number, shape (N,).
         position: Of each number in the flattened x, shape (N,).
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
@@ -43,11 +44,17 @@ class Prediction:
     mean: Array
     sd: Array
     x: Array
-    log_density: Array
+    log_likelihood: Array
     trial: Array
     position: Array
     valid: Array
     probability_valid: Array
+
+    @property
+    def log_density(self) -> Array:
+        """Of the measurements of each trial, shape (t,), nats."""
+        each = self.log_likelihood
+        return log_sum_exp(each, axis=0) - np.log(len(each))
 
 
 def predict(
@@ -70,7 +77,7 @@ def predict(
         error: None, "unexplained" or "scatter".
         num_draws: From the posterior, n.
         seed: Of the draws; None is that of the models.
-        scored: Whether to compute ``log_density``, which is empty without.
+        scored: Whether to compute ``log_likelihood``, which is empty without.
     """
     name = rivals.evidence(names, error=error).name
     rival, sample = rivals.rivals[name], rivals.samples[name]
@@ -114,22 +121,22 @@ def predict(
     errors, sd = _errors(noise, cells, scales, mean.shape, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
-    density = []
-    for t in range(len(target) if scored else 0):
+    each = np.empty((num_draws, len(target) if scored else 0))
+    for t in range(each.shape[1]):
         at = m.trial == t
-        residual = (m.x - mean)[:, at] / np.where(extra[at] > 0, 1.0, factor[:, at])
-        each = [
-            _log_density(noise, c, s, r, at, np.where(extra[at] > 0, w[at], 0.0))
-            for c, s, r, w in zip(cells, scales, residual, sd, strict=True)
-        ]
-        log_scale = np.where(extra[at] > 0, 0.0, np.log(factor[:, at])).sum(1)
-        each = np.array(each) - log_scale + flags[t]
-        density.append(log_sum_exp(each) - np.log(num_draws))
+        residual = (m.x - mean)[:, at]
+        if extra[at].any():
+            each[:, t] = _independent(residual, sd[:, at])
+        else:
+            log_scale = np.log(factor[:, at]).sum(1)
+            e = residual / factor[:, at]
+            each[:, t] = _log_density(noise, cells, scales, e, at) - log_scale
+        each[:, t] += flags[t]
     return Prediction(
         mean,
         sd,
         mean + errors,
-        np.array(density, dtype=float),
+        each,
         m.trial,
         m.position,
         rng.uniform(size=probability.shape) < probability,
@@ -180,14 +187,19 @@ def _errors(
 
 
 def _log_density(
-    noise: NoiseGrid, cell: int, scale: float, residual: Array, at: Array, wide: Array
-) -> float:
-    """Return the log density of one trial's residual given the cell of the noise."""
-    whole = noise.cells[cell]
-    if wide.any():  # beside the residual process, as independent numbers
-        log_p = -0.5 * (residual / wide) ** 2 - np.log(wide) - 0.5 * np.log(2 * np.pi)
-        return float(log_p.sum())
-    part = type(whole)(0.0, whole.sd[at], whole.rho[at], whole.df)
-    return float(
-        NoiseGrid([part], scales=np.array([scale])).log_likelihood(residual[None])[0]
-    )
+    noise: NoiseGrid, cells: Array, scales: Array, residual: Array, at: Array
+) -> Array:
+    """Return log densities of one trial's residuals, each in its cell, shape (n,)."""
+    log_p = np.empty(len(residual))
+    for cell, scale in {*zip(cells.tolist(), scales.tolist(), strict=True)}:
+        whole = noise.cells[cell]
+        part = NoiseCell(0.0, whole.sd[at], whole.rho[at], whole.df)
+        own = (cells == cell) & (scales == scale)
+        grid = NoiseGrid([part], scales=np.array([scale]))
+        log_p[own] = grid.log_likelihood(residual[own])
+    return log_p
+
+
+def _independent(residual: Array, sd: Array) -> Array:
+    """Return log densities of independent numbers, as beside the residual process."""
+    return (-0.5 * (residual / sd) ** 2 - np.log(sd) - 0.5 * LOG_2PI).sum(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,8 @@ from sbi_active.criticism.figures import (
     plot_residuals,
 )
 from sbi_active.criticism.headline import added, summary_sentence, verdict_line
-from sbi_active.criticism.sections import Section, sections
+from sbi_active.criticism.section import Section
+from sbi_active.criticism.sections import sections
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,9 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = ["figures", "to_html", "to_markdown", "to_text"]
 
+WIDTH = 88  # of lines of text; tables are as wide as they are
 CAPTIONS = {
     "residuals": "Residuals of the models refitted to all trials, in standard "
-    "deviations of the prediction; the band is two of them. Each row has its scale.",
+    "deviations of the prediction; the band is two of them. Each row has its scale, "
+    "logarithmic beyond the band where residuals are large.",
     "probabilities": "Posterior probability of the models that were tried.",
     "before_after": "One line a scored trial; the bars are over all of them. "
     "Lower is better for the first two, higher for the third; the dotted line is 90 %.",
@@ -67,12 +71,16 @@ def figures(report: Report) -> dict[str, Figure]:
 
 def to_text(report: Report) -> str:
     """Return the report as plain text, the verdict in the first line."""
-    lines = [verdict_line(report), summary_sentence(report)]
+    lines = [verdict_line(report), *_wrapped(summary_sentence(report))]
     for section in sections(report):
-        lines += ["", section.title, "-" * len(section.title), *section.text]
-        lines += [f"- {item}" for item in section.items]
+        lines += ["", section.title, "-" * len(section.title)]
+        for paragraph in section.text:
+            lines += _wrapped(paragraph)
+        for item in section.items:
+            lines += _wrapped(f"- {item}", indent="  ")
         if section.rows:
-            lines += _aligned([section.header, *section.rows])
+            between = [""] if section.text or section.items else []
+            lines += [*between, *_aligned([section.header, *section.rows])]
     return "\n".join(lines)
 
 
@@ -84,6 +92,8 @@ def to_markdown(report: Report) -> str:
         for paragraph in section.text:
             lines += [paragraph, ""]
         lines += [f"- {item}" for item in section.items]
+        if section.items and section.rows:
+            lines.append("")  # or the table would belong to the list
         if section.rows:
             bar = ["---", *["---:"] * (len(section.header) - 1)]
             for row in (section.header, bar, *section.rows):
@@ -139,6 +149,16 @@ def _embedded(figure: Figure) -> str:
     figure.savefig(buffer, format="png", dpi=130)
     code = base64.b64encode(buffer.getvalue()).decode()
     return f"data:image/png;base64,{code}"
+
+
+def _wrapped(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:

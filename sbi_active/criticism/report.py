@@ -16,6 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism import rendering
 from sbi_active.criticism.cautions import find_warnings
 from sbi_active.criticism.headline import verdict_line
+from sbi_active.criticism.psis_loo import LeaveOneOut
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
@@ -55,6 +56,8 @@ class Report:
         num_trials: Trials that could be fitted.
         action_labels: One an entry of the action, with its unit.
         channel_names: One an entry of x's last axis, where known.
+        leave_one_out: Of the bare model and of the one that was chosen, where trials
+            are independent given their parameters.
     """
 
     residuals: Residuals
@@ -71,6 +74,7 @@ class Report:
     num_trials: int
     action_labels: tuple[str, ...]
     channel_names: tuple[str, ...] | None
+    leave_one_out: tuple[LeaveOneOut, ...] = ()
 
     def __str__(self) -> str:
         return rendering.to_text(self)
@@ -189,6 +193,7 @@ def build_report(
     digest: str = "",
     exploratory: bool = False,
     designed: bool = False,
+    leave_one_out: Sequence[LeaveOneOut] = (),
     warnings: Sequence[str] = (),
 ) -> Report:
     """Put the parts together, and find what a reader must be warned of.
@@ -207,6 +212,7 @@ def build_report(
         digest: Hash of what was frozen before the data.
         exploratory: What was frozen was changed afterwards.
         designed: Actions were chosen for their information.
+        leave_one_out: Of the bare model and of the one that was chosen.
         warnings: Further ones.
 
     Returns:
@@ -222,6 +228,7 @@ def build_report(
         tracing,
         detection=detection,
         residuals_after=residuals_after,
+        evaluation=evaluation,
         effects=getattr(prior, "effects", ()),
         exploratory=exploratory,
         designed=designed,
@@ -242,6 +249,7 @@ def build_report(
         num_trials=len(trials.fit),
         action_labels=tuple(labels),
         channel_names=None if channels is None else tuple(channels),
+        leave_one_out=tuple(leave_one_out),
     )
 
 

@@ -348,6 +348,13 @@ def test_one_trial():
         Criticism(MODEL, PRIOR, measured(1, {}, num=1))
 
 
+def test_no_valid_trial_to_fit():
+    role = ["fit", "fit", "held out"]
+    x = torch.tensor([torch.nan, torch.nan, 1.0])
+    with pytest.raises(ValueError, match="at least one valid trial; got 2 trials"):
+        Criticism(MODEL, PRIOR, Trials(torch.ones(3), x, role=role))
+
+
 def test_shapes_of_trials_and_simulator():
     with pytest.raises(ValueError, match="expected trials of the simulator's shape"):
         Criticism(MODEL, PRIOR, Trials(torch.ones(3), torch.ones(3, 4)))

@@ -15,6 +15,8 @@ from torch.distributions import Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, joint_prior
 from sbi_active.criticism.cautions import find_warnings
+from sbi_active.criticism.headline import with_error
+from sbi_active.criticism.psis_loo import LeaveOneOut
 from sbi_active.criticism.report import build_report
 from sbi_active.criticism.results import (
     Detection,
@@ -137,6 +139,18 @@ def evaluation(num: int = 8) -> Evaluation:
     )
 
 
+def left_out(name: str, *, density: float, k: float = 0.2) -> LeaveOneOut:
+    pareto_k = np.full(8, 0.2)
+    pareto_k[[3, 5]] = k
+    each = density + 0.1 * np.arange(8)
+    return LeaveOneOut(name=name, density=each, pareto_k=pareto_k, num_draws=400)
+
+
+def flat(made) -> str:
+    """Return the text of a report as one line."""
+    return " ".join(str(made).split())
+
+
 def trials(action=SHUFFLED[:8]) -> Trials:
     return Trials(torch.tensor(action), torch.randn(len(action), 6))
 
@@ -172,7 +186,8 @@ def report(**changes):
         ),
         "prior": BoxUniform(torch.zeros(3), torch.ones(3)),
         "actions": DiscreteActions([1.0, 3.0], names=["speed"], units=["m/s"]),
-        "digest": "sha256:0123456789abcdef",
+        "digest": "0123456789abcdef",
+        "leave_one_out": (left_out("none", density=-20), left_out("drag", density=2)),
     }
     return build_report(**(parts | changes))
 
@@ -221,12 +236,12 @@ def test_before_after_has_its_columns_and_intervals():
 def test_few_scored_trials_have_no_interval_and_say_so():
     made = report(evaluation=evaluation(5))
     assert made.before_after["interval"].isna().all()
-    assert "Below 8 trials" in str(made)
+    assert "Below 8 trials" in flat(made)
     scores = made.evaluation
     for i in range(5):
         before, after = scores.before["rmse"][i], scores.after["rmse"][i]
-        assert f"- held-out trial {i}: RMSE {before:.3g} -> {after:.3g}" in str(made)
-    assert "Below 8 trials" not in str(report())
+        assert f"- held-out trial {i}: RMSE {before:.3g} -> {after:.3g}" in flat(made)
+    assert "Below 8 trials" not in flat(report())
 
 
 def test_parameters_stand_before_and_after():
@@ -239,7 +254,7 @@ def test_parameters_stand_before_and_after():
 def test_left_out_trials_say_how_often_the_verdict_was_the_same():
     folds = (*["drag"] * 7, "tilt")
     scores = replace(evaluation(), scheme="leave one out", selected=folds)
-    text = str(report(evaluation=scores))
+    text = flat(report(evaluation=scores))
     assert "8 trials, each predicted by models that were chosen and fitted" in text
     assert "7 of 8 such verdicts are drag" in text
 
@@ -255,26 +270,102 @@ def test_a_report_pickles_with_effects_that_are_local_functions():
     assert (again.simulator.mean(theta, action) == 1).all()
 
 
-def test_an_action_outside_the_permitted_ones_is_named():
-    beyond = replace(
-        report().next_action,
-        action=None,
-        outside=np.array([-3.0]),
-        outside_separates=("none", "tilt"),
-        outside_gain=0.6,
+def test_the_first_sentences_have_the_error_with_its_interval():
+    rmse = report().before_after.set_index("metric").loc["rmse"]
+    before, after, ratio = (f"{rmse[n]:.3g}" for n in ("before", "after", "ratio"))
+    low, high = (f"{end:.3g}" for end in rmse["interval"])
+    sentence = f"goes from {before} to {after} (ratio {ratio}, 90 % interval {low} to "
+    assert f"{sentence}{high})." in flat(report())
+    assert f"goes from {before} to {after}." in flat(
+        report(
+            evaluation=replace(
+                evaluation(), table=evaluation().table.assign(low=np.nan, high=np.nan)
+            )
+        )
     )
-    text = str(report(next_action=beyond))
-    assert "Stop: no permitted action" in text
-    assert "speed [m/s] = -3 would tell none, tilt apart: at least 0.60 nats" in text
+
+
+def test_numbers_have_the_digits_that_their_deviation_leaves():
+    assert with_error(0.35992, 0.00071) == "0.35992 +- 0.00071"
+    assert with_error(-1234.56, 56.7) == "-1235 +- 57"
+    assert with_error(0.3, 0.0996) == "0.30 +- 0.10"
+    assert with_error(3.2e-7, 1e-8) == "3.2e-07 +- 1e-08"
+    assert with_error(2.0, 0.0) == "2 +- 0"
+    assert with_error(np.nan, np.nan) == ""
+
+
+def test_tables_stand_in_columns():
+    lines = str(report()).splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("model  "))
+    rows = lines[start : start + 7]
+    assert " ".join(rows[0].split()) == "model P phi log BF ESS 90 % set"
+    assert rows[1].startswith("drag  ")
+    assert "0.123 +- 0.011 1/m" in rows[1]
+    ends = {row.index("312") + 3 for row in rows if "312" in row}
+    assert ends == {rows[0].index("ESS") + 3}
+    assert max(map(len, lines)) <= 88
+
+
+def test_leaving_one_out_stands_beside_the_evidence():
+    text = flat(report())
+    assert "bare model -157.2 0.20 none with drag 18.8 0.20 none" in text
+    assert "a trial decides so much" not in text
+    assert "k > 0.62" in text  # 1 - 1 / log10 of 400 draws
+    unsure = left_out("drag", density=2, k=0.9)
+    text = flat(report(leave_one_out=(left_out("none", density=-20), unsure)))
+    assert "with drag 18.8 0.90 3, 5" in text
+    assert "a trial decides so much" in text
+
+
+def test_the_residual_process_is_not_left_one_out():
+    only = (left_out("none", density=-20),)
+    text = flat(report(tracing=tracing("unexplained"), leave_one_out=only))
+    assert "The residual process joins the trials" in text
+    assert "Leave one out" not in flat(report(leave_one_out=()))
+
+
+def stopped(**changes):
+    """Return a report in which no permitted action is worth a trial."""
+    return report(next_action=replace(report().next_action, action=None, **changes))
+
+
+GROUP = frozenset({"tilt", "none"})
+BEYOND = {
+    "outside": np.array([-3.0]),
+    "outside_separates": ("none", "tilt"),
+    "outside_gain": 0.6,
+}
+
+
+@pytest.mark.parametrize("setting", ["text", "markdown", "page"])
+def test_what_no_permitted_action_separates_is_printed_everywhere(setting):
+    def words(made):
+        page = {"text": str, "markdown": type(made).to_markdown}
+        return " ".join(page.get(setting, type(made).to_html)(made).split())
+
+    made = words(stopped(inseparable=(GROUP, frozenset({"drag", "bias"})), **BEYOND))
+    assert (
+        "no permitted action separates none and tilt; speed = -3 m/s, which is not "
+        "permitted, would: at least 0.60 nats"
+    ) in made
+    alone = "no permitted action separates bias and drag"
+    assert alone in made
+    assert f"{alone};" not in made
+    assert "no permitted action separates" not in words(report())
+
+
+def test_an_action_that_is_chosen_can_leave_a_group_unseparated():
+    chosen = replace(report().next_action, inseparable=(GROUP,))
+    text = flat(report(next_action=chosen))
+    assert "speed = 3 m/s: at least 0.41 nats between drag, tilt" in text
+    assert "- no permitted action separates none and tilt" in text
 
 
 def test_nothing_more_to_do_is_a_stop():
-    still = replace(report().next_action, action=None)
-    assert (
-        "Stop: no permitted action tells more about which model is right than 0.410"
-        in str(report(next_action=still))
-    )
-    assert "speed [m/s] = 3: at least 0.41 nats between drag, tilt" in str(report())
+    worth = "Stop: no permitted action tells more about which model is right than 0.410"
+    assert worth in flat(stopped())
+    assert "Stop: no model but drag is left." in flat(stopped(separates=("drag",)))
+    assert "speed = 3 m/s: at least 0.41 nats between drag, tilt" in flat(report())
 
 
 def test_a_report_of_a_right_model_has_no_warnings():
@@ -324,7 +415,7 @@ def test_markdown_tables_have_as_many_cells_as_headings():
     made = report(tracing=tracing(probabilities=shares, credible_set=(*shares,)))
     text = re.sub(r"\\\|", "", made.to_markdown())
     blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     for block in blocks:
         assert len({line.count("|") for line in block.splitlines()}) == 1
 
