@@ -16,13 +16,14 @@ from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
 from sbi_active.cli.loading import load_object
+from sbi_active.cli.options import add_options, make_task
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate
 from sbi_active.simulation.bank import Bank
 from sbi_active.simulation.bank.labeled import LabeledStore
 from sbi_active.simulation.store import run_digest
-from sbi_active.tasks import TASKS, get_task  # pyright: ignore
+from sbi_active.tasks import TASKS  # pyright: ignore
 
 __all__ = ["add_parser"]
 
@@ -51,7 +52,7 @@ def add_parser(commands: Any) -> None:
     source = build.add_mutually_exclusive_group(required=True)
     source.add_argument("--task", help=f"one of: {', '.join(TASKS)}")
     source.add_argument("--simulator", metavar="MODULE:NAME")
-    build.add_argument("--variant", help="of the task, where it has variants")
+    add_options(build)
     build.add_argument("--prior", metavar="MODULE:NAME", help="with --simulator")
     build.add_argument("--actions", metavar="MODULE:NAME", help="with --simulator")
     build.add_argument(
@@ -137,14 +138,7 @@ def _source(
     arguments: argparse.Namespace,
 ) -> tuple[Callable[..., Any], Distribution, ActionSpace]:
     if arguments.task is not None:
-        options = {} if arguments.variant is None else {"variant": arguments.variant}
-        try:
-            task = get_task(arguments.task, **options)
-        except TypeError as error:
-            raise ValueError(
-                f"expected no --variant for task {arguments.task!r}, which has none; "
-                f"got {arguments.variant!r}; do drop it"
-            ) from error
+        task = make_task(arguments.task, arguments.option)
         return task.simulator, task.prior, task.actions
     if arguments.prior is None or arguments.actions is None:
         raise ValueError(

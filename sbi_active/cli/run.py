@@ -1,9 +1,14 @@
-"""``sbi-active run TASK --out DIR``: a campaign on a task."""
+"""``sbi-active run TASK --out DIR``: a campaign on a task.
+
+A task's own options follow ``--option``, as in ``sbi-active run box_collision --option
+target=2 --option noise=0.01 --out DIR``.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,10 +21,12 @@ from tqdm import tqdm
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.campaign import METHODS
+from sbi_active.cli.options import add_options, make_task
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
+from sbi_active.simulation import simulate
+from sbi_active.tasks import TASKS, Task  # pyright: ignore
 
 __all__ = ["add_parser"]
 
@@ -41,7 +48,7 @@ def add_parser(commands: Any) -> None:
     run.add_argument("--rounds", type=int, default=4, help="real trials (4)")
     run.add_argument("--seed", type=int, default=0)
     run.add_argument("--out", type=Path, required=True, help="folder for the results")
-    run.add_argument("--variant", help="of the task, where it has variants")
+    add_options(run)
     run.add_argument(
         "--setting",
         choices=[*SETTINGS],
@@ -54,14 +61,7 @@ def add_parser(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    options = {} if arguments.variant is None else {"variant": arguments.variant}
-    try:
-        task = get_task(arguments.task, **options)
-    except TypeError as error:
-        raise ValueError(
-            f"expected no --variant for task {arguments.task!r}, which has none; got "
-            f"{arguments.variant!r}; do drop it"
-        ) from error
+    task = make_task(arguments.task, arguments.option)
     if arguments.rounds < 1:
         raise ValueError(f"expected --rounds >= 1; got {arguments.rounds}; do use 4")
     campaign = Campaign(
@@ -143,12 +143,14 @@ def _exact_gain(task: Task, campaign: Campaign) -> torch.Tensor | None:
 
 
 def _reference(task: Task, trials: Sequence[Trial]) -> Any:
-    used = [t for t in trials if t.status == "ok" and t.x is not None]
-    dim = task.actions.action_dim
-    if not used:
-        return task.reference(torch.empty(0, dim), torch.empty(0, 1))
-    x = torch.stack([t.x for t in used if t.x is not None])
-    return task.reference(torch.stack([t.action for t in used]), x)
+    """Return exact inference from what was measured; an invalid trial counts."""
+    used = [t for t in trials if t.status in ("ok", "invalid") and t.x is not None]
+    if used:
+        x = torch.stack([t.x for t in used if t.x is not None])
+        return task.reference(torch.stack([t.action for t in used]), x)
+    action = task.actions.values[:1]
+    row = simulate(task.simulator, task.theta_true[None], action, seed=0)
+    return task.reference(action[:0], row.x[:0])
 
 
 def _round_record(
@@ -163,7 +165,8 @@ def _round_record(
     record = {
         "round": len(campaign.history),
         "action": trial.action.tolist(),
-        "x": trial.x.tolist(),
+        "status": trial.status,
+        "x": [v if math.isfinite(v) else None for v in trial.x.flatten().tolist()],
         "eig": float(trial.design.expected_information_gain[index]),
         "eig_se": float(trial.design.standard_error[index]),
         "information_gained": trial.information_gained,
@@ -207,7 +210,7 @@ def _save(
 
     summary = {
         "task": arguments.task,
-        "variant": arguments.variant,
+        "options": arguments.option,
         "method": arguments.method,
         "setting": arguments.setting,
         "seed": arguments.seed,

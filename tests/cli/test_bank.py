@@ -100,7 +100,10 @@ def test_inspect_names_a_damaged_file(capsys):
     ("arguments", "text"),
     [
         (["--task", "numerica"], "expected a task among"),
-        (["--task", "oscillator", "--variant", "x"], "expected no --variant for task"),
+        (
+            ["--task", "oscillator", "--option", "variant=x"],
+            "expected options of 'oscillator' among",
+        ),
         (["--simulator", "m:f"], "expected --prior and --actions with --simulator"),
         (["--task", "numerical", "--rows", "0"], "expected --rows >= 1; got 0"),
         (
@@ -129,7 +132,7 @@ def test_another_simulator_is_refused(robot, capsys):
     assert "expected the simulator of the bank bank; got another" in (
         capsys.readouterr().err
     )
-    assert build("bank", 20, task="numerical", variant="sinh") == 2
+    assert build("bank", 20, task="numerical", option="variant=sinh") == 2
     assert main(["bank", "inspect", "nowhere"]) == 2
     assert "got no nowhere/bank.json" in capsys.readouterr().err
 

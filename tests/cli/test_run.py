@@ -1,9 +1,14 @@
 import json
+import sys
 
 import arviz as az
 import pytest
+import torch
 
+from sbi_active.campaign import Trial
 from sbi_active.cli import main
+from sbi_active.cli.run import _reference
+from sbi_active.tasks import get_task  # pyright: ignore
 
 SMALL = ["--simulations", "200", "--samples", "20", "--iterations", "30"]
 
@@ -49,10 +54,61 @@ def test_same_seed_same_results(tmp_path):
             ["run", "numerical", "--method", "abc"],
             "expected method to be one of 'asbi'",
         ),
-        (["run", "numerical", "--variant", "x"], "'linear', 'sinh', 'square'; got 'x'"),
+        (
+            ["run", "numerical", "--option", "variant=x"],
+            "'linear', 'sinh', 'square'; got 'x'",
+        ),
+        (["run", "numerical", "--option", "variant"], "expected --option NAME=VALUE"),
+        (
+            ["run", "numerical", "--option", "target=2"],
+            "expected options of 'numerical' among variant",
+        ),
+        (
+            ["run", "box_collision", "--option", 'noise="loud"'],
+            "expected values that 'box_collision' can use; got {'noise': 'loud'}",
+        ),
+        (
+            ["run", "box_collision", "--option", "target=3"],
+            "expected target among 1, 2; got 3",
+        ),
         (["run", "numerical", "--rounds", "0"], "expected --rounds >= 1; got 0"),
     ],
 )
 def test_bad_names_list_the_valid_ones(arguments, text, tmp_path, capsys):
     assert main([*arguments, "--out", str(tmp_path)]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_what_a_task_needs_is_named(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert main(["run", "box_collision", "--out", str(tmp_path)]) == 2
+    assert "pip install 'sbi-active[mujoco]'" in capsys.readouterr().err
+
+
+def test_invalid_trials_count_in_the_exact_posterior():
+    pytest.importorskip("mujoco")
+    task = get_task("box_collision", reference_budget=600)
+    before = _reference(task, [])
+    assert before.x.shape == (0, 3)
+    fell = Trial(0, torch.tensor([8.0]), torch.full((3,), torch.nan), "invalid")
+    missing = Trial(1, torch.tensor([1.0]), None, "missing")
+    after = _reference(task, [fell, missing])
+    assert after.action.tolist() == [[8.0]]
+    heavy_and_rough, light_and_smooth = torch.tensor([[0.9] * 3, [0.1] * 3])
+    assert float(after.log_prob(heavy_and_rough)) == -torch.inf
+    assert float(after.log_prob(light_and_smooth)) > 0
+
+
+@pytest.mark.slow
+def test_a_task_s_own_options(tmp_path, capsys):
+    pytest.importorskip("mujoco")
+    status = main(
+        ["run", "box_collision", "--option", "target=2", "--option", "noise=0.01"]
+        + ["--rounds", "1", "--out", str(tmp_path), *SMALL]
+    )
+    assert status == 0
+    assert "cube_density" in capsys.readouterr().out
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["options"] == ["target=2", "noise=0.01"]
+    trial = result["rounds"][0]
+    assert (trial["x"] == [None] * 3) == (trial["status"] == "invalid")
