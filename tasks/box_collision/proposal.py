@@ -26,10 +26,12 @@ class KernelMixture:
     Attributes:
         location: Shape (k, 3).
         scale: Lower Cholesky factors, shape (k, 3, 3).
+        source: Index of the draw that a kernel sits on, shape (k,).
     """
 
     location: Tensor
     scale: Tensor
+    source: Tensor
 
     @classmethod
     def around(
@@ -51,7 +53,7 @@ class KernelMixture:
         local = offset.mT @ offset / nearest.shape[1]
         # Repeated draws may be too few for a covariance; a share of the whole is added.
         covariance = WIDTH**2 * (local + 0.02 * overall)
-        return cls(location, torch.linalg.cholesky(covariance))
+        return cls(location, torch.linalg.cholesky(covariance), chosen[:NUM_KERNELS])
 
     def sample(self, num: int, generator: torch.Generator) -> Tensor:
         """Return draws, shape (num, 3)."""
@@ -66,8 +68,16 @@ class KernelMixture:
         share = torch.rand(num, 1, generator=generator, dtype=torch.float64)
         return torch.where(share < PRIOR_SHARE, normal, z)
 
-    def log_prob(self, z: Tensor) -> Tensor:
-        """Return the log density of z (n, 3), shape (n,)."""
+    def log_prob(self, z: Tensor, *, has_sources: bool = False) -> Tensor:
+        """Return the log density, shape (n,).
+
+        Args:
+            z: Shape (n, 3).
+            has_sources: Whether these are the draws that the kernels were chosen from.
+                Each is then seen by the kernels of the others alone: its own would make
+                it look more probable than any new draw there, and so all weights, and
+                the evidence, too small.
+        """
         inverse = torch.linalg.inv(self.scale)
         offset = torch.einsum("kij,nkj->nki", inverse, z[:, None] - self.location)
         norm = math.lgamma((DEGREES + DIM) / 2) - math.lgamma(DEGREES / 2)
@@ -75,7 +85,12 @@ class KernelMixture:
         log_det = inverse.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         tail = torch.log1p(offset.square().sum(-1) / DEGREES)
         log_kernel = norm + log_det - 0.5 * (DEGREES + DIM) * tail
-        log_kernels = log_kernel.logsumexp(-1) - math.log(len(self.location))
+        others = torch.tensor(float(len(self.location)), dtype=z.dtype)
+        if has_sources:
+            own = self.source == torch.arange(len(z))[:, None]
+            log_kernel = log_kernel.masked_fill(own, -torch.inf)
+            others = (~own).sum(-1)
+        log_kernels = log_kernel.logsumexp(-1) - others.log()
         return torch.logaddexp(
             log_kernels + math.log1p(-PRIOR_SHARE),
             log_normal(z) + math.log(PRIOR_SHARE),

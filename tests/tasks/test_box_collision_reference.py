@@ -3,11 +3,14 @@ import math
 import pytest
 import torch
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import GaussianNoise, SimulatorModel, Trial
 from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("mujoco")
-from sbi_active.tasks.box_collision import BoxCollisionReference  # noqa: E402
+from sbi_active.tasks.box_collision import (  # noqa: E402
+    BoxCollisionReference,
+    exact_posterior,
+)
 
 SD = 0.02
 
@@ -73,6 +76,70 @@ def test_agrees_with_a_grid(speeds):
     error = sd / reference.effective_sample_size**0.5 + sd / 4000**0.5
     assert bool(((draws.mean(0) - mean).abs() < 4 * error).all())
     assert reference.num_simulations <= 24_000 + 1 * len(speeds)
+
+
+def test_what_is_given_up_weighs_nothing():
+    action, x = trials(2.0, 4.0, 12.0)
+    reference = BoxCollisionReference(MODEL, action, x, num_effective=200)
+    assert reference.num_simulations < 3 * len(reference.theta)
+    draws = reference._draws
+    log_weight = draws.log_ratio + log_likelihood(reference.theta, action, x)
+    assert abs(reference.log_evidence - float(log_weight.logsumexp(0))) < 1e-3
+    assert bool((reference.weight - log_weight.softmax(0)).abs().max() < 1e-4)
+
+
+def test_goes_on_from_fewer_trials():
+    action, x = trials(3.0, 5.0, 4.0)
+    first = BoxCollisionReference(MODEL, action[:2], x[:2], num_effective=300)
+    spent = first.num_simulations
+    both = BoxCollisionReference(MODEL, action, x, num_effective=300, past=first)
+    alone = BoxCollisionReference(MODEL, action, x, num_effective=300, seed=1)
+    assert both.num_simulations < alone.num_simulations
+    assert first.num_simulations == spent
+    error = math.hypot(both.log_evidence_se, alone.log_evidence_se)
+    assert abs(both.log_evidence - alone.log_evidence) < 4 * error
+
+
+def test_a_speed_that_was_simulated_costs_nothing():
+    action, x = trials(3.0, 5.0, 5.0)
+    first = BoxCollisionReference(MODEL, action[:2], x[:2], num_effective=400)
+    again = BoxCollisionReference(MODEL, action, x, num_effective=100, past=first)
+    assert again.num_simulations < 0.1 * first.num_simulations
+    log_weight = again._draws.log_ratio + log_likelihood(again.theta, action, x)
+    assert abs(again.log_evidence - float(log_weight.logsumexp(0))) < 1e-3
+
+
+def test_a_past_of_another_simulator_is_refused():
+    action, x = trials(3.0)
+    past = BoxCollisionReference(MODEL, action, x, num_effective=50)
+    other = SimulatorModel(slide, noise=GaussianNoise(0.1))
+    with pytest.raises(ValueError, match="expected a past posterior with this"):
+        BoxCollisionReference(other, action, x, past=past)
+
+
+@pytest.mark.slow
+def test_standard_errors_cover():
+    action, x = trials(3.0, 5.0)
+    references = [
+        BoxCollisionReference(MODEL, action, x, num_effective=100, seed=seed)
+        for seed in range(20)
+    ]
+    log_evidence = torch.tensor([r.log_evidence for r in references])
+    se = torch.tensor([r.log_evidence_se for r in references]).square().mean().sqrt()
+    # A standard deviation of 20 numbers is off by 1 / sqrt(40) of itself.
+    assert abs(float(log_evidence.std() / se) - 1) < 4 / 40**0.5
+
+
+def test_trials_of_a_campaign():
+    task = get_task("box_collision", theta_true=(0.2, 0.2, 0.2))
+    fell = Trial(0, torch.tensor([8.0]), torch.full((3,), torch.nan), "invalid")
+    lost = Trial(1, torch.tensor([3.0]), None, "missing")
+    posterior = exact_posterior(task, [fell, lost], num_particles=100)
+    assert posterior.action.tolist() == [[8.0]]
+    assert posterior.effective_sample_size >= 100
+    # All that is known: the share of the prior that leaves the table at 8 m/s.
+    share = math.exp(posterior.log_evidence)
+    assert abs(share - 0.63) < 0.05 + 4 * share * posterior.log_evidence_se
 
 
 def test_without_trials_it_is_the_prior():
@@ -143,7 +210,7 @@ def test_the_task_gives_it_where_there_is_a_budget():
     action = torch.tensor([[5.0]])
     x = task.real_system(action[0], seed=0)[None]
     reference = task.reference(action, x)
-    assert reference.num_simulations == 600
+    assert 600 <= reference.num_simulations < 600 + 20
     assert float(reference.log_prob(task.theta_true[None])) > 0  # more than the prior
     assert get_task("box_collision").reference(action, x) is None
 

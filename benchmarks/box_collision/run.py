@@ -1,0 +1,308 @@
+"""The paper's box collision: log p(truth), reproduction error, speeds, time a round.
+
+    python -m benchmarks.box_collision.run                  # both targets, 10 trials
+    python -m benchmarks.box_collision.run --trials 50      # the paper's number
+    python -m benchmarks.box_collision.run --target 1 --setting paper --methods asbi
+    python -m benchmarks.box_collision.run --table coverage --rounds 4
+    python -m benchmarks.box_collision.run --summary --figures FOLDER
+
+Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
+method, target and setting, in ``benchmarks/box_collision/results``. The tables are
+printed at the end, or alone by ``--summary``.
+
+Beside a belief stands the posterior of the same trials by importance sampling
+(``log_p_exact``, with its standard error), which is what the best inference would
+reach with these actions. It needs noise: without any, as in the paper, there is no
+posterior density.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.box_collision.bank import PriorBank
+from benchmarks.box_collision.summary import (
+    REPORTED,
+    STAGES,
+    coverage_table,
+    draw,
+    read,
+    summarize,
+)
+from sbi_active import Campaign, CampaignOptions, MixtureDensity
+from sbi_active.campaign.campaign import METHODS
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import Task, get_task
+from sbi_active.tasks.box_collision import (  # pyright: ignore
+    BoxCollisionReference,
+    exact_posterior,
+)
+
+RESULTS = Path(__file__).parent / "results"
+NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
+#: Options of a campaign, and of the task.
+SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
+    # Section 5.3: 41 x 500 rows, (128, 128), 2000 steps of batch 50, M = 250.
+    "paper": (
+        CampaignOptions(
+            num_simulations=41 * 500,
+            num_samples=500,  # half of them choose, half report
+            density_estimator=MixtureDensity.faithful(),
+            estimator="posterior",
+            eliminate=False,
+            refine=False,
+        ),
+        {"left_table": "paper"},
+    ),
+    # The paper's simulations with this library's estimators.
+    "paper_size": (
+        CampaignOptions(num_simulations=41 * 500, num_samples=250),
+        {},
+    ),
+    "default": (CampaignOptions(num_samples=250, num_scored=500), {}),
+}
+COLUMNS = [
+    *["seed", "theta_true", "round", "speed", "is_valid", "x", "y", "z", "eig"],
+    *["log_prob_true", "log_p_exact", "log_p_exact_se", "gap", "hpd"],
+    *[f"rep_err_{speed:g}" for speed in REPORTED],
+    *[f"exact_rep_err_{speed:g}" for speed in REPORTED],
+    *["num_simulations", "num_reused", "exact_ess", "exact_simulations", "exact_cpu"],
+    *[f"cpu_{s}" for s in STAGES],
+    *[f"wall_{s}" for s in STAGES],
+]
+
+
+class Resampled:
+    """Draws of a weighted sample, as the task's metrics take a belief."""
+
+    def __init__(self, posterior: BoxCollisionReference) -> None:
+        self._posterior = posterior
+
+    def sample(self, shape: torch.Size) -> Tensor:
+        """Return draws, shape (n, 3)."""
+        seed = int(torch.randint(2**31, ()))
+        return self._posterior.sample(shape[0], seed=seed)
+
+
+def run_trial(
+    task: Any, method: str, seed: int, arguments: argparse.Namespace
+) -> list[dict[str, object]]:
+    """Return one row a round of one campaign."""
+    options = SETTINGS[arguments.setting][0]
+    bank = PriorBank(arguments.bank, task) if arguments.bank else None
+    campaign = Campaign(
+        task.simulator if bank is None else bank.simulator,
+        task.prior,
+        task.actions,
+        method=method,
+        seed=seed,
+        options=replace(options, num_workers=arguments.workers),
+    )
+    rows: list[dict[str, object]] = []
+    past = None
+    for index in range(arguments.rounds):
+        trial = campaign.ask()
+        if bank is not None and bank.is_open:
+            bank.is_open = False  # from here on no other campaign is alike
+            bank.close()
+        real_seed = derive_seed(seed, "real", index)
+        campaign.tell(task.real_system(trial.action, seed=real_seed))
+        campaign.update()
+        is_last = index + 1 == arguments.rounds
+        row = round_row(task, campaign, is_last=is_last)
+        if bank is not None:
+            row["num_reused"] = bank.num_reused if index == 0 else 0
+        if task.noise > 0 and (is_last or arguments.reference == "all"):
+            start = time.process_time()
+            past = exact_posterior(
+                task,
+                campaign.history,
+                num_particles=arguments.particles,
+                seed=derive_seed(seed, "reference"),
+                past=past,
+            )
+            log_q = float(campaign.belief.log_prob(task.theta_true))
+            row |= reference_row(task, past, log_q)
+            row["exact_cpu"] = time.process_time() - start
+            if is_last:
+                row |= errors(task, Resampled(past), "exact_rep_err")
+        rows.append({"seed": seed, "round": index + 1} | row)
+    return rows
+
+
+def round_row(task: Any, campaign: Campaign, *, is_last: bool) -> dict[str, object]:
+    """Return the figures of the last round, without the reference's."""
+    trial, belief = campaign.history[-1], campaign.belief
+    assert trial.design is not None
+    assert trial.x is not None
+    log_q = float(belief.log_prob(task.theta_true))
+    with forked_generators(derive_seed(trial.index, "draws")):
+        draws = belief.sample(torch.Size([NUM_DRAWS]))
+    gain = trial.design.expected_information_gain
+    row: dict[str, object] = {
+        "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
+        "speed": float(trial.action),
+        "is_valid": int(trial.status == "ok"),
+        **dict(zip("xyz", trial.x.double().tolist(), strict=True)),
+        "eig": float(gain[trial.design.index]),
+        "log_prob_true": log_q,
+        # Share of the belief that is denser than the truth: the truth is in the region
+        # of highest density of level c where this is below c.
+        "hpd": float((belief.log_prob(draws) > log_q).double().mean()),
+        "num_simulations": trial.num_simulations,
+    }
+    if is_last:
+        row |= errors(task, belief, "rep_err")
+    for stage in STAGES:
+        row[f"cpu_{stage}"] = trial.cpu_seconds.get(stage, 0.0)
+        row[f"wall_{stage}"] = trial.seconds.get(stage, 0.0)
+    return row
+
+
+def errors(task: Any, belief: Any, name: str) -> dict[str, object]:
+    """Return the reproduction errors, 1e-3 m, N = 250 as in the paper."""
+    table = task.reproduction_table(belief)
+    return {f"{name}_{speed:g}": table[speed] for speed in REPORTED}
+
+
+def reference_row(
+    task: Task, exact: BoxCollisionReference, log_q: float
+) -> dict[str, object]:
+    """Return what importance sampling says of the same trials."""
+    spent = exact.num_simulations  # without those of the density
+    log_p = float(exact.log_prob(task.theta_true[None])[0])
+    return {
+        "log_p_exact": log_p,
+        "log_p_exact_se": exact.log_evidence_se,
+        "gap": log_p - log_q,
+        "exact_ess": exact.effective_sample_size,
+        "exact_simulations": spent,
+    }
+
+
+def make_task(target: str, arguments: argparse.Namespace, seed: int) -> Any:
+    """Return a target of the paper, or a truth drawn from the prior."""
+    options: dict[str, Any] = {
+        "noise": arguments.noise,
+        **SETTINGS[arguments.setting][1],
+    }
+    if target != "prior":
+        return get_task("box_collision", target=int(target), **options)
+    task = get_task("box_collision", **options)
+    with forked_generators(derive_seed(seed, "truth")):
+        return task.with_truth(task.prior.sample(torch.Size([1]))[0])
+
+
+def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
+    """Return the file of a method, target and setting."""
+    name = f"{arguments.setting}_target_{target}_{method}"
+    if arguments.noise != 0.005:
+        name += f"_noise_{arguments.noise:g}"
+    if arguments.rounds != 6:
+        name += f"_rounds_{arguments.rounds}"
+    return arguments.results / f"{name}.csv"
+
+
+def run_missing(method: str, target: str, arguments: argparse.Namespace) -> None:
+    """Run the trials that are not in the file yet."""
+    path = path_of(method, target, arguments)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done = {int(row["seed"]) for row in read(path)}
+    for seed in range(arguments.trials):
+        if seed in done:
+            continue
+        start = time.process_time()
+        task = make_task(target, arguments, seed)
+        rows = run_trial(task, method, seed, arguments)
+        new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            if new:
+                writer.writeheader()
+            writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+        spent = time.process_time() - start
+        print(f"{path.stem} trial {seed}: {spent:.0f} CPU s", flush=True)
+
+
+def short(value: object) -> object:
+    """Return a number with six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def parse() -> argparse.Namespace:
+    """Return the arguments."""
+    parser = argparse.ArgumentParser(description="The paper's box collision.")
+    parser.add_argument("--table", choices=["paper", "coverage"], default="paper")
+    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
+    parser.add_argument("--methods", nargs="*", choices=[*METHODS], help="(asbi nsbi)")
+    parser.add_argument("--setting", choices=[*SETTINGS], default="default")
+    parser.add_argument("--trials", type=int, help="(10; 40 for the coverage)")
+    parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--noise", type=float, default=0.005, help="m; > 0 (0.005)")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--reference",
+        choices=["last", "all"],
+        default="last",
+        help="rounds after which to run importance sampling",
+    )
+    parser.add_argument("--particles", type=int, default=100, help="effective ones")
+    parser.add_argument(
+        "--bank",
+        type=Path,
+        help="folder to keep first rounds' simulations in; one worker only, and the "
+        "time of a first round is then not that of a campaign alone",
+    )
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--figures", type=Path, help="folder to draw figures into")
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+    if arguments.noise <= 0:
+        parser.error(
+            f"expected --noise > 0; got {arguments.noise}; do use 0.005: without noise "
+            "there is no posterior density, and nothing to estimate"
+        )
+    if arguments.bank and arguments.workers > 1:
+        parser.error(
+            f"expected --workers 1 beside --bank; got {arguments.workers}; do drop one"
+        )
+    is_coverage = arguments.table == "coverage"
+    if arguments.methods is None:
+        arguments.methods = ["asbi"] if is_coverage else ["asbi", "nsbi"]
+    if arguments.trials is None:
+        arguments.trials = 40 if is_coverage else 10
+    return arguments
+
+
+def main() -> None:
+    arguments = parse()
+    torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", message="the posterior rests on")
+    is_coverage = arguments.table == "coverage"
+    targets = [arguments.target] if arguments.target else ["1", "2"]
+    targets = ["prior"] if is_coverage else targets
+    cells = {}
+    for method in arguments.methods:
+        for target in targets:
+            if not arguments.summary:
+                run_missing(method, target, arguments)
+            rows = read(path_of(method, target, arguments))
+            rows = [row for row in rows if int(row["seed"]) < arguments.trials]
+            if rows:
+                cells[method, target] = rows
+    print(coverage_table(cells) if is_coverage else summarize(cells))
+    if arguments.figures is not None and cells:
+        print(*draw(cells, arguments.figures), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

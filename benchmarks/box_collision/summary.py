@@ -1,0 +1,313 @@
+"""The paper's Table 2 and Figures 7 to 9 from the rows of a run."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from sbi_active.plots import as_table
+
+__all__ = [
+    "REPORTED",
+    "STAGES",
+    "coverage_table",
+    "draw",
+    "read",
+    "summarize",
+]
+
+REPORTED = (3.0, 5.0, 7.0)  # m/s
+STAGES = ("simulation", "training", "design", "scoring", "update")
+PARTS = {  # of a round, in the paper's words
+    "simulation": ("simulation",),
+    "training": ("training",),
+    "information gain": ("design",),
+    "refinement": ("scoring", "update"),
+}
+#: Table 2: mean and standard deviation of 50 trials, 1e-3 m, at 3, 5 and 7 m/s.
+PUBLISHED = {
+    ("asbi", "1"): ("2.7 +- 0.6", "10.3 +- 2.5", "22.7 +- 8.7"),
+    ("nsbi", "1"): ("19.5 +- 23", "158 +- 230", "532 +- 590"),
+    ("alhi", "1"): ("4.4 +- 4.3", "20.5 +- 20", "84.5 +- 130"),
+    ("nlhi", "1"): ("42.5 +- 66", "297 +- 360", "754 +- 650"),
+    ("asbi", "2"): ("703 +- 190", "0 +- 0", "0 +- 0"),
+    ("nsbi", "2"): ("1850 +- 250", "477 +- 540", "77 +- 140"),
+    ("alhi", "2"): ("1350 +- 580", "262 +- 440", "59.5 +- 160"),
+    ("nlhi", "2"): ("1930 +- 180", "851 +- 570", "300 +- 370"),
+}
+#: Mean speeds of rounds 1 and 6 (section 5.3), and seconds a round (Figure 9).
+PUBLISHED_SPEEDS = {("asbi", "1"): "5.35 .. 8.2", ("asbi", "2"): "5.3 .. 2.7"}
+PUBLISHED_TIME = "simulation 22.2, training 8.2, information gain 4.6: 35 s, with a GPU"
+COMPARED = 3  # round by which target 2 should be pushed more slowly
+COLORS = {"1": "tab:blue", "2": "tab:orange"}
+
+Rows = Sequence[Mapping[str, str]]
+Cells = Mapping[tuple[str, str], Rows]  # by method and target
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file, none if it is not there."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def column(rows: Rows, key: str, round_: int | None = None) -> Any:
+    """Return a column of one round, or of all, as an array; NaN where it is empty."""
+    kept = [r[key] for r in rows if round_ is None or int(r["round"]) == round_]
+    return np.array([float(v) if v else np.nan for v in kept])
+
+
+def num_rounds(rows: Rows) -> int:
+    """Return the last round."""
+    return max(int(r["round"]) for r in rows)
+
+
+def summarize(cells: Cells) -> str:
+    """Return all tables, the paper's figures beside ours.
+
+    Args:
+        cells: Rows by method and target.
+    """
+    if not cells:
+        return "no trials yet"
+    parts = [errors_table(cells), rounds_table(cells), time_table(cells)]
+    return "\n\n".join([*parts, *slower_pushes(cells), *active_against_random(cells)])
+
+
+def errors_table(cells: Cells) -> str:
+    """Return Table 2: the reproduction errors of the last belief."""
+    table = []
+    for (method, target), rows in cells.items():
+        last = num_rounds(rows)
+        published = PUBLISHED.get((method, target), ("-",) * len(REPORTED))
+        trials = len(column(rows, "log_prob_true", last))
+        entry = [f"target {target}", method.upper(), str(trials)]
+        for speed, paper in zip(REPORTED, published, strict=True):
+            ours = column(rows, f"rep_err_{speed:g}", last)
+            limit = column(rows, f"exact_rep_err_{speed:g}", last)
+            entry += [spread(ours), spread(limit), paper]
+        table.append(entry)
+    header = ["", "method", "trials"]
+    for speed in REPORTED:
+        header += [f"RepErr({speed:g}), 1e-3", "exact posterior's", "paper"]
+    return as_table(table, header)
+
+
+def rounds_table(cells: Cells) -> str:
+    """Return Figures 7 and 8 in numbers, and the gap to the exact posterior."""
+    table = []
+    for (method, target), rows in cells.items():
+        last = num_rounds(rows)
+        rounds = range(1, last + 1)
+        medians = [np.median(column(rows, "log_prob_true", r)) for r in rounds]
+        speeds = [column(rows, "speed", r).mean() for r in rounds]
+        shares = [1 - column(rows, "is_valid", r).mean() for r in rounds]
+        table.append(
+            [
+                f"target {target}, {method.upper()}",
+                " / ".join(f"{m:.2f}" for m in medians),
+                gap(rows, last),
+                " / ".join(f"{s:.1f}" for s in speeds),
+                PUBLISHED_SPEEDS.get((method, target), "-"),
+                " / ".join(f"{s:.2f}" for s in shares),
+            ]
+        )
+    header = ["", "median log p(truth) by round", "gap: mean +- se, 95 % (se of exact)"]
+    return as_table(table, [*header, "mean speed", "paper", "share off the table"])
+
+
+def time_table(cells: Cells) -> str:
+    """Return Figure 9 in numbers: what a round costs."""
+    table = []
+    for (method, target), rows in cells.items():
+        entry = [f"target {target}, {method.upper()}"]
+        for kind in ("cpu", "wall"):
+            seconds = time_parts(rows, kind)
+            cells_ = [f"{s:.1f}" for s in seconds.values()]
+            entry.append(f"{sum(seconds.values()):.1f} ({' + '.join(cells_)})")
+        entry.append(f"{column(rows, 'num_simulations').mean():.0f}")
+        table.append(entry)
+    names = " + ".join(PARTS)
+    header = ["", f"CPU s a round ({names})", "wall s", "simulations a round"]
+    return f"{as_table(table, header)}\npaper, ASBI: {PUBLISHED_TIME}"
+
+
+def time_parts(rows: Rows, kind: str) -> dict[str, float]:
+    """Return mean seconds a round by part."""
+    return {
+        part: float(sum(column(rows, f"{kind}_{s}").mean() for s in stages))
+        for part, stages in PARTS.items()
+    }
+
+
+def slower_pushes(cells: Cells) -> list[str]:
+    """Return how often target 2 is pushed more slowly than target 1, by method."""
+    lines = []
+    for method in dict.fromkeys(method for method, _ in cells):
+        if (method, "1") not in cells or (method, "2") not in cells:
+            continue
+        first, second = (by_seed(cells[method, t], COMPARED) for t in ("1", "2"))
+        shared = sorted(first.keys() & second.keys())
+        if shared:
+            lower = sum(second[seed] < first[seed] for seed in shared)
+            lines.append(
+                f"{method.upper()}: slower for target 2 in round {COMPARED} in {lower} "
+                f"of {len(shared)} trials ({lower / len(shared):.2f}; bar .80)"
+            )
+    return lines
+
+
+def active_against_random(cells: Cells) -> list[str]:
+    """Return whether designed actions have the higher median, round by round."""
+    lines = []
+    for active, random in (("asbi", "nsbi"), ("alhi", "nlhi")):
+        for target in ("1", "2"):
+            if (active, target) not in cells or (random, target) not in cells:
+                continue
+            ours, theirs = cells[active, target], cells[random, target]
+            differences = [
+                np.median(column(ours, "log_prob_true", r))
+                - np.median(column(theirs, "log_prob_true", r))
+                for r in range(2, num_rounds(ours) + 1)
+            ]
+            above = sum(d > 0 for d in differences)
+            text = " / ".join(f"{d:+.2f}" for d in differences)
+            lines.append(
+                f"target {target}: {active.upper()} above {random.upper()} in median "
+                f"log p in {above} of rounds 2 to {num_rounds(ours)} ({text})"
+            )
+    return lines
+
+
+def coverage_table(cells: Cells) -> str:
+    """Return how often the truth is within regions of highest density."""
+    table = []
+    for (method, _), rows in cells.items():
+        for round_ in [r for r in (4, 6) if r <= num_rounds(rows)]:
+            hpd = column(rows, "hpd", round_)
+            entry = [method.upper(), str(round_), str(len(hpd))]
+            for level in (0.5, 0.9):
+                inside = int((hpd <= level).sum())
+                low, high = stats.binom.interval(0.95, len(hpd), level)
+                share = f"{inside / len(hpd):.3f}"
+                verdict = "within" if low <= inside <= high else "outside"
+                bounds = f"[{low / len(hpd):.3f}, {high / len(hpd):.3f}]"
+                entry.append(f"{share} {verdict} {bounds}")
+            entry.append(gap(rows, round_))
+            table.append(entry)
+    if not table:
+        return "no trials of four rounds yet"
+    header = ["", "round", "trials", "in 50 % region", "in 90 % region", "gap"]
+    return as_table(table, header)
+
+
+def draw(cells: Cells, folder: Path) -> list[Path]:
+    """Draw Figures 7 to 9 and return their paths.
+
+    Args:
+        cells: Rows by method and target.
+        folder: Made where it is missing.
+    """
+    from matplotlib.figure import Figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    targets = sorted({target for _, target in cells})
+    methods = [*dict.fromkeys(method for method, _ in cells)]
+
+    figure = Figure(figsize=(5 * len(targets), 3.5), layout="constrained")
+    for axes, target in zip(grid(figure, len(targets)), targets, strict=True):
+        present = [m for m in methods if (m, target) in cells]
+        for k, method in enumerate(present):
+            rows = cells[method, target]
+            rounds = range(1, num_rounds(rows) + 1)
+            boxes = axes.boxplot(
+                [column(rows, "log_prob_true", r) for r in rounds],
+                positions=[r + 0.25 * (k - (len(present) - 1) / 2) for r in rounds],
+                widths=0.2,
+                manage_ticks=False,
+                patch_artist=True,
+                boxprops={"facecolor": f"C{k}", "alpha": 0.6},
+                medianprops={"color": "black"},
+                flierprops={"markersize": 3},
+            )
+            boxes["boxes"][0].set_label(method.upper())
+        axes.axhline(0, color="tab:purple", ls=":", label="prior")
+        axes.set(title=f"Target {target}", xlabel="round")
+        axes.set_ylabel("log p(truth), nats")
+        axes.legend()
+    paths.append(save(figure, folder / "log_prob.png"))
+
+    figure = Figure(figsize=(4 * len(methods), 3.5), layout="constrained")
+    for axes, method in zip(grid(figure, len(methods)), methods, strict=True):
+        for target in targets:
+            if (method, target) not in cells:
+                continue
+            rows = cells[method, target]
+            rounds = range(1, num_rounds(rows) + 1)
+            speeds = [column(rows, "speed", r) for r in rounds]
+            mean = np.array([s.mean() for s in speeds])
+            sd = np.array([s.std() for s in speeds])
+            color = COLORS.get(target, "gray")
+            axes.plot(rounds, mean, "o-", color=color, label=f"target {target}")
+            axes.fill_between(rounds, mean - sd, mean + sd, color=color, alpha=0.2)
+        axes.set(title=method.upper(), xlabel="round", ylabel="speed, m/s")
+        axes.legend()
+    paths.append(save(figure, folder / "speeds.png"))
+
+    figure = Figure(figsize=(3 + len(methods), 3.5), layout="constrained")
+    axes = figure.subplots()
+    for k, method in enumerate(methods):
+        rows = [row for (m, _), part in cells.items() if m == method for row in part]
+        bottom = 0.0
+        for j, (part, seconds) in enumerate(time_parts(rows, "wall").items()):
+            label = part if k == 0 else None
+            axes.bar(method.upper(), seconds, bottom=bottom, color=f"C{j}", label=label)
+            bottom += seconds
+    axes.set_ylabel("wall s a round")
+    figure.legend(loc="outside right upper")
+    paths.append(save(figure, folder / "time.png"))
+    return paths
+
+
+def grid(figure: Any, num: int) -> list[Any]:
+    """Return axes side by side."""
+    return [*figure.subplots(1, num, squeeze=False)[0]]
+
+
+def save(figure: Any, path: Path) -> Path:
+    """Write a figure and return its path."""
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def by_seed(rows: Rows, round_: int) -> dict[int, float]:
+    """Return the speed chosen in a round, by seed."""
+    return {
+        int(r["seed"]): float(r["speed"]) for r in rows if int(r["round"]) == round_
+    }
+
+
+def gap(rows: Rows, round_: int) -> str:
+    """Return the gap to the exact posterior: mean, its error, 95th percentile."""
+    values = column(rows, "gap", round_)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return "-"
+    error = values.std(ddof=1) / len(values) ** 0.5 if len(values) > 1 else np.nan
+    exact = np.nanmax(column(rows, "log_p_exact_se", round_))
+    percentile = np.percentile(values, 95)
+    return f"{values.mean():.2f} +- {error:.2f}, {percentile:.2f} ({exact:.2f})"
+
+
+def spread(values: Any) -> str:
+    """Return mean and standard deviation."""
+    values = values[np.isfinite(values)]
+    return f"{values.mean():.1f} +- {values.std():.1f}" if len(values) else "-"
