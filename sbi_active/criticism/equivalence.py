@@ -32,7 +32,7 @@ SAME = 1.0
 #: Share of an effect's size that may be left of it for the effects to look the same.
 RELATIVE = 1e-2
 #: Step from the null, in deviations of the prior.
-STEP = 1e-3
+STEP = 1e-4
 
 
 def equivalent_effects(

@@ -19,9 +19,13 @@ Array = NDArray[Any]
 
 DEGREES_OF_FREEDOM = 5
 #: Particles a round, rounds at most, and the effective number that ends them.
-ROUND, MAX_ROUNDS, ENOUGH = 400, 4, 100.0
-#: Share of the particles that a later round spreads over all of its components.
-DEFENSIVE = 0.2
+ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 100.0
+#: Effective particles below which a round missed the shape, rounds after which that is
+#: looked at, and points from which the shape is looked for again.
+MISSED, LOOKS, NUM_AGAIN = 15.0, (0, 7), 48
+#: Share of the particles that a later round spreads over all of its components, and
+#: the weight of the component that has the sample's own moments.
+DEFENSIVE, OVERALL = 0.5, 0.3
 #: Inflation of a fitted covariance, so that the proposal's tails are the heavier.
 INFLATION = 1.5
 
@@ -101,20 +105,23 @@ def importance_sample(
     proposal: TMixture,
     *,
     rng: np.random.Generator,
-    local: Callable[[], TMixture] | None = None,
+    local: Callable[[Array | None], TMixture] | None = None,
     enough: float = ENOUGH,
 ) -> ImportanceSample:
     r"""Return the evidence :math:`Z = E_q[p(x | z) p(z) / q(z)]`.
 
-    Where one round leaves few effective particles, the next proposes from ``local``,
-    and further ones from the same with the weights of its components adapted; all
-    rounds count, each particle weighted by the mixture of all their proposals.
+    Where the first round leaves few effective particles, the next proposes from
+    ``local``, and where these stay few, so does a later one; further ones propose from
+    the same with the weights of its components adapted, and with a component of the
+    sample's own moments. All rounds count, each particle weighted by the mixture of all
+    their proposals.
 
     Args:
         rival: The model.
         proposal: The first round's.
         rng: Source of the draws.
-        local: Returns the second round's; None repeats the first, adapted.
+        local: Returns such a round's, given points of the posterior so far, shape
+            (k, dim), or None before there are any; None repeats the first, adapted.
         enough: Effective sample size that ends the rounds.
 
     References:
@@ -122,6 +129,7 @@ def importance_sample(
         Journal of Statistics 39 (2012).
     """
     proposals, parts, targets = [], [], []
+    basis = proposal
     for i in range(MAX_ROUNDS):
         u = proposal.sample(ROUND, rng)
         target = rival.log_prior(u)
@@ -134,10 +142,12 @@ def importance_sample(
         sample = _weighted(parts, targets, proposals)
         if sample.effective_sample_size >= enough:
             break
-        if i == 0 and local is not None:
-            proposal = local()
+        missed = sample.effective_sample_size < MISSED
+        if local is not None and missed and i in LOOKS:
+            points = None if i == 0 else np.unique(sample.draws(NUM_AGAIN, rng), axis=0)
+            proposal = basis = local(points)
         else:
-            proposal = _adapted(sample, proposal)
+            proposal = _adapted(sample, basis)
     return sample
 
 
@@ -166,4 +176,13 @@ def _adapted(sample: ImportanceSample, proposal: TMixture) -> TMixture:
     flat = np.sqrt(sample.weights)
     weights = share @ (flat / flat.sum())
     weights = (1 - DEFENSIVE) * weights / weights.sum() + DEFENSIVE / len(weights)
-    return TMixture(proposal.means, proposal.factors, weights)
+    means, factors, dim = proposal.means, proposal.factors, sample.u.shape[1]
+    if sample.effective_sample_size > 3 * dim:
+        mean = sample.weights @ sample.u
+        apart = sample.u - mean
+        cov = (sample.weights[:, None] * apart).T @ apart
+        cov += 1e-10 * np.diag(np.diag(cov) + 1e-12)
+        means = np.concatenate([means, mean[None]])
+        factors = np.concatenate([factors, np.linalg.cholesky(cov)[None]])
+        weights = np.append((1 - OVERALL) * weights, OVERALL)
+    return TMixture(means, factors, weights)

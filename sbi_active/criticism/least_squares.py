@@ -17,9 +17,9 @@ __all__ = ["Modes", "along_ridges", "find_modes", "probe_step"]
 
 Array = NDArray[Any]
 
-NUM_STARTS = 16
-#: Draws of the prior of which the best are among the starts.
-NUM_SCREENED, NUM_BEST = 200, 4
+#: Starts of a search, among them so many points near smaller rivals' posteriors and
+#: the best of so many draws of the prior.
+NUM_STARTS, MOST_NEAR, NUM_SCREENED, NUM_BEST = 14, 6, 64, 4
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
@@ -28,16 +28,20 @@ NUM_POINTS, RANGE = 64, 4.0
 FLAT = 0.3
 #: Iterations that bring a point back to where the data put it.
 RETURN = 5
-#: Starts that go on after the first phase, iterations of the first and of each later
-#: phase, and later phases at least and at most.
-NUM_KEPT, EARLY, LATE, PHASES = 8, 4, 4, (2, 10)
+#: Iterations of the first phase in two halves and of each later phase, starts that go
+#: on after either half, and later phases at least and at most.
+EARLY, LATE, NUM_KEPT, PHASES = (2, 3), 4, (8, 4), (2, 10)
+#: Coordinates within which two points count as the same, early and late.
+NEAR_MODE, SAME_MODE = 0.05, 0.02
+#: Expected fall of a sum of squares that is worth no further iteration.
+CONVERGED = 0.02
 #: Sum of squares that a phase must take off the best start to be worth another.
 PROGRESS = 0.5
 MAX_MODES = 8
 #: Modes whose sum of squares exceeds the best by this hold no mass that counts.
 NEGLIGIBLE = 40.0
 #: Finite-difference steps in prior deviations, and where two of them count as one.
-STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2), 0.1
+STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2, 0.2), 0.1
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,12 @@ def probe_step(rival: Rival, *, seed: int) -> tuple[float, bool]:
 
 
 def find_modes(
-    rival: Rival, *, step: float, seed: int, near: Array | None = None
+    rival: Rival,
+    *,
+    step: float,
+    seed: int,
+    near: Array | None = None,
+    widened: float = 1.0,
 ) -> Modes:
     r"""Return modes of the posterior and t distributions around them.
 
@@ -91,13 +100,15 @@ def find_modes(
         step: Of finite differences, in u.
         seed: Of the starts.
         near: Points to start some of the searches from, shape (k, dim).
+        widened: Factor on the covariances.
 
     References:
-        Marquardt, SIAM Journal on Applied Mathematics 11 (1963).
+        Marquardt, SIAM Journal on Applied Mathematics 11 (1963); Broyden, Mathematics
+        of Computation 19 (1965), for the derivatives of the first phase.
     """
     u = rival.coordinates.sample(NUM_STARTS, seed=seed)
     if near is not None:
-        some = min(len(near), NUM_STARTS // 2)
+        some = min(len(near), MOST_NEAR)
         u[:some] = near[:some]
     fixed = ~rival.searched
     whiten = rival.error.start()
@@ -106,37 +117,41 @@ def find_modes(
     u[-NUM_BEST:] = screened[np.argsort(squares)[:NUM_BEST]]
     u[:, fixed] = 0.0
     u = np.clip(u, rival.coordinates.low, rival.coordinates.high)
-    u, cost = _descend(rival, u, whiten, step, EARLY)
-    u = u[np.argsort(cost)[:NUM_KEPT]]
+    for iterations, most in zip(EARLY, NUM_KEPT, strict=True):
+        u, cost = _descend(rival, u, whiten, step, iterations, secant=True)
+        u = _distinct(u[np.argsort(cost)], NEAR_MODE)[:most]
     best, stalls = np.inf, 0
     for phase in range(PHASES[1]):
         whiten = rival.error.whitener(rival.residual(u[:1])[0][0])
         u, cost = _descend(rival, u, whiten, step, LATE)
-        u, cost = u[np.argsort(cost)], np.sort(cost)
+        order = np.argsort(cost)
+        order = order[_which_distinct(u[order], SAME_MODE / 4)]
+        u, cost = u[order], cost[order]
         stalls = stalls + 1 if best - cost[0] < PROGRESS else 0
         # Far from a fit, a phase may be lost to finding the damping.
         patience = 3 if cost[0] > FAR * len(rival.simulator.measurements) else 1
         if phase + 1 >= PHASES[0] and stalls >= patience:
             break
         best = cost[0]
-    modes = [u[0]]
-    for candidate, c in zip(u[1:], cost[1:], strict=True):
-        apart = all(np.abs(candidate - mode).max() > 0.02 for mode in modes)
-        if c - cost[0] < NEGLIGIBLE and apart and len(modes) < MAX_MODES:
-            modes.append(candidate)
-    at = np.stack(modes)
+    at = _distinct(u[cost - cost[0] < NEGLIGIBLE], SAME_MODE)[:MAX_MODES]
     # Never wider than the prior: a flat direction has its variance.
     means, factors = [at], [_factors(rival, at, whiten, step, 1.0)]
     for other in rival.error.regimes():
-        own, _ = _descend(rival, at[:1], other, step, LATE)
+        own, _ = _descend(rival, at[:1], other, step, LATE, secant=True)
         means.append(own)
         factors.append(_factors(rival, own, other, step, 1.0))
-    proposal = TMixture(np.concatenate(means), np.concatenate(factors))
+    wide = np.concatenate(factors) * np.sqrt(widened)
+    proposal = TMixture(np.concatenate(means), wide)
     return Modes(at, proposal, whiten)
 
 
 def along_ridges(
-    rival: Rival, modes: Modes, *, step: float, rng: np.random.Generator
+    rival: Rival,
+    modes: Modes,
+    *,
+    step: float,
+    rng: np.random.Generator,
+    points: Array | None = None,
 ) -> TMixture:
     """Return narrow t distributions along what the data leave open.
 
@@ -151,11 +166,13 @@ def along_ridges(
         modes: Its modes.
         step: Of finite differences, in u.
         rng: Source of the points.
+        points: That are known to lie on the ridge, shape (k, dim).
     """
     c = rival.coordinates
-    u = np.concatenate([modes.u, modes.proposal.sample(NUM_POINTS, rng)])
+    on = modes.u if points is None else np.concatenate([modes.u, points])
+    u = np.concatenate([on, modes.proposal.sample(NUM_POINTS, rng)])
     u = np.clip(u, c.low, c.high)
-    u, _ = _descend(rival, u, modes.whiten, step, RETURN, center=u.copy())
+    u, _ = _descend(rival, u, modes.whiten, step, RETURN, center=u.copy(), secant=True)
     target = rival.log_prior(u) + rival.log_likelihood(u)
     if not np.isfinite(target.max()):
         return modes.proposal
@@ -186,46 +203,81 @@ def _factors(
     return np.linalg.cholesky(np.linalg.inv(precision) * INFLATION)
 
 
+def _which_distinct(u: Array, apart: float) -> list[int]:
+    """Return the places of points that lie apart from all those before them."""
+    kept: list[int] = []
+    for i, point in enumerate(u):
+        if all(np.abs(point - u[j]).max() > apart for j in kept):
+            kept.append(i)
+    return kept
+
+
+def _distinct(u: Array, apart: float) -> Array:
+    return u[_which_distinct(u, apart)]
+
+
 def _descend(
     rival: Rival,
     u: Array,
     whiten: Whitener,
     step: float,
     iterations: int,
+    *,
     center: Array | None = None,
+    secant: bool = False,
 ) -> tuple[Array, Array]:
     """Return improved starts and their cost, shapes (n, dim) and (n,).
 
-    Without a center, shape (n, dim), the penalty is that of the prior.
+    Args:
+        rival: The model.
+        u: Starts, shape (n, dim).
+        whiten: Of the residuals.
+        step: Of finite differences.
+        iterations: At most; a start that is expected to gain nothing stops.
+        center: Of the penalty, shape (n, dim); None has that of the prior.
+        secant: Derivatives are updated from the steps made, by Broyden's rule, and not
+            computed again.
     """
     c, dim = rival.coordinates, rival.dim
     weight = c.precision if center is None else _floor(rival)
-    center = c.center if center is None else center
+    center = np.broadcast_to(c.center if center is None else center, u.shape)
     free = rival.searched
     damping = np.full(len(u), 1e-2)
+    u = u.copy()
 
-    def penalized(r: Array, u: Array) -> Array:
-        return (r**2).sum(1) + ((u - center) ** 2 * weight).sum(1)
+    def penalized(r: Array, at: Array, rows: Array) -> Array:
+        return (r**2).sum(1) + ((at - center[rows]) ** 2 * weight).sum(1)
 
     r, jac = rival.jacobian(u, whiten, step)
-    cost = penalized(r, u)
+    cost = penalized(r, u, np.arange(len(u)))
+    rows = np.arange(len(u))
     for i in range(iterations):
-        normal = np.einsum("nij,nik->njk", jac, jac) + np.diag(weight)
-        gradient = np.einsum("nij,ni->nj", jac, r) + (u - center) * weight
+        part = jac[rows]
+        normal = np.einsum("nij,nik->njk", part, part) + np.diag(weight)
+        gradient = np.einsum("nij,ni->nj", part, r[rows])
+        gradient = gradient + (u[rows] - center[rows]) * weight
         diagonal = np.einsum("njj->nj", normal)
-        lift = damping[:, None] * diagonal + 1e-8
+        lift = damping[rows, None] * diagonal + 1e-8
         system = normal + lift[:, :, None] * np.eye(dim)
         move = np.linalg.solve(system, gradient[..., None])[..., 0]
-        new = np.clip(u - np.where(free, move, 0.0), c.low, c.high)
-        last = i == iterations - 1
-        if last:
-            new_r, new_jac = whiten(rival.residual(new)[0]), jac
-        else:
-            new_r, new_jac = rival.jacobian(new, whiten, step)
-        new_cost = penalized(new_r, new)
-        better = new_cost < cost
-        u, cost = np.where(better[:, None], new, u), np.where(better, new_cost, cost)
-        r = np.where(better[:, None], new_r, r)
-        jac = np.where(better[:, None, None], new_jac, jac)
-        damping = np.where(better, damping * 0.15, damping * 10)
+        new = np.clip(u[rows] - np.where(free, move, 0.0), c.low, c.high)
+        linear = np.einsum("nij,nj->ni", part, new - u[rows])
+        expected = cost[rows] - penalized(r[rows] + linear, new, rows)
+        worth = expected > CONVERGED
+        rows, new, linear = rows[worth], new[worth], linear[worth]
+        if not len(rows):
+            break
+        new_r = whiten(rival.residual(new)[0])
+        new_cost = penalized(new_r, new, rows)
+        if secant:
+            change = new - u[rows]
+            miss = new_r - r[rows] - linear
+            length = np.maximum((change**2).sum(1), 1e-300)[:, None, None]
+            jac[rows] += miss[:, :, None] * change[:, None] / length
+        better = new_cost < cost[rows]
+        won = rows[better]
+        u[won], cost[won], r[won] = new[better], new_cost[better], new_r[better]
+        if len(won) and not secant and i < iterations - 1:
+            _, jac[won] = rival.jacobian(u[won], whiten, step)
+        damping[rows] = damping[rows] * np.where(better, 0.15, 10.0)
     return u, cost

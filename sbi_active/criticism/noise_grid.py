@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.distributions import Distribution
 
 from sbi_active.criticism.errors import NoiseCell, NoiseGrid
 from sbi_active.criticism.measurements import Measurements
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import NoiseModel
+from sbi_active.simulation.noise_posterior import NoisePosterior, SdGrid
 
 __all__ = ["declared_noise", "declared_sds", "scattered"]
 
@@ -34,7 +36,7 @@ def declared_noise(
 
     Along a time axis, noise that says nothing of a correlation has an unknown one: the
     correlation time is log-uniform, or zero. A posterior over the noise's parameters is
-    represented by draws.
+    represented by draws, or summed if it is a grid of a size and a correlation time.
 
     Args:
         noise: The simulator's; None where the simulator is the draw, and its own
@@ -49,6 +51,10 @@ def declared_noise(
         one = np.ones(len(measurements))
         return NoiseGrid(_correlated(measurements, one))
     names = noise.parameter_names
+    if "correlation_time" in names:
+        grid = _product(noise.posterior, measurements)
+        if grid is not None:
+            return grid
     if noise.posterior is None:
         rows = noise.parameters[None]
     else:
@@ -81,6 +87,35 @@ def declared_noise(
         else:
             cells.append(NoiseCell.of(measurements, sd=sd, df=df, log_weight=weight))
     return NoiseGrid(cells)
+
+
+def _product(
+    posterior: Distribution | None, measurements: Measurements
+) -> NoiseGrid | None:
+    """Return the sum over a grid of one standard deviation times a correlation time.
+
+    None unless the posterior is such a grid with independent parts, as one is that
+    stands for noise of unknown size: a few draws of it would miss what the trials tell
+    of the size to some percent.
+    """
+    if not isinstance(posterior, NoisePosterior) or posterior.shared is None:
+        return None
+    sd, shared = posterior.sd, posterior.shared
+    if not isinstance(sd, SdGrid) or sd.num_channels > 1:
+        return None
+    weights = sd.log_weight[:, 0]
+    if not torch.equal(weights, weights[:1].expand_as(weights)):
+        return None
+    nodes = sd.nodes[0]
+    middle = float((weights[0].exp() * nodes.log()).sum().exp())
+    unit = np.full(len(measurements), middle)
+    times = (shared.edges[1:] * shared.edges[:-1]).sqrt().tolist()
+    cells = [
+        NoiseCell.of(measurements, sd=unit, correlation_time=tau, log_weight=w)
+        for tau, w in zip(times, shared.log_weight.tolist(), strict=True)
+    ]
+    scales = (nodes / middle).numpy()
+    return NoiseGrid(cells, scales=scales, log_weights=weights[0].numpy())
 
 
 def declared_sds(noise: NoiseModel) -> torch.Tensor:

@@ -45,7 +45,16 @@ TOO_FEW = 20.0
 #: Nats by which a largest likelihood stays below another model's evidence, so that its
 #: own evidence need not be precise.
 HOPELESS = 30.0
+#: The same, so that its evidence is worth no tempering.
+UNLIKELY = 10.0
+#: Particles and moves of the first cross-check by tempering, and the standard errors
+#: by which it may exceed the evidence before the full number runs.
+FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
+#: Factor on the covariance at a mode of a simulator that jumps.
+ROUGH = 4.0
 NUM_SPREAD = 200
+#: Draws of largest weight, among which the best fit is sought.
+NUM_TOP = 20
 #: Searches that start at posteriors of smaller rivals.
 NUM_NEAR = 8
 
@@ -101,6 +110,7 @@ class RivalSet:
         self.noise = declared_noise(
             model.noise, self.measurements, seed=derive_seed(seed, "noise")
         )
+        self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         self.can_fail = not trials.valid.all() or self.simulator.failed
         self.step, self.is_smooth = probe_step(
@@ -187,13 +197,19 @@ class RivalSet:
         """Return the evidence by tempering, and keep it where it is the larger.
 
         A mode that the least-squares search missed is missing from its evidence, and
-        no effective sample size shows it.
+        no effective sample size shows it. A few particles do the check; where they say
+        more than the evidence, the full number decides.
         """
         rival = self.rival(names, error=error)
         own = self.evidence(names, error=error)
         seed = derive_seed(self.seed, "tempering", rival.name)
         before = self.simulator.num_simulations
-        sample = temper(rival, seed=seed)
+        sample = temper(
+            rival, seed=seed, num_particles=FEW_PARTICLES, num_moves=FEW_MOVES
+        )
+        either = np.hypot(own.standard_error, sample.standard_error)
+        if not sample.log_evidence < own.log_evidence + TOLERATED * either:
+            sample = temper(rival, seed=seed)
         other = self._record(rival, sample, "tempering", before, seed)
         both = float(np.hypot(own.standard_error, other.standard_error))
         if other.log_evidence > own.log_evidence + 2 * both:
@@ -202,33 +218,43 @@ class RivalSet:
         return other
 
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
-        if not self.is_smooth:
-            return temper(rival, seed=seed), "tempering"
         near = self._starts(rival, seed)
-        modes = find_modes(rival, step=self.step, seed=seed, near=near)
+        # Where the simulator jumps, a mode is wider than its derivatives say.
+        widened = 1.0 if self.is_smooth else ROUGH
+        modes = find_modes(rival, step=self.step, seed=seed, near=near, widened=widened)
         rng = np.random.default_rng(seed)
-        hopeless = self._is_hopeless(rival, modes.u)
+        behind = self._behind(rival, modes.u)
+        hopeless = behind > HOPELESS
         sample = importance_sample(
             rival,
             modes.proposal,
             rng=rng,
-            local=lambda: along_ridges(rival, modes, step=self.step, rng=rng),
+            local=lambda points: along_ridges(
+                rival, modes, step=self.step, rng=rng, points=points
+            ),
             enough=1.0 if hopeless else ENOUGH,
         )
-        if hopeless or sample.effective_sample_size >= TOO_FEW:
+        enough = TOO_FEW if behind < UNLIKELY else 0.0
+        if sample.effective_sample_size >= enough:
             return sample, "least squares"
-        return temper(rival, seed=seed), "tempering"
+        other = temper(rival, seed=seed)
+        both = np.hypot(sample.standard_error, other.standard_error)
+        if sample.log_evidence > other.log_evidence + 2 * both:
+            # Particles that lost a ridge do not find it again.
+            return sample, "least squares"
+        return other, "tempering"
 
-    def _is_hopeless(self, rival: Rival, modes: Array) -> bool:
-        """Return whether even the largest likelihood is far below a known evidence.
+    def _behind(self, rival: Rival, modes: Array) -> float:
+        """Return how far even the largest likelihood is below a known evidence, nats.
 
-        An evidence is an average of likelihoods, so that no precision of it matters.
+        An evidence is an average of likelihoods, so that no precision of it matters
+        where it is much.
         """
         if rival.has_noise_effect:  # whose coordinates the search leaves alone
-            return False
+            return -np.inf
         known = [e.log_evidence for e in self.evidences.values()]
         best = max([*known, self.reference])
-        return bool(rival.log_likelihood(modes).max() < best - HOPELESS)
+        return float(best - rival.log_likelihood(modes).max())
 
     def _starts(self, rival: Rival, seed: int) -> Array | None:
         """Return points at posteriors of smaller rivals, the rest from the prior.
@@ -277,7 +303,7 @@ class RivalSet:
         seed: int,
     ) -> Evidence:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
-        best = sample.u[np.argsort(sample.weights)[-20:]]
+        best = sample.u[np.argsort(sample.weights)[-NUM_TOP:]]
         joint = rival.coordinates.joint
         theta_names = self.model.parameter_names
         if theta_names is None:
@@ -300,6 +326,15 @@ class RivalSet:
 
     def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
         """Return mean and deviation of each number before the data, shapes (N,)."""
+        m = simulator.measurements
+        trials = simulator.trials
+        asked = (trials.action, trials.index, trials.sample_times, m.position)
+        key = tuple(None if a is None else np.asarray(a).tobytes() for a in asked)
+        if key not in self._predictives:
+            self._predictives[key] = self._prior_predictive(simulator)
+        return self._predictives[key]
+
+    def _prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
         c = SearchCoordinates(self.prior, (), self.nuisances, len(simulator.trials))
         u = c.sample(NUM_SPREAD, seed=derive_seed(self.seed, "spread"))
         mean, _, _ = simulator.predict(*c.split(u))

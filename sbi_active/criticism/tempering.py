@@ -15,16 +15,21 @@ __all__ = ["temper"]
 
 Array = NDArray[Any]
 
-NUM_PARTICLES = 400
-#: The prior's sample, from which the particles are the first selection.
-NUM_PRIOR = 4 * NUM_PARTICLES
-MOVES = 4
+NUM_PARTICLES, NUM_MOVES = 400, 4
+#: The prior's sample, from which the particles are the first selection, by particle.
+PRIOR_SHARE = 4
 #: Share of the particles that a step of the temperature leaves effective.
 SHARE = 0.5
 MAX_STEPS = 60
 
 
-def temper(rival: Rival, *, seed: int) -> ImportanceSample:
+def temper(
+    rival: Rival,
+    *,
+    seed: int,
+    num_particles: int = NUM_PARTICLES,
+    num_moves: int = NUM_MOVES,
+) -> ImportanceSample:
     r"""Return the evidence and a sample of the posterior.
 
     Particles go from the prior through
@@ -39,18 +44,20 @@ def temper(rival: Rival, *, seed: int) -> ImportanceSample:
     Args:
         rival: The model.
         seed: Of all draws.
+        num_particles: n.
+        num_moves: A temperature; the two kinds take turns.
 
     References:
         Del Moral, Doucet & Jasra, Journal of the Royal Statistical Society B 68 (2006);
         Lee & Whiteley, Biometrika 105 (2018), for the variance.
     """
     rng = np.random.default_rng(seed)
-    u = rival.coordinates.sample(NUM_PRIOR, seed=seed)
+    u = rival.coordinates.sample(PRIOR_SHARE * num_particles, seed=seed)
     log_l = rival.log_likelihood(u)
     log_z, variance, b, width = 0.0, 0.0, 0.0, 2.0 / np.sqrt(rival.dim)
     ancestor = np.arange(len(u))
     for _ in range(MAX_STEPS):
-        step = _step(log_l, 1 - b)
+        step = _step(log_l, 1 - b, SHARE * num_particles)
         log_w = step * log_l
         log_z += log_sum_exp(log_w) - np.log(len(u))
         w = np.exp(log_w - log_sum_exp(log_w))
@@ -58,11 +65,13 @@ def temper(rival: Rival, *, seed: int) -> ImportanceSample:
         mean = w @ u
         cov = (w[:, None] * (u - mean)).T @ (u - mean)
         factor = np.linalg.cholesky(cov + 1e-16 * np.eye(rival.dim))
-        ladder = (rng.uniform() + np.arange(NUM_PARTICLES)) / NUM_PARTICLES
+        ladder = (rng.uniform() + np.arange(num_particles)) / num_particles
         which = np.minimum(np.searchsorted(np.cumsum(w), ladder), len(w) - 1)
         u, log_l, b = u[which], log_l[which], b + step
         ancestor = ancestor[which]
-        u, log_l, width = _move(rival, u, log_l, min(b, 1.0), factor, width, rng)
+        u, log_l, width = _move(
+            rival, u, log_l, min(b, 1.0), factor, width, rng, num_moves
+        )
         if b >= 1 - 1e-12:
             break
     else:
@@ -78,9 +87,8 @@ def temper(rival: Rival, *, seed: int) -> ImportanceSample:
     return ImportanceSample(u, weights, float(log_z), error, distinct)
 
 
-def _step(log_l: Array, most: float) -> float:
-    """Return the longest step of b that leaves enough particles effective."""
-    target = SHARE * NUM_PARTICLES
+def _step(log_l: Array, most: float, target: float) -> float:
+    """Return the longest step of b that leaves so many particles effective."""
 
     def effective(step: float) -> float:
         log_w = step * log_l
@@ -106,11 +114,12 @@ def _move(
     factor: Array,
     width: float,
     rng: np.random.Generator,
+    num_moves: int,
 ) -> tuple[Array, Array, float]:
     """Return moved particles, their log likelihoods, and the adapted step width."""
     n = len(u)
     log_p = rival.log_prior(u)
-    for move in range(MOVES):
+    for move in range(num_moves):
         walk = rng.normal(size=u.shape) @ factor.T
         if move % 2 == 0:
             new = u + width * walk

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sbi_active.criticism.augmented import AugmentedSimulator
 from sbi_active.criticism.measurements import Measurements
+from sbi_active.criticism.simulated_rows import SimulatedRows
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
@@ -22,8 +23,8 @@ Array = NDArray[Any]
 NUM_REPLICATES = 32
 #: Draws with a number from which a mean and a deviation are taken, at least.
 FEWEST = 4
-#: Numbers of x in memory at once.
-CHUNK = 8_000_000
+#: Numbers of x in memory at once, and predicted numbers that are kept.
+CHUNK = KEPT = 8_000_000
 
 
 class TrialSimulator:
@@ -64,6 +65,13 @@ class TrialSimulator:
         self.is_stochastic = model.noise is None
         self.num_simulations, self.failed = 0, False
         self._dtype = torch.float64
+        self._known = SimulatedRows(KEPT)
+        # The scale of a declared noise is no part of the mean.
+        self._of_noise = {
+            e.name
+            for e in model.effects
+            if e.hook == "noise" and not self.is_stochastic
+        }
 
     def __len__(self) -> int:
         return len(self.trials)
@@ -82,6 +90,18 @@ class TrialSimulator:
             deviation, shape (n, N), None where the noise is declared; the probability
             that each trial has an outcome, shape (n, t).
         """
+        names = [name for name in phi if name not in self._of_noise]
+        columns = [theta, *[phi[name].reshape(len(theta), -1) for name in names]]
+        rows = torch.cat([part.double() for part in columns], 1).numpy()
+
+        def simulate(at: Array) -> tuple[Array, Array | None, Array]:
+            return self._predict_all(theta[at], {k: p[at] for k, p in phi.items()})
+
+        return self._known.get(names, rows, simulate)
+
+    def _predict_all(
+        self, theta: Tensor, phi: dict[str, Tensor]
+    ) -> tuple[Array, Array | None, Array]:
         m = self.measurements
         repeats = NUM_REPLICATES if self.is_stochastic else 1
         size = max(1, int(np.prod(m.shape)) * repeats)
