@@ -84,6 +84,24 @@ class Belief(Distribution, ABC):
         log_prob = torch.where(inside, self._log_prob(rows).float(), -torch.inf)
         return log_prob.reshape(theta.shape[:-1])
 
+    def smooth_log_prob(self, value: Tensor) -> Tensor:
+        """Return a log density that costs no simulations, for many places.
+
+        Args:
+            value: Shape (..., theta_dim).
+
+        Returns:
+            Shape (...), float32; :meth:`log_prob` but for beliefs that simulate that.
+        """
+        theta = torch.as_tensor(value, dtype=torch.float32)
+        rows = theta.reshape(-1, theta.shape[-1])
+        inside = within_support(self.prior, rows)
+        log_prob = self._smooth_log_prob(rows).float()
+        return torch.where(inside, log_prob, -torch.inf).reshape(theta.shape[:-1])
+
+    def _smooth_log_prob(self, theta: Tensor) -> Tensor:
+        return self._log_prob(theta)
+
     @cached_property
     def _moments(self) -> tuple[Tensor, Tensor]:
         with forked_generators(0):  # the same belief, the same moments
@@ -230,8 +248,10 @@ def information_gained(
     """
     with forked_generators(seed):
         theta = belief.sample((num_samples,))
-    gain = belief.log_prob(theta).double() - previous.log_prob(theta).double()
-    return float(gain.mean())
+    after, before = (
+        getattr(b, "smooth_log_prob", b.log_prob)(theta) for b in (belief, previous)
+    )
+    return float((after.double() - before.double()).mean())
 
 
 def parameter_dim(prior: Distribution) -> int:

@@ -16,6 +16,8 @@ from torch.distributions import Distribution
 from sbi_active.inference.belief import require_support
 from sbi_active.inference.comparison import compare_orders
 from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.exact_belief import ExactBelief
+from sbi_active.inference.exact_refinement import ExactRecord, refine_exactly
 from sbi_active.inference.histories import Histories, HistoryRecord
 from sbi_active.inference.outcome_checks import check_outcomes
 from sbi_active.inference.population import (
@@ -33,8 +35,13 @@ from sbi_active.inference.regions import (
     cover,
     whole_space,
 )
+from sbi_active.inference.simulated_likelihood import (
+    MeanTable,
+    SimulatedLikelihood,
+    declares_noise,
+)
 from sbi_active.inference.surrogate import Surrogate
-from sbi_active.inference.trust import Course, Stage, diagnose
+from sbi_active.inference.trust import SERIOUS_MISFIT, Course, Stage, diagnose
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 from sbi_active.threads import single_thread
@@ -43,6 +50,7 @@ __all__ = ["Refinement", "refine"]
 
 Array = NDArray[Any]
 
+HALF = 0.5  # of the budget, after which misfit is taken to stay
 MIN_STAGE = 60  # histories below which another stage adds nothing
 
 
@@ -69,7 +77,8 @@ class Refinement:
         max_regions: Ellipsoids at most, but for splits against misfit.
         check_order: Refine a second time, with the trials in reverse and new
             simulations, and report the divergence between the two: what the order and
-            the draws contribute. It doubles the cost.
+            the draws contribute. It doubles the cost. A simulated likelihood has no
+            order and no such check.
         num_workers: Of the simulations, see :func:`~sbi_active.simulation.simulate`.
         time_limit: Seconds a simulated row may take; None waits for ever.
         num_retries: How often a row that a fault lost is tried again. A history of
@@ -116,7 +125,7 @@ def refine(
     past: HistoryRecord | None = None,
     settings: Refinement | None = None,
     seed: int,
-) -> RefinedBelief:
+) -> RefinedBelief | ExactBelief:
     r"""Return the posterior of all trials given the original prior.
 
     Stage by stage, over the whole prior and then in ellipsoids around what is still
@@ -126,6 +135,12 @@ def refine(
     (:func:`~sbi_active.inference.population.population_monte_carlo`), and put new
     ellipsoids around the sample. It ends when the residuals are pure noise and a stage
     changes nothing, or when the budget is spent.
+
+    Misfit that stays, as of a response that jumps, is no noise. Where the simulator is
+    noise-free beside a declared noise, a simulation gives the likelihood itself, and
+    the posterior is then sampled with that
+    (:func:`~sbi_active.inference.importance.importance_sample`), from the learned
+    posterior or from the draws of the earlier call.
 
     A trial without a measurement counts by the probability of having none, one that was
     partly observed by the numbers that were (:mod:`~sbi_active.inference.validity`).
@@ -165,20 +180,35 @@ def refine(
     """
     prior = require_support(prior)
     settings = Refinement() if settings is None else settings
-    action, observed = _trials(action, x)
+    action, outcome = _trials(action, x)
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
     with single_thread():
-        belief = _refine(
-            simulator, prior, action, observed, hints, past, settings, seed
-        )
-        if settings.check_order:
+        belief = None
+        if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
+            past.table.engine = _engine(settings)
+            belief = refine_exactly(
+                prior,
+                SimulatedLikelihood(past.table, action, outcome),
+                past.coordinates,
+                first=[],
+                histories=past,
+                pool=past.pool,
+                num_histories=settings.num_histories,
+                defensive=settings.defensive,
+                seed=seed,
+            )
+        if belief is None:
+            belief = _refine(
+                simulator, prior, action, outcome, hints, past, settings, seed
+            )
+        if settings.check_order and isinstance(belief, RefinedBelief):
             other_seed = derive_seed(seed, "reversed")
             other = _refine(
                 simulator,
                 prior,
                 action.flip(0),
-                observed[::-1],
+                outcome.flip(0),
                 hints,
                 None,
                 settings,
@@ -192,19 +222,15 @@ def _refine(
     simulator: Callable[..., Any],
     prior: Distribution,
     action: Tensor,
-    observed: Array,
+    outcome: Tensor,
     hints: Sequence[Distribution],
     past: HistoryRecord | None,
     settings: Refinement,
     seed: int,
-) -> RefinedBelief:
+) -> RefinedBelief | ExactBelief:
     rng = np.random.default_rng(derive_seed(seed, "refine"))
     coordinates = PriorCoordinates(prior, rng)
-    engine = {
-        "num_workers": settings.num_workers,
-        "time_limit": settings.time_limit,
-        "num_retries": settings.num_retries,
-    }
+    observed, engine = outcome.numpy().reshape(len(outcome), -1), _engine(settings)
     histories = Histories(simulator, action, observed, coordinates, seed, past, engine)
 
     regions = [whole_space(coordinates.dim)]
@@ -243,6 +269,11 @@ def _refine(
         course.append(stage)
         if is_last or course.is_settled:
             break
+        is_rough = stage.excess > SERIOUS_MISFIT
+        if is_rough and histories.num_drawn >= HALF * settings.num_histories:
+            few = coordinates.to_theta(stage.draws[:8])
+            if declares_noise(simulator, few, action[:1].expand(8, -1)):
+                break
         num_forced = (
             min(2 * max(num_forced, len(regions)), 32)
             if (course.is_stuck)
@@ -259,6 +290,29 @@ def _refine(
         base = RegionsProposal(regions)
         mixture = GaussianMixture.fit(particles.resample(800, rng), 6, rng)
         first = StudentProposal(mixture, base)
+
+    if stage.excess > SERIOUS_MISFIT:
+        few = coordinates.to_theta(stage.draws[:8])
+        if declares_noise(simulator, few, action[:1].expand(8, -1)):
+            table = MeanTable(simulator, engine)
+            count = settings.num_histories // 4
+            exact = refine_exactly(
+                prior,
+                SimulatedLikelihood(table, action, outcome),
+                coordinates,
+                first=[
+                    (count, PriorProposal(coordinates)),
+                    (count, particles.proposal),
+                ],
+                histories=histories.record(),
+                pool=None,
+                num_histories=settings.num_histories,
+                defensive=settings.defensive,
+                seed=seed,
+            )
+            if exact is not None:
+                exact.diagnostics["num_simulations"] += histories.num_simulations
+                return exact
 
     diagnostics = diagnose(
         course,
@@ -284,6 +338,14 @@ def _refine(
             stacklevel=3,
         )
     return belief
+
+
+def _engine(settings: Refinement) -> dict[str, Any]:
+    return {
+        "num_workers": settings.num_workers,
+        "time_limit": settings.time_limit,
+        "num_retries": settings.num_retries,
+    }
 
 
 def _stage_size(settings: Refinement, used: int) -> int:
@@ -322,7 +384,7 @@ def _simulate_stage(
         histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
 
 
-def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Array]:
+def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     action, x = torch.as_tensor(action), torch.as_tensor(x)
     if action.ndim != 2 or x.ndim < 1 or len(action) != len(x) or len(action) == 0:
         raise ValueError(
@@ -330,4 +392,4 @@ def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Array]:
             f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; do stack "
             "the trials along axis 0"
         )
-    return action.float().cpu(), x.double().cpu().numpy().reshape(len(x), -1)
+    return action.float().cpu(), x.double().cpu().reshape(len(x), *x.shape[1:] or (1,))

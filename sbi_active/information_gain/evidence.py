@@ -168,7 +168,8 @@ def log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tenso
         inside = torch.ones(len(theta)).bool()
     log_b = torch.full((len(z),), -torch.inf).double()
     if bool(inside.any()):
-        log_b[inside] = belief.log_prob(theta[inside]).double()
+        density = getattr(belief, "smooth_log_prob", belief.log_prob)
+        log_b[inside] = density(theta[inside]).double()
     return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
 
 

@@ -58,7 +58,8 @@ class PosteriorGain(InformationGainEstimator):
         simulations: CandidateSimulations,
         belief: Distribution,
     ) -> Tensor:
-        log_p = belief.log_prob(simulations.theta)
+        density = getattr(belief, "smooth_log_prob", belief.log_prob)
+        log_p = density(simulations.theta)
         gains = []
         for x in simulations.outcomes():
             theta, action = simulations.rows()

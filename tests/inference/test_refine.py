@@ -13,6 +13,7 @@ from sbi.utils import BoxUniform, MultipleIndependent
 from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import (
+    Distribution,
     Gamma,
     Independent,
     LogNormal,
@@ -51,7 +52,7 @@ def observe(simulator, theta: Tensor, action: Tensor, seed: int) -> Tensor:
         return simulator(theta.double().expand(len(action), -1), action.double())
 
 
-def draws(belief: RefinedBelief, num: int, seed: int = 0) -> Tensor:
+def draws(belief: Distribution, num: int, seed: int = 0) -> Tensor:
     with forked_generators(seed):
         return belief.sample((num,))
 
@@ -77,7 +78,9 @@ def linear() -> tuple[RefinedBelief, Tensor, Tensor]:
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
     simulator = numerical()
     x = observe(simulator, torch.tensor([[-3.0, 1.0]]), action, 0)
-    return refine(simulator, BOX, action, x, seed=0), action, x
+    belief = refine(simulator, BOX, action, x, seed=0)
+    assert isinstance(belief, RefinedBelief)
+    return belief, action, x
 
 
 def test_linear_gaussian_closed_form():

@@ -1,0 +1,276 @@
+"""Posteriors of a response that jumps, against integrals over a fine grid."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.exact_belief import ExactBelief
+from sbi_active.inference.importance import importance_sample
+from sbi_active.inference.kernels import KernelProposal
+from sbi_active.inference.refine import Refinement, refine
+from sbi_active.inference.refined_belief import RefinedBelief
+from sbi_active.inference.regions import PriorProposal
+from sbi_active.inference.simulated_likelihood import (
+    MeanTable,
+    SimulatedLikelihood,
+    declares_noise,
+)
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.simulation.outcomes import MissingRowsWarning
+
+BOX = BoxUniform(-torch.ones(2), torch.ones(2))
+SD, CELL = 0.02, 0.02
+ACTION = torch.tensor([[0.3], [1.0], [0.6]])
+TRUTH = torch.tensor([[0.31, -0.42]])
+FEW = Refinement(num_histories=1_200)
+
+
+def jumping(theta: Tensor, action: Tensor) -> Tensor:
+    """A plane, and in each cell a step of its own, of three noise deviations."""
+    theta, action = theta.double(), action.double()
+    cell = torch.floor(theta / CELL)
+    phase = 12.9898 * cell[:, :1] + 78.233 * cell[:, 1:] + 37.719 * action
+    step = (torch.sin(phase) * 43758.5453) % 1.0 - 0.5
+    plane = theta[:, :1] * torch.cos(action) + theta[:, 1:] * torch.sin(action)
+    return plane + 3 * SD * math.sqrt(12) * step
+
+
+def smooth(theta: Tensor, action: Tensor) -> Tensor:
+    return theta[:, :1] * torch.cos(action) + theta[:, 1:] * torch.sin(action)
+
+
+def half(theta: Tensor, action: Tensor) -> Tensor:
+    """No measurement on the left."""
+    x = jumping(theta, action)
+    return torch.where(theta[:, :1] < 0.3, torch.nan, x)
+
+
+@pytest.fixture
+def model() -> SimulatorModel:
+    return SimulatorModel(jumping, noise=GaussianNoise(SD))
+
+
+def observe(model: SimulatorModel, seed: int) -> Tensor:
+    with forked_generators(seed):
+        return model(TRUTH.expand(len(ACTION), -1), ACTION).double()
+
+
+def grid_evidence(model: SimulatorModel, action: Tensor, x: Tensor) -> float:
+    """Midpoints of a grid of .004, on which the likelihood is smooth in each cell."""
+    axis = (torch.arange(500).double() + 0.5) / 250 - 1
+    theta = torch.cartesian_prod(axis, axis)
+    log_likelihood = torch.zeros(len(theta)).double()
+    for a, each in zip(action, x, strict=True):
+        shape = len(theta), 1
+        log_likelihood += model.log_prob(each.expand(shape), theta, a.expand(shape))
+    return float(log_likelihood.logsumexp(0)) - math.log(len(theta))
+
+
+def sampled(model: SimulatorModel, x: Tensor, count: int, seed: int = 0, past=None):
+    coordinates = PriorCoordinates(BOX, np.random.default_rng(0))
+    table = MeanTable(model, {})
+    likelihood = SimulatedLikelihood(table, ACTION[:count], x[:count])
+    base = PriorProposal(coordinates)
+    pool = importance_sample(
+        likelihood,
+        coordinates,
+        np.random.default_rng(seed),
+        first=[(1_000, base)],
+        base=base,
+        past=past,
+        num_simulations=9_000,
+        num_draws=500,
+    )
+    return likelihood, pool
+
+
+def test_kernels_are_normalized_and_match_their_draws():
+    rng = np.random.default_rng(0)
+    base = PriorProposal(PriorCoordinates(BOX, rng))
+    z = 0.2 * rng.standard_normal((300, 2)) @ np.array([[1.0, 0.9], [0.0, 0.1]])
+    kernels = KernelProposal.around(z, np.full(300, 1 / 300), base, rng)
+    draws = kernels.sample(10_000, rng)
+    wide = rng.uniform(-3, 3, (40_000, 2))  # the Student tails reach beyond the box
+    value = 36 * np.exp(kernels.log_prob(wide))
+    error = value.std() / math.sqrt(len(value))
+    assert value.mean() == pytest.approx(1.0, abs=4 * error + 0.01)
+    inside = (np.abs(draws) < 0.1).all(1)
+    near = (np.abs(wide) < 0.1).all(1)
+    expected = (value * near).mean()
+    error = (value * near).std() / math.sqrt(len(value))
+    assert inside.mean() == pytest.approx(expected, abs=4 * (error + 0.005))
+
+
+def test_the_likelihood_is_the_noise_around_the_mean(model: SimulatorModel):
+    x = observe(model, 0)
+    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    theta = BOX.sample((50,))
+    exact = torch.zeros(50).double()
+    for k in range(3):
+        exact += model.log_prob(x[k].expand(50, 1), theta, ACTION[k].expand(50, 1))
+    assert not likelihood.knows(theta).any()
+    value = likelihood(theta)
+    # Means come as float32, of size 1 with a relative error of 6e-8 and noise .02.
+    assert value == pytest.approx(exact.numpy(), rel=1e-3, abs=1e-3)
+    assert likelihood.knows(theta).all()
+    count = likelihood.table.num_simulations
+    assert count == 150
+    floor = float(np.median(value))
+    reaches = np.isfinite(likelihood(theta, floor=floor - 1e-6))
+    assert (reaches == (value >= floor - 1e-6)).all()
+    assert likelihood.table.num_simulations == count
+
+
+def test_hopeless_rows_are_not_simulated_further(model: SimulatorModel):
+    x = observe(model, 0)
+    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    likelihood(BOX.sample((200,)), floor=float(likelihood.peak.sum()) - 25)
+    assert likelihood.table.num_simulations < 0.6 * 600
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_evidence_is_that_of_a_fine_grid(model: SimulatorModel, seed: int):
+    x = observe(model, seed)
+    pool = None
+    for count in (1, 3):
+        exact = grid_evidence(model, ACTION[:count], x[:count])
+        _, scratch = sampled(model, x, count, seed)
+        _, pool = sampled(model, x, count, seed, past=pool)
+        for each in (scratch, pool):
+            effective = each.effective_sample_size
+            assert effective > 20
+            assert each.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
+
+
+def test_draws_follow_the_posterior_and_not_its_smooth_part(model: SimulatorModel):
+    x = observe(model, 1)
+    likelihood, pool = sampled(model, x, 3, 1)
+    rows = np.random.default_rng(0).choice(len(pool.z), size=2_000, p=pool.weight)
+    theta = torch.from_numpy(pool.z[rows]).float()
+    # Each observed number is one deviation of the noise from the mean, on average; for
+    # draws of the plane alone it would be sqrt(1 + 3^2).
+    residual = np.stack(
+        [likelihood.table.mean(theta, ACTION[k])[0] - x[k].numpy() for k in range(3)]
+    )
+    assert math.sqrt((residual**2).mean()) < 1.8 * SD
+
+
+def test_a_jumping_response_is_refined_exactly(model: SimulatorModel):
+    gaps, learned = [], []
+    for seed in range(2):
+        x = observe(model, seed)
+        exact = grid_evidence(model, ACTION, x)
+        score = model.log_prob(x, TRUTH.expand(3, -1), ACTION).sum() - exact
+        score = float(score) - math.log(4)  # the prior's density
+        belief = refine(model, BOX, ACTION, x, settings=FEW, seed=seed)
+        assert isinstance(belief, ExactBelief)
+        gaps.append(score - float(belief.log_prob(TRUTH)))
+        hidden = refine(model.__call__, BOX, ACTION, x, settings=FEW, seed=seed)
+        assert isinstance(hidden, RefinedBelief)
+        learned.append(score - float(hidden.log_prob(TRUTH)))
+    # 60 effective draws leave a standard error of .13.
+    assert max(map(abs, gaps)) < 0.5
+    assert np.mean(learned) > 1.0  # the learned likelihood is that far behind
+
+
+def test_a_smooth_response_is_refined_as_without_a_declaration():
+    model = SimulatorModel(smooth, noise=GaussianNoise(SD))
+    x = observe(model, 0)
+    belief = refine(model, BOX, ACTION, x, settings=FEW, seed=0)
+    hidden = refine(model.__call__, BOX, ACTION, x, settings=FEW, seed=0)
+    assert isinstance(belief, RefinedBelief)
+    theta = BOX.sample((100,))
+    assert torch.equal(belief.log_prob(theta), hidden.log_prob(theta))
+
+
+def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):
+    x = observe(model, 2)
+    first = refine(model, BOX, ACTION[:2], x[:2], settings=FEW, seed=0)
+    second = refine(model, BOX, ACTION, x, past=first.histories, settings=FEW, seed=1)
+    assert isinstance(second, ExactBelief)
+    assert second.diagnostics["trustworthy"], second.diagnostics["warnings"]
+    assert second.diagnostics["num_stages"] > first.diagnostics["num_stages"]
+    exact = grid_evidence(model, ACTION, x)
+    assert second.diagnostics["log_evidence"] == pytest.approx(exact, abs=0.5)
+
+    # Draws of the second were simulated at the first's actions, and are free there.
+    with forked_generators(0):
+        theta = second.sample((500,))
+    table = second.histories.table  # pyright: ignore
+    count = table.num_simulations
+    assert bool(first.log_prob(theta).isfinite().all())
+    second.log_prob(theta)
+    assert table.num_simulations - count <= 2  # a draw of the prior's share
+
+    corrected = x.clone()
+    corrected[0] += 0.1
+    assert not second.histories.leads_to(model, ACTION, corrected)  # pyright: ignore
+
+
+def test_a_smooth_density_costs_no_simulations(model: SimulatorModel):
+    x = observe(model, 0)
+    belief = refine(model, BOX, ACTION, x, settings=FEW, seed=0)
+    assert isinstance(belief, ExactBelief)
+    table = belief.histories.table  # pyright: ignore
+    count = table.num_simulations
+    theta = BOX.sample((4_000,))
+    smooth = belief.smooth_log_prob(theta).double()
+    assert table.num_simulations == count
+    # Normalized over the box, of area 4, to three standard errors of the mean.
+    error = 3 * float(smooth.exp().std()) / 4_000**0.5
+    assert float(smooth.exp().mean()) == pytest.approx(1 / 4, abs=error)
+    loaded = pickle.loads(pickle.dumps(belief))
+    assert torch.equal(loaded.log_prob(TRUTH), belief.log_prob(TRUTH))
+
+
+def test_trials_without_a_measurement_count():
+    model = SimulatorModel(half, noise=GaussianNoise(SD))
+    x = torch.full((3, 1), torch.nan).double()
+    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    theta = BOX.sample((100,))
+    left = (theta[:, 0] < 0.3).numpy()
+    assert (likelihood(theta) == np.where(left, 0.0, -np.inf)).all()
+    x = observe(model, 0)  # the truth lies just on the right
+    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    assert (np.isfinite(likelihood(theta)) == ~left).all()
+
+
+@pytest.mark.slow
+def test_a_fault_loses_its_draw_alone(model: SimulatorModel):
+    def failing(theta: Tensor, action: Tensor) -> Tensor:
+        if bool((theta[:, 1] > 0.9).any()):
+            raise RuntimeError("diverged")
+        return jumping(theta, action)
+
+    faulty = SimulatorModel(failing, noise=GaussianNoise(SD))
+    x = observe(model, 0)
+    with pytest.warns(MissingRowsWarning):
+        belief = refine(faulty, BOX, ACTION, x, settings=FEW, seed=0)
+    assert isinstance(belief, ExactBelief)
+    assert belief.diagnostics["num_missing"] > 0
+    assert belief.diagnostics["log_evidence"] == pytest.approx(
+        grid_evidence(model, ACTION, x), abs=0.5
+    )
+
+
+def test_only_declared_noise_beside_a_function_is_exact(model: SimulatorModel):
+    theta, action = BOX.sample((8,)), ACTION[:1].expand(8, -1)
+    assert declares_noise(model, theta, action)
+    assert not declares_noise(model.__call__, theta, action)
+    assert not declares_noise(SimulatorModel(jumping), theta, action)
+    assert not declares_noise(
+        SimulatorModel(jumping, noise=GaussianNoise(0.0)), theta, action
+    )
+    random = SimulatorModel(
+        lambda t, a: t[:, :1] + torch.randn(len(t), 1), noise=GaussianNoise(SD)
+    )
+    assert not declares_noise(random, theta, action)
