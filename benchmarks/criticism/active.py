@@ -64,7 +64,7 @@ def score_active(case: Case, number: int) -> list[dict[str, object]]:
                 else:
                     criticism, scores = shared
                 if policy == "chosen" and num < len(every):
-                    following = criticism.next_action().action
+                    following = criticism.next_action(beyond=False).action
             except Exception as error:  # a crash is a result of the benchmark
                 rows[-1]["failure"] = f"{type(error).__name__}: {error}"[:300]
                 break

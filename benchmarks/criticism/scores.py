@@ -70,6 +70,7 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
             effects=problem.effects,
             actions=problem.actions,
             seed=number,
+            plan=False,  # no table needs it but that of active choice
         )
     except Exception as error:  # a crash is a result of the benchmark
         return row | {"failure": f"{type(error).__name__}: {error}"[:300]}

@@ -168,7 +168,7 @@ def _model_design(criticism: Criticism, actions: ActionSpace) -> Design | None:
         predict the same.
     """
     spent = criticism.rivals.simulator.num_simulations
-    found = criticism.next_action(actions)
+    found = criticism.next_action(actions, beyond=False)
     if found.action is None:
         return None
     candidates = torch.as_tensor(found.candidates).float()

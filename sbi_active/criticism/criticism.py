@@ -178,11 +178,15 @@ class Criticism:
         model = AugmentedSimulator(self.model, added, next_index=index)
         return model, joint_prior(self.prior, added)
 
-    def next_action(self, actions: ActionSpace | None = None) -> NextAction:
+    def next_action(
+        self, actions: ActionSpace | None = None, *, beyond: bool = True
+    ) -> NextAction:
         """Return the action whose outcome tells most about which rival is right.
 
         Args:
             actions: None takes those of the constructor.
+            beyond: Whether to name one that is not permitted where rivals are
+                separated by no other.
         """
         space = self.actions if actions is None else actions
         if space is None:
@@ -190,7 +194,7 @@ class Criticism:
                 "expected the permitted actions; got None; do give "
                 "next_action(actions) or Criticism(actions=...)"
             )
-        return choose_action(self.rivals, self.trace(), space)
+        return choose_action(self.rivals, self.trace(), space, beyond=beyond)
 
     def evaluate(self) -> Evaluation | None:
         """Return the error before and after, on held-out trials where there are any.
@@ -217,6 +221,7 @@ class Criticism:
         self,
         *,
         evaluate: bool = True,
+        plan: bool = True,
         designed: bool = False,
         exploratory: bool = False,
     ) -> Report:
@@ -225,6 +230,7 @@ class Criticism:
         Args:
             evaluate: Without held-out trials the error costs one verdict a trial; False
                 leaves it out.
+            plan: Name the next action, which takes about as long as the verdict.
             designed: The trials' actions were chosen for their information, of which
                 the report then warns.
             exploratory: Library or priors were changed after the data were seen, of
@@ -235,6 +241,7 @@ class Criticism:
 
         tracing = self.trace()
         simulator, prior = self.add()
+        skipped = self.actions is None or not plan
         after = None
         if tracing.verdict != NONE:
             error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
@@ -248,7 +255,7 @@ class Criticism:
             simulator=simulator,
             prior=prior,
             evaluation=self.evaluate() if evaluate else None,
-            next_action=None if self.actions is None else self.next_action(),
+            next_action=None if skipped else self.next_action(),
             actions=self.actions,
             digest=self.digest,
             designed=designed,
@@ -277,6 +284,7 @@ def close_loop(
     summaries: int | None = None,
     seed: int = 0,
     evaluate: bool = True,
+    plan: bool = True,
     designed: bool = False,
 ) -> Report:
     """Find the residual, trace it to an effect, add it, and report the error.
@@ -290,6 +298,7 @@ def close_loop(
         summaries: As in :class:`Criticism`.
         seed: Of all draws.
         evaluate: As in :meth:`Criticism.report`.
+        plan: As in :meth:`Criticism.report`.
         designed: As in :meth:`Criticism.report`.
     """
     return Criticism(
@@ -300,4 +309,4 @@ def close_loop(
         actions=actions,
         summaries=summaries,
         seed=seed,
-    ).report(evaluate=evaluate, designed=designed)
+    ).report(evaluate=evaluate, plan=plan, designed=designed)

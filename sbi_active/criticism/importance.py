@@ -128,7 +128,9 @@ def importance_sample(
         Cappe et al., Statistics and Computing 18 (2008); Cornuet et al., Scandinavian
         Journal of Statistics 39 (2012).
     """
-    proposals, parts, targets = [], [], []
+    proposals: list[TMixture] = []
+    particles, targets = np.empty((0, proposal.means.shape[1])), np.empty(0)
+    log_q = np.empty(0)  # of each particle, summed over the proposals so far
     basis = proposal
     for i in range(MAX_ROUNDS):
         u = proposal.sample(ROUND, rng)
@@ -136,10 +138,12 @@ def importance_sample(
         inside = np.isfinite(target)
         if inside.any():
             target[inside] += rival.log_likelihood(u[inside])
+        own = [q.log_prob(u) for q in [*proposals, proposal]]
+        log_q = np.logaddexp(log_q, proposal.log_prob(particles))
+        log_q = np.append(log_q, log_sum_exp(np.stack(own), axis=0))
         proposals.append(proposal)
-        parts.append(u)
-        targets.append(target)
-        sample = _weighted(parts, targets, proposals)
+        particles, targets = np.concatenate([particles, u]), np.append(targets, target)
+        sample = _weighted(particles, targets, log_q - np.log(len(proposals)))
         if sample.effective_sample_size >= enough:
             break
         missed = sample.effective_sample_size < MISSED
@@ -151,12 +155,8 @@ def importance_sample(
     return sample
 
 
-def _weighted(
-    parts: list[Array], targets: list[Array], proposals: list[TMixture]
-) -> ImportanceSample:
-    u, target = np.concatenate(parts), np.concatenate(targets)
-    log_q = log_sum_exp(np.stack([q.log_prob(u) for q in proposals]), axis=0)
-    log_w = target - (log_q - np.log(len(proposals)))
+def _weighted(u: Array, target: Array, log_q: Array) -> ImportanceSample:
+    log_w = target - log_q
     total = log_sum_exp(log_w)
     n = len(u)
     if not np.isfinite(total):

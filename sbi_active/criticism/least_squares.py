@@ -19,7 +19,7 @@ Array = NDArray[Any]
 
 #: Starts of a search, among them so many points near smaller rivals' posteriors and
 #: the best of so many draws of the prior.
-NUM_STARTS, MOST_NEAR, NUM_SCREENED, NUM_BEST = 14, 6, 64, 4
+NUM_STARTS, MOST_NEAR, NUM_SCREENED, NUM_BEST = 20, 6, 128, 6
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
@@ -30,7 +30,7 @@ FLAT = 0.3
 RETURN = 5
 #: Iterations of the first phase in two halves and of each later phase, starts that go
 #: on after either half, and later phases at least and at most.
-EARLY, LATE, NUM_KEPT, PHASES = (2, 3), 4, (8, 4), (2, 10)
+EARLY, LATE, NUM_KEPT, PHASES = (3, 3), 4, (10, 6), (2, 10)
 #: Coordinates within which two points count as the same, early and late.
 NEAR_MODE, SAME_MODE = 0.05, 0.02
 #: Expected fall of a sum of squares that is worth no further iteration.

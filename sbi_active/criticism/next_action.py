@@ -31,6 +31,8 @@ MAX_RIVALS = 8
 #: Information below which no action is worth a trial, nats.
 NOTHING = 0.02
 MAX_CANDIDATES = 64
+#: The same beyond the permitted range, where the best is not asked for.
+MAX_OUTSIDE = 24
 #: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
 #: three quarters fit a density, which needs some tens.
 SAMPLES_PER_RIVAL = 160
@@ -110,7 +112,7 @@ class PredictedRival:
 
 
 def choose_action(
-    rivals: RivalSet, tracing: Tracing, actions: ActionSpace
+    rivals: RivalSet, tracing: Tracing, actions: ActionSpace, *, beyond: bool = True
 ) -> NextAction:
     r"""Return the action of the largest information about the model index.
 
@@ -123,6 +125,7 @@ def choose_action(
         rivals: The models.
         tracing: Their probabilities.
         actions: The permitted ones.
+        beyond: Whether to try others where these separate nothing.
     """
     if isinstance(actions, DiscreteActions) and len(actions) <= MAX_CANDIDATES:
         candidates = actions.values
@@ -151,6 +154,8 @@ def choose_action(
         groups = [frozenset(named)]
     groups = [g for g in groups if len(g) > 1]
     found = replace(found, inseparable=(*groups,))
+    if not beyond:
+        return found
     return _look_outside(rivals, found, groups, actions, candidates)
 
 
@@ -164,7 +169,7 @@ def _look_outside(
     """Return the choice with an action that is not permitted, if one separates."""
     if not groups:
         return found
-    others = outside_candidates(actions, candidates, limit=MAX_CANDIDATES)
+    others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
     others = _simulated(rivals, others)
     if len(others) == 0:
         return found

@@ -21,7 +21,9 @@ BLOCK = 2**22  # numbers at once
 LogDensities = Callable[[Tensor], Tensor]
 
 
-def class_members(x: Tensor, label: Tensor, enough: Tensor) -> list[LogDensities]:
+def class_members(
+    x: Tensor, label: Tensor, enough: Tensor, *, kernels: bool = True
+) -> list[LogDensities]:
     """Fit relative densities of each class, in several ways.
 
     In this order: none; Gaussians with a common covariance; Gaussians with one each,
@@ -32,6 +34,7 @@ def class_members(x: Tensor, label: Tensor, enough: Tensor) -> list[LogDensities
         label: Class, shape (n,).
         enough: Whether a class has rows enough for a density, shape (k,), bool; where
             one has not, only the first is fitted.
+        kernels: Whether to fit kernel densities, the dearest ones.
 
     Returns:
         Functions of outcomes (m, q) that give log densities up to what is common to
@@ -59,12 +62,9 @@ def class_members(x: Tensor, label: Tensor, enough: Tensor) -> list[LogDensities
         lambda new: _log_gaussians(new, mean, common.expand_as(shrunk)),
         lambda new: _log_gaussians(new, mean, shrunk),
     ]
-    for factor in BANDWIDTHS:
+    for factor in BANDWIDTHS if kernels else ():
         densities.append(lambda new, f=factor: _log_kernels(new, rows, shrunk, f, d))
-    for density in densities:
-        for power in TEMPERATURES:
-            members.append(lambda new, f=density, b=power: b * f(reduce(new)))
-    return members
+    return members + [lambda new, f=density: f(reduce(new)) for density in densities]
 
 
 def _discriminating(

@@ -15,7 +15,7 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
-from sbi_active.information_gain.class_density import class_members
+from sbi_active.information_gain.class_density import TEMPERATURES, class_members
 from sbi_active.information_gain.cross_fitting import cross_fit, patterns_of_numbers
 from sbi_active.information_gain.noise_kernels import MOST_NUMBERS, noise_members
 from sbi_active.seeding import derive_seed
@@ -308,14 +308,18 @@ def _score(
         log_prior = log_p + log_shares(train)
         count = torch.bincount(own[train], minlength=num_models)
         enough = count >= FEW
-        members = class_members(x[train], own[train], enough)
+        narrow = []
         if noise is not None:
             center, width = (part[train] for part in noise)
-            members += noise_members(center, width, own[train], enough)
+            narrow = noise_members(center, width, own[train], enough)
+        wide = class_members(x[train], own[train], enough, kernels=not narrow)
         scores = []
-        for member in members:
-            log_q = (log_prior + member(x[test])).log_softmax(1)
-            scores.append(log_q[torch.arange(len(test)), own[test]] - log_p[own[test]])
+        for member in [*wide, *narrow]:
+            log_f = member(x[test])
+            for power in TEMPERATURES:
+                log_q = (log_prior + power * log_f).log_softmax(1)
+                log_q = log_q[torch.arange(len(test)), own[test]]
+                scores.append(log_q - log_p[own[test]])
         return torch.stack(scores)
 
     return cross_fit(score, block[rows], log_p.exp()[own])

@@ -20,7 +20,7 @@ import math
 import torch
 from torch import Tensor
 
-from sbi_active.information_gain.class_density import TEMPERATURES, LogDensities
+from sbi_active.information_gain.class_density import LogDensities
 
 __all__ = ["MOST_NUMBERS", "noise_members"]
 
@@ -54,12 +54,9 @@ def noise_members(
     members: list[LogDensities] = []
     for factor in FACTORS:
         mixtures = [_NoiseKernels(m, s, factor) for m, s in classes]
-        for power in TEMPERATURES:
-            members.append(
-                lambda new, parts=mixtures, b=power: (
-                    b * torch.stack([part(new) for part in parts], 1)
-                )
-            )
+        members.append(
+            lambda new, parts=mixtures: torch.stack([part(new) for part in parts], 1)
+        )
     return members
 
 
