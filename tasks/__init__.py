@@ -9,6 +9,7 @@ from sbi_active.tasks.base import Task
 from sbi_active.tasks.box_collision import BoxCollisionTask
 from sbi_active.tasks.numerical import NumericalTask
 from sbi_active.tasks.oscillator import OscillatorTask
+from sbi_active.tasks.servo_pendulum import ServoPendulumTask
 
 __all__ = ["TASKS", "Task", "get_task"]
 
@@ -16,6 +17,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "numerical": NumericalTask,
     "oscillator": OscillatorTask,
     "box_collision": BoxCollisionTask,
+    "servo_pendulum": ServoPendulumTask,
 }
 
 

@@ -110,10 +110,11 @@ class AutocorrelatedNoise(ScaleNoise):
 
     def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
         posterior = self.posterior
-        if not isinstance(posterior, NoisePosterior):
+        if not isinstance(posterior, NoisePosterior) or not isinstance(
+            posterior.sd, InverseChiSquare
+        ):
             return super()._marginal(residual, times)
         assert posterior.shared is not None
-        assert isinstance(posterior.sd, InverseChiSquare)
         edges, log_weight = posterior.shared.edges, posterior.shared.log_weight
         terms = []
         for cell, weight in enumerate(log_weight.tolist()):

@@ -1,0 +1,176 @@
+"""The tables of the servo pendulum, in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sbi_active.tasks.servo_pendulum import Recordings  # pyright: ignore
+
+__all__ = ["tables"]
+
+SHOWN = 0.005
+
+
+def tables(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
+    """Return what each stage says.
+
+    Args:
+        rows: By stage, of ``judge``.
+        recordings: For the names of trials.
+    """
+    parts = [_stages(rows, recordings)]
+    parts += [
+        _models(rows, name)
+        for name in rows
+        if name in ("powered", "motor off") or name.startswith("trials")
+    ]
+    if "motor off" in rows:
+        row = rows["motor off"]
+        parts += [_errors(row, recordings), _parameters(row), _rates(row["rates"])]
+    if "powered, iid" in rows:
+        parts.append(_independent(rows))
+    return "\n\n".join(parts)
+
+
+def _stages(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
+    lines = [
+        "| stage | trials | verdict | P | 90 % set | log BF | next trial "
+        "| next, coarsened | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, row in rows.items():
+        lines.append(
+            f"| {name} | {len(row['fitted'])} | {row['verdict']} | "
+            f"{_probability(row['probabilities'][row['verdict']])} | "
+            f"{', '.join(row['credible_set'])} | {row['log_bayes_factor']:.1f} | "
+            f"{_next(row, '', recordings)} | {_next(row, 'coarsened ', recordings)} | "
+            f"{row['seconds']:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def _next(row: dict[str, Any], kind: str, recordings: Recordings) -> str:
+    if f"{kind}gain" not in row:
+        return ""
+    best = row[f"{kind}next"]
+    if best is None:
+        return "none"
+    return f"{_named(best, recordings)} ({max(row[f'{kind}gain']):.2f} nats)"
+
+
+def _models(rows: Mapping[str, dict[str, Any]], stage: str) -> str:
+    """Return the models of a stage, the likeliest first."""
+    row = rows[stage]
+    null = row["log_evidence"]["none"]
+    lines = [
+        f"| {stage}: model | P | P coarsened | log BF | phi, alone |",
+        "|---|---|---|---|---|",
+    ]
+    for name, p in row["probabilities"].items():
+        flat = row["coarsened"].get(name)
+        if p < SHOWN and (flat is None or flat < SHOWN) and " + " in name:
+            continue
+        phi = ""
+        if name in row["singles"]:
+            mean, sd = row["singles"][name][name]
+            phi = f"{mean:.3g} +- {sd:.2g}"
+        lines.append(
+            f"| {name} | {_probability(p)} | "
+            f"{'' if flat is None else _probability(flat)} | "
+            f"{row['log_evidence'][name] - null:.1f} | {phi} |"
+        )
+    return "\n".join(lines)
+
+
+def _errors(row: dict[str, Any], recordings: Recordings) -> str:
+    """Return the held-out errors beside plain least squares."""
+    each = " | ".join(_named(i, recordings) for i in row["held_out"])
+    lines = [
+        f"| RMSE, rad | fitted | held out | 5 to 95 % | {each} |",
+        "|---" * (4 + len(row["held_out"])) + "|",
+    ]
+    total = dict(
+        zip(row["before_after"]["metric"], _pairs(row["before_after"]), strict=True)
+    )["RMSE" if "RMSE" in row["before_after"]["metric"] else "rmse"]
+    for i, (when, what) in enumerate(
+        (("before", "bare model"), ("after", row["verdict"]))
+    ):
+        low, _, high = row["draws"][when]["rmse"]
+        own = " | ".join(f"{v:.3f}" for v in row["rmse"][when])
+        lines.append(
+            f"| **{when}**: {what} | | **{total[i]:.4f}** | {low:.3f} to {high:.3f} | "
+            f"{own} |"
+        )
+    for name, found in row["least squares"].items():
+        own = " | ".join(f"{v:.3f}" for v in found["each"])
+        lines.append(
+            f"| least squares: {name} | {found['train']:.4f} | {found['held_out']:.4f} "
+            f"| | {own} |"
+        )
+    return "\n".join(lines)
+
+
+def _pairs(table: dict[str, list[float]]) -> list[tuple[float, float]]:
+    return [*zip(table["before"], table["after"], strict=True)]
+
+
+def _parameters(row: dict[str, Any]) -> str:
+    before, after = row["parameters"]["none"], row["parameters"].get(row["verdict"], {})
+    lines = ["| parameter | bare model | " + row["verdict"] + " |", "|---|---|---|"]
+    for name in dict.fromkeys([*before, *after]):
+        cells = [
+            f"{found[name][0]:.4g} +- {found[name][1]:.2g}" if name in found else ""
+            for found in (before, after)
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _independent(rows: Mapping[str, dict[str, Any]]) -> str:
+    """Return what errors that are forced to be independent change."""
+    lines = [
+        "| stage | errors | verdict | P | log BF: Coulomb / load / torque / viscous |",
+        "|---|---|---|---|---|",
+    ]
+    for stage in ("powered", "motor off"):
+        for errors, name in (("default", stage), ("independent", f"{stage}, iid")):
+            if name not in rows:
+                continue
+            row = rows[name]
+            z = row["log_evidence"]
+            factors = " / ".join(f"{z[n] - z['none']:.0f}" for n in row["singles"])
+            lines.append(
+                f"| {stage} | {errors} | {row['verdict']} | "
+                f"{_probability(row['probabilities'][row['verdict']])} | {factors} |"
+            )
+    return "\n".join(lines)
+
+
+def _rates(rows: Sequence[dict[str, Any]]) -> str:
+    """Return how the evidence grows with the rate at which angles are compared."""
+    rates = sorted({row["rate"] for row in rows}, reverse=True)
+    found = {(row["model"], row["rate"]): row for row in rows}
+    header = " | ".join(f"{rate:g} Hz" for rate in rates)
+    lines = [
+        f"| log likelihood above none (correlation of innovations) | {header} |",
+        "|---" * (1 + len(rates)) + "|",
+    ]
+    for model in dict.fromkeys(row["model"] for row in rows):
+        cells = []
+        for rate in rates:
+            own, null = found[model, rate], found["none", rate]
+            gain = own["log_likelihood"] - null["log_likelihood"]
+            cells.append(f"{gain:.0f} ({own['innovations']:.2f})")
+        lines.append(f"| {model} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _named(trial: int, recordings: Recordings) -> str:
+    return f"{recordings.trajectory[trial]} {recordings.kp[trial]:.0f}"
+
+
+def _probability(value: float) -> str:
+    if value < SHOWN:
+        return "< .01"
+    return "> .99" if value > 1 - SHOWN else f"{value:.2f}"
