@@ -79,9 +79,9 @@ def _of_trials(
 ) -> Iterator[str]:
     if residuals.noise == "estimated":
         yield (
-            "noise undeclared: it is estimated from repeated trials, which show "
-            "scatter and no bias, and what differs from repeat to repeat passes for "
-            "noise"
+            "noise undeclared: its size has a prior or is estimated from repeated "
+            "trials, which show scatter and no bias, and what differs from repeat to "
+            "repeat passes for noise"
         )
     num = int(trials.valid.sum())
     if num < FEW_TRIALS:

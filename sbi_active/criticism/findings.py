@@ -101,7 +101,7 @@ def residuals(report: Report) -> Section:
         rows.append((f"with {added(report)}", *sizes))
     noise = {
         "declared": "The noise is declared.",
-        "estimated": "The noise is estimated from repeated trials.",
+        "estimated": "The noise is uncertain, and what it may be is summed over.",
         "stochastic": "The noise is the simulator's own.",
     }[before.noise]
     p = detection.p_value

@@ -71,7 +71,7 @@ def summary_sentence(report: Report) -> str:
         shares = [f"{n} ({stated(report.probabilities[n])})" for n in others]
         found.append(f"Not excluded: {', '.join(shares)}.")
     found += [
-        f"{e.name}: {e.describe}."
+        f"{e.name}: {e.describe.rstrip('.')}."
         for e in report.tracing.estimates
         if e.name in report.tracing.chosen and e.describe
     ]
