@@ -12,6 +12,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.augmented import AugmentedSimulator
 from sbi_active.criticism.detection import detect
 from sbi_active.criticism.effects import Effect
+from sbi_active.criticism.equivalence import equivalent_effects
 from sbi_active.criticism.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.formulas import guess
 from sbi_active.criticism.joint import joint_prior
@@ -125,6 +126,7 @@ class Criticism:
         )
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
+        self._equivalent: tuple[frozenset[str], ...] | None = None
         self._residuals: Residuals | None = None
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
@@ -135,16 +137,28 @@ class Criticism:
             self._residuals = find_residuals(self.rivals)
         return self._residuals
 
+    def equivalent(self) -> tuple[frozenset[str], ...]:
+        """Return groups of effects that no permitted action separates.
+
+        It depends on the simulator and the actions, not on what was measured; without
+        permitted actions, on those of the trials.
+        """
+        if self._equivalent is None:
+            self._equivalent = equivalent_effects(self.rivals, self.actions)
+        return self._equivalent
+
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            self._detection = detect(self.rivals)
+            self._detection = detect(self.rivals, self.equivalent())
         return self._detection
 
     def trace(self) -> Tracing:
         """Return which effect the data point to."""
         if self._tracing is None:
-            tracing = trace(self.rivals, self.detect(), actions=self.actions)
+            tracing = trace(
+                self.rivals, self.detect(), self.equivalent(), actions=self.actions
+            )
             if tracing.verdict == UNEXPLAINED:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
@@ -215,7 +229,8 @@ class Criticism:
         part = Criticism(
             model, self.prior, trials, effects=effects, summaries=0, seed=self.seed
         )
-        return part.rivals, trace(part.rivals, part.detect(), compare=False)
+        part._equivalent = groups = self.equivalent()
+        return part.rivals, trace(part.rivals, part.detect(), groups, compare=False)
 
     def report(
         self,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.stats import chi2
 
 from sbi_active.criticism.errors import log_sum_exp
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Detection
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection
 from sbi_active.criticism.rival_set import RivalSet
 from sbi_active.criticism.unknown_scale import log_evidence
 
-__all__ = ["THRESHOLD", "detect"]
+__all__ = ["THRESHOLD", "alternatives", "detect"]
 
 #: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
 #: at any stopping time, with a probability of at most 1/20.
@@ -19,27 +21,33 @@ THRESHOLD = float(np.log(20.0))
 MARGIN = 2.0
 
 
-def detect(rivals: RivalSet) -> Detection:
+def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detection:
     r"""Return the Bayes factor of everything else against the bare model.
 
     .. math::
-        \log B = \log \frac1m \sum_{k=1}^m Z_k - \log Z_0
+        \log B = \log \sum_k w_k Z_k - \log Z_0
 
-    over all effects, with priors of unknown scale, the residual process and noise
-    inflation. Before an alarm, the
-    bare model's evidence is computed again by tempering, since a mode that the
-    least-squares search missed would be a false alarm.
+    over effects with priors of unknown scale, the residual process and noise
+    inflation, with the weights of :func:`alternatives`. Before an alarm, the bare
+    model's evidence is computed again by tempering, since a mode that the least-squares
+    search missed would be a false alarm.
 
     Args:
         rivals: The models.
+        equivalent: Groups that no permitted action separates, found without the data.
 
     References:
         Ville, Etude critique de la notion de collectif (1939), for any stopping time.
     """
     null = rivals.evidence()
     # First what can explain anything: beside it, a hopeless effect is soon dismissed.
-    others = [log_evidence(rivals, error=e) for e in (UNEXPLAINED, SCATTER)]
-    others += [log_evidence(rivals, (name,)) for name in rivals.effects]
+    weights = alternatives([*rivals.effects], equivalent)
+    found = {e: log_evidence(rivals, error=e) for e in (UNEXPLAINED, SCATTER)}
+    found |= {name: log_evidence(rivals, (name,)) for name in rivals.effects}
+    others = [
+        (found[name][0] + float(np.log(w)), found[name][1])
+        for name, w in weights.items()
+    ]
     first = null.log_evidence
     log_b, error = bayes_factor(others, log_evidence(rivals))
     check = None
@@ -63,13 +71,39 @@ def detect(rivals: RivalSet) -> Detection:
     )
 
 
+def alternatives(
+    effects: Sequence[str], equivalent: Sequence[frozenset[str]]
+) -> dict[str, float]:
+    """Return the weights of the alternatives to the bare model, which sum to one.
+
+    The residual process, noise inflation and each effect count alike, effects that
+    nothing separates as one. What nothing separates from the bare model is none.
+
+    Args:
+        effects: Their names.
+        equivalent: Groups that nothing separates, with "none" for the bare model.
+
+    Example:
+        >>> groups = [frozenset({"none", "gain"}), frozenset({"bias", "offset"})]
+        >>> alternatives(["gain", "bias", "offset"], groups)["bias"]  # 1 / 2 of 1 / 3
+        0.16666666666666666
+    """
+    shares = {UNEXPLAINED: 1.0, SCATTER: 1.0}
+    for name in effects:
+        group = next((g for g in equivalent if name in g), frozenset({name}))
+        if NONE not in group:
+            shares[name] = 1 / len(group & {*effects})
+    total = sum(shares.values())
+    return {name: share / total for name, share in shares.items()}
+
+
 def bayes_factor(
     others: list[tuple[float, float]], null: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the log Bayes factor of an equal mixture, and its standard error.
+    """Return the log Bayes factor of a mixture, and its standard error.
 
     Args:
-        others: Log evidence and its standard error, of each part of the mixture.
+        others: Log of weight times evidence and its error, of each part.
         null: The same of the bare model.
     """
     log_z, errors = np.array(others).T
@@ -77,5 +111,5 @@ def bayes_factor(
     share = np.exp(log_z - total)
     errors = np.where(share > 0, errors, 0.0)
     variance = (share**2 * errors**2).sum() + null[1] ** 2
-    log_b = total - np.log(len(others)) - null[0]
+    log_b = total - null[0]
     return float(log_b), float(np.sqrt(variance))

@@ -25,7 +25,7 @@ __all__ = ["formula_effects", "guess"]
 Array = NDArray[Any]
 
 #: Nats by which a formula must beat the residual process to be printed.
-MARGIN = 3.0
+MARGIN = 2.0
 #: Bound on exponents, so that a formula stays finite.
 LARGEST_EXPONENT = 20.0
 
@@ -94,7 +94,7 @@ def guess(rivals: RivalSet) -> tuple[tuple[str, float], ...]:
 
     Returns:
         Formulas and their log evidence above that of the residual process, only those
-        more than 3 nats above; empty where there is none.
+        more than 2 nats above; empty where there is none.
     """
     bar = rivals.evidence(error=UNEXPLAINED).log_evidence
     effects = formula_effects(rivals)

@@ -93,7 +93,7 @@ class Detection:
 
     Attributes:
         alarm: True where ``lower`` exceeds ``threshold``.
-        log_bayes_factor: Of the equal-weight mixture of all effects and catch-alls
+        log_bayes_factor: Of the mixture of effects and catch-alls
             against the bare model, nats.
         standard_error: Monte Carlo, nats.
         lower: log_bayes_factor minus twice its standard error.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.combinations import grow
-from sbi_active.criticism.detection import THRESHOLD
+from sbi_active.criticism.detection import THRESHOLD, alternatives
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.equivalence import equivalent_effects
 from sbi_active.criticism.errors import log_sum_exp
@@ -57,6 +57,7 @@ def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
 def trace(
     rivals: RivalSet,
     detection: Detection,
+    equivalent: Sequence[frozenset[str]] = (),
     *,
     actions: ActionSpace | None = None,
     compare: bool = True,
@@ -70,8 +71,9 @@ def trace(
     Args:
         rivals: The models.
         detection: Whether there is anything to trace.
-        actions: The permitted ones, for what no action separates.
-        compare: Whether to look for effects that nothing separates.
+        equivalent: Groups that no permitted action separates.
+        actions: The permitted ones, for what they hardly separate.
+        compare: Whether to look for effects that these trials do not separate.
     """
     prior = log_priors([*rivals.effects.values()])
     log_p = {
@@ -85,7 +87,6 @@ def trace(
     if detection.alarm:
         log_p |= grow(rivals, {n: log_p[n] for n in rivals.effects}, prior)
     probabilities = _normalized(log_p)
-    equivalent = equivalent_effects(rivals, actions) if compare else ()
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
     near = equivalent_effects(rivals, None) if compare else ()
     if compare and detection.alarm:
@@ -101,7 +102,7 @@ def trace(
         probabilities=probabilities,
         inclusion=inclusion,
         credible_set=_credible_set(probabilities),
-        equivalent=equivalent,
+        equivalent=(*equivalent,),
         near=near,
         estimates=_estimates(rivals, inclusion),
         evidences={name: _under_unknown_scale(rivals, name) for name in log_p},
@@ -198,11 +199,9 @@ def _is_robust(
                 own = log_evidence(rivals, names)[0]
                 other = log_evidence(rivals, names, factor=factor)[0]
                 scaled[name] = log_p[name] + other - own
-        singles = [
-            scaled[name] - prior[name]
-            for name in [*rivals.effects, UNEXPLAINED, SCATTER]
-        ]
-        log_b = log_sum_exp(np.array(singles)) - np.log(len(singles))
+        weights = alternatives([*rivals.effects], equivalent)
+        singles = [scaled[k] - prior[k] + np.log(w) for k, w in weights.items()]
+        log_b = log_sum_exp(np.array(singles))
         alarm = bool(log_b - (log_p[NONE] - prior[NONE]) > THRESHOLD)
         if _verdict(_normalized(scaled), equivalent, alarm=alarm) != verdict:
             return False
