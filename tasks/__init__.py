@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from sbi_active.tasks.ball_drops import BallDropsTask
 from sbi_active.tasks.base import Task
 from sbi_active.tasks.box_collision import BoxCollisionTask
 from sbi_active.tasks.numerical import NumericalTask
@@ -18,6 +19,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "oscillator": OscillatorTask,
     "box_collision": BoxCollisionTask,
     "servo_pendulum": ServoPendulumTask,
+    "ball_drops": BallDropsTask,
 }
 
 

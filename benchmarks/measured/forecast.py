@@ -1,0 +1,151 @@
+"""How a trial goes on that was measured at its beginning alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from sbi_active.criticism.errors import NoiseGrid
+from sbi_active.criticism.noise_grid import declared_noise
+from sbi_active.criticism.residual_process import ResidualProcess
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED
+from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.trial_simulator import TrialSimulator
+from sbi_active.criticism.trials import Trials
+
+__all__ = ["Forecast", "aligned_error", "forecast"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a rival expects of the rest of one trial.
+
+    Attributes:
+        times: In s, shape (m,).
+        x: As measured, shape (m,).
+        mean: Mean of the noise-free predictions, shape (m,).
+        low: 5 % quantile, errors included, shape (m,).
+        high: 95 % quantile, shape (m,).
+    """
+
+    times: Array
+    x: Array
+    mean: Array
+    low: Array
+    high: Array
+
+    @property
+    def rmse(self) -> float:
+        """Of the mean."""
+        return float(np.sqrt(np.mean((self.mean - self.x) ** 2)))
+
+    @property
+    def coverage(self) -> float:
+        """Share of the samples in the central 90 %."""
+        return float(((self.x >= self.low) & (self.x <= self.high)).mean())
+
+
+def forecast(
+    rivals: RivalSet, whole: Trials, *, verdict: str, trial: int, seed: int = 0
+) -> Forecast:
+    """Return the rest of a trial given its beginning and the other trials.
+
+    Unlike a new trial, it keeps the nuisances that its beginning shows, and its errors
+    go on from the last one.
+
+    Args:
+        rivals: The models, fitted to trials of which this one was cut short.
+        whole: The same trials, this one in full.
+        verdict: Names of the effects joined by " + ", or a catch-all.
+        trial: Position of the one that was cut.
+        seed: Of the draws.
+    """
+    names, error = _parts(rivals, verdict)
+    name = rivals.evidence(names, error=error).name
+    rival, rng = rivals.rivals[name], np.random.default_rng(seed)
+    u = rivals.samples[name].draws(NUM_DRAWS, rng)
+    simulator = TrialSimulator(rivals.simulator.model, whole)
+    mean = simulator.predict(*rival.coordinates.split(u))[0]
+    m, cut = simulator.measurements, rivals.measurements
+    own = rival.residual(u, penalized=False)[0]
+    extra = np.zeros(len(m))
+    if isinstance(rival.error, ResidualProcess):
+        action = rivals.scaled_actions(whole)
+        shift, extra = rival.error.condition(own, m, action)
+        mean = mean + shift
+        cells, scales = rival.error.noise_posterior(own, rng)
+    else:
+        assert isinstance(rival.error, NoiseGrid)
+        joint = rival.error.joint(own)
+        flat = joint.reshape(len(own), -1)
+        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
+        cells, which = np.unravel_index(best, joint.shape[1:])
+        scales = rival.error.scales[which]
+    noise = declared_noise(rivals.model.noise, m)
+    # The last sample of the beginning, and all that follow it.
+    first = int((cut.trial == trial).sum())
+    at = np.flatnonzero(m.trial == trial)
+    last, rest = at[first - 1], at[first:]
+    rho = np.stack([noise.cells[c].rho for c in cells])
+    sd = np.stack([noise.cells[c].sd for c in cells]) * scales[:, None]
+    r = m.x[last] - mean[:, last]
+    x = np.empty((NUM_DRAWS, len(rest)))
+    for j, k in enumerate(rest):
+        fresh = sd[:, k] * np.sqrt(1 - rho[:, k] ** 2)
+        r = rho[:, k] * r + fresh * rng.normal(size=NUM_DRAWS)
+        x[:, j] = mean[:, k] + r
+    x = x + extra[rest] * rng.normal(size=x.shape)
+    low, high = np.quantile(x, [0.05, 0.95], axis=0)
+    return Forecast(m.time[rest], m.x[rest], mean[:, rest].mean(0), low, high)
+
+
+def aligned_error(
+    rivals: RivalSet, whole: Trials, *, verdict: str, trial: int
+) -> float:
+    """Return the RMSE of a whole trial with its nuisances fitted by least squares.
+
+    Parameters and strengths are posterior means.
+
+    Args:
+        rivals: As in :func:`forecast`.
+        whole: The trials in full.
+        verdict: As there; a catch-all adds nothing.
+        trial: Position of the trial.
+    """
+    names, _ = _parts(rivals, verdict)
+    name = rivals.evidence(names).name
+    rival = rivals.rivals[name]
+    draws = rivals.samples[name].draws(NUM_DRAWS, np.random.default_rng(0))
+    theta, phi = rival.coordinates.split(draws)
+    start = [phi[e.name][:, trial].mean(0).numpy() for e in rivals.nuisances]
+    sizes = np.cumsum([len(part) for part in start])[:-1]
+    mean = {e.name: phi[e.name].mean(0, keepdim=True) for e in rival.effects}
+    one = TrialSimulator(rivals.simulator.model, whole.select([trial]))
+
+    def residual(z: Array) -> Array:
+        own = {
+            e.name: torch.from_numpy(part)[None, None]
+            for e, part in zip(rivals.nuisances, np.split(z, sizes), strict=True)
+        }
+        predicted = one.predict(theta.mean(0, keepdim=True), {**mean, **own})[0]
+        return predicted[0] - one.measurements.x
+
+    return float(
+        np.sqrt(np.mean(least_squares(residual, np.concatenate(start)).fun ** 2))
+    )
+
+
+def _parts(rivals: RivalSet, verdict: str) -> tuple[tuple[str, ...], str | None]:
+    """Return the effects and the catch-all that a verdict names."""
+    if verdict in (UNEXPLAINED, SCATTER):
+        return (), verdict
+    return tuple(n for n in verdict.split(" + ") if n in rivals.effects), None
