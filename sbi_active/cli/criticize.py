@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import argparse
 import copy
+import functools
+import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.cli.check import actions_of, numbers_of, prior_of
 from sbi_active.cli.loading import load_object
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
-from sbi_active.criticism.tables import WideTable, read_wide_table
+from sbi_active.criticism.augmented import takes_times
+from sbi_active.criticism.tables import TrialTable, read_table
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import TASKS, get_task  # pyright: ignore
 
@@ -35,14 +40,27 @@ def add_parser(commands: Any) -> None:
             "Compare a simulator with measured trials: find the residual, trace it to "
             "an effect that the simulator lacks, add it, and report the error before "
             "and after. TRIALS.csv has one row a trial, with columns action_* and x_* "
-            "and optionally role (fit or 'held out'), index and repeat_of. An empty "
-            "cell is what was not measured. All numbers are in the simulator's units; "
-            "tables with one row a sample are not read. Write negative numbers as in "
-            "--theta-low=-5,-5."
+            "and optionally role (fit or 'held out'), index and repeat_of; or one row "
+            "a sample, with columns trial and time besides. Units stand in brackets, "
+            "as in x_height[m], and are those of the simulator. An empty cell is what "
+            "was not measured. Write negative numbers as in --theta-low=-5,-5."
         ),
     )
     criticize.set_defaults(command=_criticize)
     criticize.add_argument("trials", metavar="TRIALS.csv", type=Path)
+    criticize.add_argument(
+        "--columns",
+        nargs="+",
+        metavar="KEY=NAME[,NAME...]",
+        help="columns that are trial, time, action, x, role, index or repeat_of, where "
+        "they are named otherwise, as in trial=ball,drop time=time_s x=height_m",
+    )
+    criticize.add_argument(
+        "--units",
+        nargs="+",
+        metavar="NAME=UNIT",
+        help="of columns without a unit in the header",
+    )
     source = criticize.add_mutually_exclusive_group(required=True)
     source.add_argument("--task", help=f"one of: {', '.join(TASKS)}")
     source.add_argument("--simulator", metavar="MODULE:FUNCTION")
@@ -87,9 +105,8 @@ class _Source:
 
 
 def _criticize(arguments: argparse.Namespace) -> int:
-    table = read_wide_table(arguments.trials)
-    trials = Trials(**table.arguments)
-    source = _source(arguments, table)
+    table, trials = _trials(arguments)
+    source = _source(arguments, trials)
     # Only scales are taken from these where the permitted actions are unknown.
     space = source.actions or DiscreteActions(trials.action.unique(dim=0).float())
     own = [*source.effects, *_declared(arguments)]
@@ -105,12 +122,61 @@ def _criticize(arguments: argparse.Namespace) -> int:
         designed=arguments.designed,
     )
     print(report)
+    if table.is_long or any(table.columns.units.values()):
+        print(f"\n{_described(arguments.trials, table, trials)}")
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
     return 0
 
 
-def _source(arguments: argparse.Namespace, table: WideTable) -> _Source:
+def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
+    """Return what the file holds; what it lacks in a small way is noted on stderr."""
+    columns = _pairs(arguments.columns, "--columns")
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always", UserWarning)
+        table = read_table(
+            arguments.trials,
+            columns={key: text.split(",") for key, text in columns.items()} or None,
+            units=_pairs(arguments.units, "--units"),
+        )
+        trials = Trials(**table.arguments)
+    for note in noted:
+        print(f"sbi-active: note: {note.message}", file=sys.stderr)
+    num, held = len(trials), len(trials.held_out_positions)
+    if num - held < 2:
+        raise ValueError(
+            f"expected at least two trials to fit; got {num - held} in "
+            f"{arguments.trials} ({num} in all, {held} held out); do measure more, "
+            "since one trial fits any model"
+        )
+    return table, trials
+
+
+def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
+    found = {}
+    for text in texts or []:
+        key, equals, value = text.partition("=")
+        if not (key and equals and value):
+            raise ValueError(
+                f"expected {option} KEY=NAME; got {text!r}; do write, say, x=height_m"
+            )
+        found[key] = value
+    return found
+
+
+def _described(path: Path, table: TrialTable, trials: Trials) -> str:
+    """Return what was read, with its units."""
+    columns, num = table.columns, len(trials)
+    action, x = (map(columns.label, names) for names in (columns.action, columns.x))
+    what = f"{num} trials of {path}: action {', '.join(action)}; x {', '.join(x)}"
+    if not table.is_long:
+        return what
+    counts = trials.mask.flatten(2).any(-1) if trials.x.ndim > 2 else trials.mask
+    few, many = int(counts.sum(1).min()), int(counts.sum(1).max())
+    return f"{what}; {few} to {many} samples a trial, time [s]"
+
+
+def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
     if arguments.task is not None:
         for name in ("prior", "theta_low", "theta_high"):
             if getattr(arguments, name) is not None:
@@ -119,6 +185,7 @@ def _source(arguments: argparse.Namespace, table: WideTable) -> _Source:
                     f"prior; got {getattr(arguments, name)}; do drop one of them"
                 )
         task = get_task(arguments.task)
+        _require_units(task.actions, trials, arguments)
         actions = actions_of(arguments) if arguments.actions else task.actions
         effects = getattr(task, "effects", list)()
         simulator = _with_noise(task.simulator, arguments.noise)
@@ -130,16 +197,52 @@ def _source(arguments: argparse.Namespace, table: WideTable) -> _Source:
             f"{arguments.simulator}; do name what takes (theta, action)"
         )
     if not isinstance(fn, SimulatorModel):
-        fn = SimulatorModel(fn, channel_names=table.channel_names)
+        fn = _with_times(SimulatorModel(fn), trials, arguments)
     prior, simulator = prior_of(arguments), _with_noise(fn, arguments.noise)
     actions = actions_of(arguments) if arguments.actions else None
-    if isinstance(actions, DiscreteActions) and actions.action_dim == len(
-        table.action_names
-    ):
-        actions = DiscreteActions(
-            actions.values, names=table.action_names, units=actions.units
-        )
+    if actions is not None:
+        _require_units(actions, trials, arguments)
     return _Source(simulator, prior, actions, [])
+
+
+def _with_times(
+    model: SimulatorModel, trials: Trials, arguments: argparse.Namespace
+) -> SimulatorModel:
+    """Return a user's function as the simulator of trials with sample times."""
+    times = trials.template()[1]
+    if times is None:
+        return model
+    own = trials.sample_times
+    assert own is not None
+    ragged = not torch.equal(own.expand(len(trials), -1), times.expand(len(trials), -1))
+    if ragged and not takes_times(model):
+        raise ValueError(
+            "expected a simulator that takes times=, shape (n, k), where trials are "
+            f"sampled at different times, as in {arguments.trials}; got one without "
+            f"under {arguments.simulator}; do add it, or give a SimulatorModel with "
+            "sample_times"
+        )
+    fn = model.fn
+
+    @functools.wraps(fn)
+    def timed(theta: Tensor, action: Tensor, **keywords: Any) -> Tensor:
+        keywords.setdefault("times", times.to(theta).expand(len(theta), -1))
+        return fn(theta, action, **keywords)
+
+    return SimulatorModel(timed if takes_times(model) else fn, sample_times=times)
+
+
+def _require_units(
+    actions: ActionSpace, trials: Trials, arguments: argparse.Namespace
+) -> None:
+    """Raise where the file states another unit of the action than the simulator."""
+    for unit, label in zip(actions.units, trials.action_labels or (), strict=False):
+        given = label.partition(" [")[2].removesuffix("]")
+        if unit and given and unit != given:
+            raise ValueError(
+                f"expected actions in {unit}; got {label} in {arguments.trials}; do "
+                "convert the column, and state the unit in brackets"
+            )
 
 
 def _declared(arguments: argparse.Namespace) -> list[Effect]:

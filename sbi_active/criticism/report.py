@@ -219,7 +219,9 @@ def build_report(
         The report.
     """
     labels = [f"action {i + 1}" for i in range(trials.action.shape[1])]
-    if actions is not None:
+    if trials.action_labels is not None:
+        labels = trials.action_labels
+    elif actions is not None:
         pairs = zip(actions.names, actions.units, strict=True)
         labels = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
     found = find_warnings(
@@ -233,7 +235,7 @@ def build_report(
         exploratory=exploratory,
         designed=designed,
     )
-    channels = simulator.channel_names
+    channels = trials.channel_labels or simulator.channel_names
     return Report(
         residuals=residuals,
         residuals_after=residuals_after,

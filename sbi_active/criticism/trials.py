@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
-from sbi_active.criticism.tables import read_wide_table
+from sbi_active.criticism.tables import read_table
 
 __all__ = ["Role", "Trials"]
 
@@ -37,6 +38,8 @@ class Trials:
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
             none; None takes trials of equal actions as repeats of the first.
         covariates: Further numbers by name, shape (n,) each.
+        action_labels: What reports call each entry of the action, with its unit.
+        channel_labels: The same of each entry of x's last axis.
 
     Raises:
         ValueError: If shapes disagree, all trials are invalid, or held-out data have
@@ -60,6 +63,8 @@ class Trials:
         performed_at: Any = None,
         repeat_of: Any = None,
         covariates: Mapping[str, Any] | None = None,
+        action_labels: Sequence[str] | None = None,
+        channel_labels: Sequence[str] | None = None,
     ) -> None:
         self.action = _tensor(action)
         if self.action.ndim == 1:
@@ -105,6 +110,8 @@ class Trials:
             name: self._rows(name, value, None)
             for name, value in (covariates or {}).items()
         }
+        self.action_labels = None if action_labels is None else (*action_labels,)
+        self.channel_labels = None if channel_labels is None else (*channel_labels,)
         if not bool(self.valid.any()):
             raise ValueError(
                 f"expected at least one valid trial; got {n} trials without a "
@@ -118,15 +125,65 @@ class Trials:
             )
 
     @classmethod
-    def from_csv(cls, path: str | Path) -> Trials:
-        r"""Return the trials of a CSV file with one row a trial.
+    def from_csv(
+        cls,
+        path: str | Path,
+        *,
+        columns: Mapping[str, str | Sequence[str]] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> Trials:
+        r"""Return the trials of a CSV file with one row a trial or one row a sample.
+
+        A row is a sample where there are columns "trial" and "time" (in s, or as in
+        "time_ms"). Either way "action_\*" is the action, which like all else that
+        belongs to a trial stands in each of its rows, and "x_\*" the observation.
+        Optional are "role", "index" (the place in the order of execution; without it
+        that of the first row) and "repeat_of" (the index of the trial that is
+        repeated). An empty cell of x is what was not measured. A unit stands in
+        brackets, as in "x_height[m]", and goes into reports.
 
         Args:
-            path: Of a file with columns "action_\*" and "x_\*", and optionally "role",
-                "index" and "repeat_of", the index of the trial that is repeated. An
-                empty cell of x is what was not measured.
+            path: Of the file; lines that begin with # are comments.
+            columns: Which columns are "trial", "time", "action", "x", "role", "index"
+                and "repeat_of", where they have other names; those left out are then
+                ignored. Several columns may name a trial together.
+            units: By column, where the header has none. Numbers are taken as they are,
+                but for the time, which is converted to seconds.
+
+        Raises:
+            ValueError: If the table is not understood; the text says where.
         """
-        return cls(**read_wide_table(path).arguments)
+        return cls(**read_table(path, columns=columns, units=units).arguments)
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: pd.DataFrame,
+        *,
+        columns: Mapping[str, str | Sequence[str]] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> Trials:
+        """Return the trials of a data frame, laid out as for :meth:`from_csv`.
+
+        Args:
+            frame: With one row a trial or one row a sample.
+            columns: As in :meth:`from_csv`.
+            units: As there.
+
+        Example:
+            >>> frame = pd.DataFrame(
+            ...     {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2.0, 4.0]}
+            ... )
+            >>> frame["mass"] = [0.1, 0.1, 0.2]
+            >>> trials = Trials.from_dataframe(
+            ...     frame,
+            ...     columns={"trial": "ball", "time": "t", "x": "h", "action": "mass"},
+            ...     units={"h": "m"},
+            ... )
+            >>> trials.x.shape, trials.channel_labels
+            (torch.Size([2, 2]), ('h [m]',))
+        """
+        return cls(**read_table(frame, columns=columns, units=units).arguments)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -200,6 +257,8 @@ class Trials:
             performed_at=None if self.performed_at is None else self.performed_at[at],
             repeat_of=torch.tensor([new.get(int(self.repeat_of[i]), -1) for i in at]),
             covariates={name: v[at] for name, v in self.covariates.items()},
+            action_labels=self.action_labels,
+            channel_labels=self.channel_labels,
         )
 
     def _of(self, role: Role) -> Trials:

@@ -1,6 +1,9 @@
 """``sbi-active criticize``: from a file to a report."""
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -59,6 +62,83 @@ def test_a_file_gives_a_report(capsys):
         assert file.read().strip() in printed
 
 
+SLIDE = """
+import torch
+from torch.distributions import HalfNormal
+from sbi_active.criticism import Effect
+
+def place(theta, action, *, times, drag=None):
+    loss = 9.81 * theta
+    if drag is None:
+        s = torch.minimum(times, action / loss)
+        return action * s - loss * s**2 / 2
+    loss, k = loss.double(), drag * torch.ones_like(action).double()
+    root, edge = (loss * k).sqrt(), (action * (k / loss).sqrt()).atan()
+    s = torch.minimum(times, edge / root)
+    return ((edge - root * s).cos() / edge.cos()).log() / k
+
+effects = [
+    Effect("drag", hook="dynamics", prior=HalfNormal(0.3), null=0.0, units="1/m",
+           apply=lambda value, phi, action, context: {
+               **value, "drag": phi.clamp(min=1e-6)})
+]
+"""
+COLUMNS = ["trial=push", "time=time_ms", "x=x_place", "action=action_speed"]
+
+
+def film(module="my_slide"):
+    """Write a film of a block with drag, one row a sample, at uneven times."""
+    space: dict = {}
+    exec(SLIDE, space)
+    gen = torch.Generator().manual_seed(0)
+    rows = []
+    for i, v in enumerate([1.0, 2.5, 1.5, 3.0, 2.0, 1.25, 2.75]):
+        times = (torch.arange(6 + i % 2) / 10 + 0.05)[None].double()
+        at = [torch.tensor([[value]]).double() for value in (0.4, v)]
+        x = space["place"](*at, times=times, drag=0.3)[0]
+        x = x + 0.003 * torch.randn(len(x), generator=gen)
+        role = "fit" if i < 5 else "held out"
+        for t, value in zip(times[0].tolist(), x.tolist(), strict=True):
+            rows.append(f"p{i},{1000 * t:.0f},{v},{value:.4f},{role}")
+    write(rows, "push,time_ms,action_speed[m/s],x_place[m],role")
+    with open(f"{module}.py", "w") as file:
+        file.write(SLIDE)
+
+
+def test_a_row_a_sample_gives_a_report(capsys):
+    film()
+    options = ["--simulator", "my_slide.py:place", "--effects", "my_slide.py:effects"]
+    options += [*OPTIONS[:2], "--noise", "0.003", "--out", "found"]
+    columns = ["--columns", *COLUMNS, "role=role"]
+    assert main(["criticize", "trials.csv", *columns, *options]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Verdict: drag (P")
+    assert "7 trials of trials.csv: action speed [m/s]; x place [m]; 6 to 7" in printed
+    assert "2 held-out trials" in printed
+    with open("found/report.md") as file:
+        assert "drag" in file.read()
+
+
+@pytest.mark.slow
+def test_the_command_itself():
+    measure()
+    with open("my_robot.py", "w") as file:
+        file.write(ROBOT)
+    command = [str(Path(sys.executable).parent / "sbi-active"), "criticize"]
+    options = ["--simulator", "my_robot.py:distance", *OPTIONS]
+    options += ["--effects", "my_robot.py:effects", "--out", "found"]
+    done = subprocess.run(
+        [*command, "trials.csv", *options], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Verdict: drag (P")
+    wrong = subprocess.run(
+        [*command, "nowhere.csv", *options], capture_output=True, text=True
+    )
+    assert wrong.returncode == 2
+    assert "sbi-active: expected a CSV file; got none at nowhere.csv" in wrong.stderr
+
+
 def test_a_task_brings_prior_noise_and_actions(capsys):
     rows = [f"{a},{-3 * math.exp(3 - a) + a},fit" for a in (0, 3, 1, 4, 2)]
     write([*rows, "5,4.6,held out"], "action_xi,x_y,role")
@@ -91,7 +171,7 @@ def test_a_table_with_all_columns():
         (["1,2,0", "3,4,0"], "action_v,x_y,index", "got index 0 in rows 1 and 2"),
         (["1,2,4"], "action_v,x_y,repeat_of", "an index of the table; got 4"),
         (["1,2", "1,2,3,4"], "action_v,x_y", "as many cells in each row"),
-        ([], "action_v,x_y", "one row a trial; got 0 rows"),
+        ([], "action_v,x_y", "one row a trial or sample; got 0 rows"),
         (["1,", "2,"], "action_v,x_y", "expected at least one valid trial"),
         (["1,2,tested"], "action_v,x_y,role", "a role 'fit' or 'held out'"),
         (["1,2,fit", "2,,held out"], "action_v,x_y,role", "in the held-out trials"),
@@ -106,7 +186,7 @@ def test_a_table_that_is_not_understood(rows, header, message):
 @pytest.mark.parametrize(
     ("rows", "options", "message"),
     [
-        (["1,2"], OPTIONS, "at least two valid trials to fit; got 1"),
+        (["1,2"], OPTIONS, "at least two trials to fit; got 1 in trials.csv"),
         (["1,2", "2,3"], OPTIONS[:2], "at least 3 repeats of one action"),
         (["1,2", "2,3"], [*OPTIONS[:2], "--noise", "0"], "expected --noise > 0"),
         (["1,2", "2,3"], OPTIONS[2:], "expected --theta-low and --theta-high"),
@@ -116,3 +196,34 @@ def test_what_cannot_be_compared(rows, options, message, capsys):
     write(rows)
     assert run("--simulator", "my_robot:distance", *options) == 2
     assert message in capsys.readouterr().err
+
+
+def test_what_a_table_of_samples_needs_of_a_simulator(capsys):
+    film("my_other_slide")
+    with open("my_other_slide.py", "a") as file:
+        file.write("\ndef fixed(theta, action):\n    return theta * action\n")
+    command = ["criticize", "trials.csv", "--columns", *COLUMNS]
+    options = [*OPTIONS[:2], "--noise", "0.003"]
+    assert main([*command, "--simulator", "my_other_slide.py:fixed", *options]) == 2
+    assert "a simulator that takes times=, shape (n, k)" in capsys.readouterr().err
+
+
+def test_units_that_are_not_the_task_s(capsys):
+    rows = ["0,1,1,5", "0,2,1,5", "1,1,1,4", "1,2,1,4.5"]
+    write(rows, "trial,time,action_area_per_mass[cm^2/g],x_h[m]")
+    assert main(["criticize", "trials.csv", "--task", "ball_drops"]) == 2
+    printed = capsys.readouterr().err
+    assert "expected actions in m^2/kg; got area_per_mass [cm^2/g]" in printed
+
+
+def test_pairs_that_are_none(capsys):
+    write(["1,2", "2,3"])
+    assert run("--task", "numerical", "--columns", "x") == 2
+    assert "expected --columns KEY=NAME; got 'x'" in capsys.readouterr().err
+
+
+def test_notes_on_a_table_are_printed(capsys):
+    rows = [f"{a},{-3 * math.exp(3 - a) + a}" for a in (0, 3, 1)]
+    write([*rows, "4,"], "action_xi,x_y")
+    assert run("--task", "numerical", "--noise", "0") == 2
+    assert "note: 1 of 4 cells of column x_y" in capsys.readouterr().err

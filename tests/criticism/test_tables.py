@@ -3,9 +3,11 @@
 import argparse
 import json
 
+import numpy as np
 import pytest
 
 from benchmarks.criticism import tables
+from benchmarks.criticism.curves import Curves
 from benchmarks.criticism.worlds import get_world
 
 
@@ -118,20 +120,6 @@ def test_a_pair_is_exact_or_not():
     assert "false inclusion 0.333 (1/3)" in text
 
 
-def test_chosen_actions_are_compared_at_random_s_last_top_1():
-    rows = []
-    for trials in (3, 4, 5, 6):
-        for policy, reached in (("random", 6), ("chosen", 4)):
-            hit = {
-                "trials": str(trials),
-                "policy": policy,
-                "top": str(trials >= reached),
-            }
-            rows.append(row(0, "tilt", "tilt", 90.0, **hit))
-    text = table("active", {"library": rows}, "B")
-    assert "top-1 at 6 trials is reached with 4 chosen ones (0.67)" in text
-
-
 @pytest.mark.parametrize("kind", ["clean", "library"])
 def test_correlated_errors_are_listed_by_correlation(kind):
     effects = "none" if kind == "clean" else "tilt"
@@ -153,3 +141,47 @@ def test_every_table_has_a_summary_of_each_of_its_kinds():
             assert (name, kind) in tables.SUMMARIES
     asked = argparse.Namespace(table="correlation", kind=None, independent=False)
     assert len([*run.settings(asked)]) == 4
+
+
+def policy_rows(case: int, policy: str, right: list[bool], strength: float) -> list:
+    return [
+        row(case, "bias", "bias" if hit else "none", strength)
+        | {
+            "policy": policy,
+            "trials": str(3 + k),
+            "top": str(hit),
+            "place": "1" if hit else "2",
+            "probability": "0.8" if hit else "0.3",
+        }
+        for k, hit in enumerate(right)
+    ]
+
+
+def test_chosen_trials_are_compared_where_random_ones_show_the_effect():
+    rows = []
+    for case in (0, 1):
+        rows += policy_rows(case, "random", [False, False, False, True], 30.0)
+        rows += policy_rows(case, "chosen", [False, case == 0, True, True], 5.0)
+    rows += policy_rows(2, "random", [False] * 4, 20.0)  # not shown: left out
+    rows += policy_rows(2, "chosen", [False] * 4, 90.0)
+    left_out = policy_rows(3, "random", [False], 0.0)[0]
+    rows.append(left_out | {"trials": "6", "verdict": "", "cpu_seconds": ""})
+    text = table("active", {"library": rows})
+    assert "detectable (lambda > 25 with all random trials): 2 of 4 cases" in text
+    assert "     4   0.000   0.500  3.0 (0.75)" in text
+    assert "     6   1.000   1.000  5.0 (0.83)" in text
+    curves = Curves.of(rows)
+    assert curves.matched("probability of the truth", 6) == pytest.approx(5.0)
+    assert curves.matched("top-1", 6, np.array([0, 0])) == pytest.approx(4.0)
+
+
+def test_a_level_that_is_never_reached():
+    rows = policy_rows(0, "random", [False, True], 30.0)
+    rows += policy_rows(0, "chosen", [False, False], 30.0)
+    assert "     4   1.000   0.000  not reached" in table("active", {"library": rows})
+
+
+def test_without_a_detectable_case_there_is_no_curve():
+    rows = policy_rows(0, "random", [False, True], 10.0)
+    rows += policy_rows(0, "chosen", [False, False], 30.0)
+    assert "0 of 1 cases" in table("active", {"library": rows})

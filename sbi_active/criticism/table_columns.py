@@ -1,0 +1,220 @@
+"""What the columns of a table of trials are, and their units."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+__all__ = ["Columns", "find_columns"]
+
+ACTION, OBSERVATION, TRIAL, TIME = "action_", "x_", "trial", "time"
+OPTIONAL = ("role", "index", "repeat_of")
+KEYS = (TRIAL, TIME, "action", "x", *OPTIONAL)
+#: Seconds in a unit of time.
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """Which column of a table is what.
+
+    Attributes:
+        action: Columns of the action.
+        x: Columns of the observation.
+        trial: Columns that name the trial together, in a table with one row a sample;
+            empty where a row is a trial.
+        time: Column of the time stamps; None where a row is a trial.
+        optional: Columns of "role", "index" and "repeat_of", where there are such.
+        units: By column, "" where none is known.
+    """
+
+    action: tuple[str, ...]
+    x: tuple[str, ...]
+    trial: tuple[str, ...]
+    time: str | None
+    optional: dict[str, str]
+    units: dict[str, str]
+
+    def label(self, column: str) -> str:
+        """Return what a column is called, with its unit, as in "speed [m/s]"."""
+        name = _bare(column)
+        for beginning in (ACTION, OBSERVATION):
+            name = name.removeprefix(beginning)
+        unit = self.units.get(column, "")
+        return f"{name} [{unit}]" if unit else name
+
+    @property
+    def seconds(self) -> float:
+        """Seconds in a unit of the time column."""
+        return 1.0 if self.time is None else SECONDS[self.units[self.time] or "s"]
+
+
+def find_columns(
+    names: Sequence[str],
+    *,
+    columns: Mapping[str, str | Sequence[str]] | None = None,
+    units: Mapping[str, str] | None = None,
+    source: str = "the table",
+) -> Columns:
+    """Return what the columns are, by their names or as the user says.
+
+    Args:
+        names: Of all columns.
+        columns: Names of those that are "trial", "time", "action", "x", "role", "index"
+            or "repeat_of"; others are then ignored. None goes by the names.
+        units: By column, with or without what stands in its brackets.
+        source: What messages call the table.
+
+    Raises:
+        ValueError: If a column is missing, unknown or there twice, or has two units.
+    """
+    twice = sorted({name for name in names if [*names].count(name) > 1})
+    if twice:
+        raise ValueError(
+            f"expected each column once; got {', '.join(twice)} more than once in "
+            f"{source}; do remove or rename one"
+        )
+    found = (
+        _by_name(names, source) if columns is None else _as_told(names, columns, source)
+    )
+    if bool(found[TRIAL]) != bool(found[TIME]):
+        there, missing = (TRIAL, TIME) if found[TRIAL] else (TIME, TRIAL)
+        raise ValueError(
+            f"expected columns {TRIAL} and {TIME} in a table with one row a sample; "
+            f"got {there} without {missing} in {source}; do add a column {missing}, or "
+            f"remove {there} where a row is a trial"
+        )
+    for key, beginning in (("action", ACTION), ("x", OBSERVATION)):
+        if not found[key]:
+            raise ValueError(
+                f"expected columns {beginning}*; got {', '.join(names)} in {source}; "
+                "do name them, as in action_speed, x_distance[m]"
+            )
+    used = [name for group in found.values() for name in group]
+    stated = _units(used, names, units or {}, source)
+    time = found[TIME][0] if found[TIME] else None
+    if time is not None:
+        unit = stated[time] or _suffix(time)
+        if unit not in ("", *SECONDS):
+            raise ValueError(
+                f"expected times in {', '.join(SECONDS)}; got {unit} in column {time} "
+                f"of {source}; do convert them"
+            )
+        stated[time] = unit
+    return Columns(
+        action=found["action"],
+        x=found["x"],
+        trial=found[TRIAL],
+        time=time,
+        optional={key: found[key][0] for key in OPTIONAL if found[key]},
+        units=stated,
+    )
+
+
+def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
+    found: dict[str, list[str]] = {key: [] for key in KEYS}
+    unknown = []
+    for name in names:
+        bare = _bare(name)
+        if bare.startswith(ACTION):
+            found["action"].append(name)
+        elif bare.startswith(OBSERVATION):
+            found["x"].append(name)
+        elif bare in KEYS:
+            found[bare].append(name)
+        elif bare.startswith(f"{TIME}_") and _suffix(bare):
+            found[TIME].append(name)
+        else:
+            unknown.append(name)
+    for key in (TRIAL, TIME, *OPTIONAL):
+        if len(found[key]) > 1:
+            raise ValueError(
+                f"expected one column {key}; got {', '.join(found[key])} in {source}; "
+                "do keep one"
+            )
+    missing = not (found["action"] and found["x"])
+    if unknown and not missing:
+        raise ValueError(
+            f"expected columns {ACTION}*, {OBSERVATION}*, {TRIAL}, {TIME}, "
+            f"{', '.join(OPTIONAL)}; got {', '.join(unknown)} in {source}; do rename "
+            "or remove what is none of these, or say which columns are what"
+        )
+    return {key: (*group,) for key, group in found.items()}
+
+
+def _as_told(
+    names: Sequence[str], columns: Mapping[str, str | Sequence[str]], source: str
+) -> dict[str, tuple[str, ...]]:
+    wrong = [key for key in columns if key not in KEYS]
+    if wrong:
+        raise ValueError(
+            f"expected columns of {', '.join(KEYS)}; got {', '.join(wrong)}; do say "
+            "which columns are these"
+        )
+    by_bare = {_bare(name): name for name in names}
+    found: dict[str, tuple[str, ...]] = dict.fromkeys(KEYS, ())
+    for key, value in columns.items():
+        told = [value] if isinstance(value, str) else [*value]
+        for name in told:
+            if name not in names and name not in by_bare:
+                near = difflib.get_close_matches(name, names, n=1)
+                hint = f"; {near[0]} is close" if near else ""
+                raise ValueError(
+                    f"expected a column {name} for {key}; got {', '.join(names)} in "
+                    f"{source}{hint}; do correct the name"
+                )
+        if key in (TIME, *OPTIONAL) and len(told) > 1:
+            raise ValueError(
+                f"expected one column for {key}; got {', '.join(told)}; do keep one"
+            )
+        found[key] = tuple(n if n in names else by_bare[n] for n in told)
+    return found
+
+
+def _units(
+    used: Sequence[str], names: Sequence[str], units: Mapping[str, str], source: str
+) -> dict[str, str]:
+    unknown = [u for u in units if u not in names and u not in map(_bare, names)]
+    if unknown:
+        raise ValueError(
+            f"expected units of columns {', '.join(names)}; got one of "
+            f"{', '.join(unknown)}; do correct the name"
+        )
+    found = {}
+    for name in used:
+        match = re.search(r"\[(.*)\]\s*$", name)
+        header = match.group(1).strip() if match else ""
+        given = units.get(name, units.get(_bare(name), ""))
+        if header and given and header != given:
+            raise ValueError(
+                f"expected one unit of column {name}; got [{header}] in the header of "
+                f"{source} and {given} in units; do convert the numbers, or correct one"
+            )
+        found[name] = header or given
+    _require_one_unit(found, source)
+    return found
+
+
+def _require_one_unit(units: Mapping[str, str], source: str) -> None:
+    """Raise where one quantity has columns of two units."""
+    seen: dict[str, str] = {}
+    for name in units:
+        other = seen.setdefault(_bare(name), name)
+        if other != name:
+            raise ValueError(
+                f"expected each quantity in one unit; got {other} and {name} in "
+                f"{source}; do convert one and merge them"
+            )
+
+
+def _bare(name: str) -> str:
+    """Return a column's name without its unit in brackets."""
+    return re.sub(r"\s*\[.*\]\s*$", "", name)
+
+
+def _suffix(name: str) -> str:
+    """Return the unit in a name like "time_ms"; "" for none."""
+    unit = _bare(name).rpartition("_")[2]
+    return unit if unit in SECONDS else ""

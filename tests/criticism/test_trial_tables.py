@@ -1,0 +1,203 @@
+"""Trials from tables: what is read, and what a user is told of what is not."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sbi_active.criticism import Trials
+
+LONG = "trial,time[s],action_speed[m/s],x_height[m]"
+SAMPLES = ["a,0,1,5.0", "a,0.1,1,4.9", "b,0,2,5.2", "b,0.1,2,5.1", "b,0.3,2,4.0"]
+
+
+def read(rows, header=LONG, **options):
+    with open("trials.csv", "w") as file:
+        file.write("\n".join([header, *rows]) + "\n")
+    return Trials.from_csv("trials.csv", **options)
+
+
+def test_a_row_a_sample_gives_ragged_trials():
+    trials = read(SAMPLES)
+    assert trials.x.shape == (2, 3)
+    assert trials.x[0].nan_to_num(-1).tolist() == [5.0, 4.9, -1]
+    assert trials.sample_times[1].tolist() == [0, 0.1, 0.3]
+    assert trials.action.tolist() == [[1], [2]]
+    assert trials.role == ["fit", "fit"]
+
+
+def test_units_of_the_header_are_carried_along():
+    trials = read(SAMPLES)
+    assert trials.action_labels == ("speed [m/s]",)
+    assert trials.channel_labels == ("height [m]",)
+    part = trials.select([1])
+    assert part.channel_labels == ("height [m]",)
+    named = read(["1,2"], "action_v,x_y", units={"x_y": "mm"})
+    assert (named.action_labels, named.channel_labels) == (("v",), ("y [mm]",))
+
+
+@pytest.mark.parametrize(
+    "time", ["time_ms", "time[ms]", "time"], ids=["suffix", "bracket", "told"]
+)
+def test_times_are_converted_to_seconds(time):
+    header = f"trial,{time},action_v,x_y"
+    rows = ["a,0,1,5.0", "a,100,1,4.9"]
+    units = {"time": "ms"} if time == "time" else None
+    trials = read(rows, header, units=units)
+    assert trials.sample_times.tolist() == [[0, 0.1]]
+
+
+def test_several_channels_stand_last():
+    header = "trial,time,action_v,x_a,x_b"
+    trials = read(["1,0,1,5,6", "1,1,1,7,8", "2,0,1,,9"], header)
+    assert trials.x.shape == (2, 2, 2)
+    assert trials.x[0].tolist() == [[5, 6], [7, 8]]
+    assert trials.mask[1].tolist() == [[False, True], [False, False]]
+
+
+def test_columns_may_have_names_of_their_own():
+    header = "ball,drop,time_s,height_m,velocity,area"
+    rows = ["golf,1,0,5,0,.1", "golf,1,.1,4,9,.1", "golf,2,0,6,0,.1"]
+    told = {"trial": ["ball", "drop"], "time": "time_s", "x": "height_m"}
+    trials = read(rows, header, columns={**told, "action": "area"})
+    assert trials.x.shape == (2, 2)
+    assert trials.channel_labels == ("height_m",)
+    assert trials.repeat_of.tolist() == [-1, 0]  # of equal actions
+
+
+def test_a_frame_is_read_as_its_file():
+    trials = read([*SAMPLES])
+    frame = pd.read_csv("trials.csv")
+    same = Trials.from_dataframe(frame)
+    assert same.x.nan_to_num(0).equal(trials.x.nan_to_num(0))
+    assert same.action_labels == trials.action_labels
+    frame.loc[1, "x_height[m]"] = np.nan
+    with pytest.warns(UserWarning, match=r"1 of 5 cells .* row 2 \(trial a\)"):
+        lost = Trials.from_dataframe(frame)
+    assert lost.mask[0].tolist() == [True, False, False]
+
+
+def test_what_belongs_to_a_trial_is_read_from_its_rows():
+    header = "trial,time,action_v,x_y,role,index,repeat_of"
+    rows = ["a,0,1,5,fit,7,", "a,1,1,4,fit,7,", "b,0,1,5,held out,9,7"]
+    trials = read(rows, header)
+    assert trials.role == ["fit", "held out"]
+    assert trials.index.tolist() == [7, 9]
+    assert trials.repeat_of.tolist() == [-1, 0]
+
+
+SHORT = "trial,time,action_v,x_y"
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        (["1,2,3"], "trial,action_v,x_y", "got trial without time in trials.csv; do"),
+        (["1,2,3"], "time,action_v,x_y", "got time without trial in trials.csv; do"),
+        (["1,0,3"], "trial,time,x_y", r"columns action_\*; got trial, time, x_y in"),
+        (["1,0,3"], "trial,time,action_v", r"columns x_\*; got trial, time, action_v"),
+        (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; do rename or"),
+        (["1,0,1,2,3"], f"{SHORT},x_y", "got x_y more than once in trials.csv"),
+        (
+            ["1,0,1,2,3"],
+            "trial,time,action_v,x_y[m],x_y[cm]",
+            r"x_y\[m\] and x_y\[cm\]",
+        ),
+        (
+            ["1,0,1,2"],
+            "trial,time[h],action_v,x_y",
+            "times in s, ms, us, min; got h in",
+        ),
+        (["1,0,1,2,3"], f"{SHORT},time_s", "one column time; got time, time_s"),
+        (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),
+        (['1,0,1,"5,2"'], SHORT, "got '5,2' in trials.csv; do write decimals with a"),
+        (["1,0,1,5", "1,x,1,4"], SHORT, r"column time, row 2 \(trial 1\); got 'x'"),
+        (["1,0,1,5", "1,,1,4"], SHORT, r"number in column time, row 2 .*an empty cell"),
+        (
+            ["1,0,1,5", "1,1,nan,4"],
+            SHORT,
+            r"column action_v, row 2 \(trial 1\); got nan",
+        ),
+        (["1,0,1,inf"], SHORT, "a finite number in column x_y, row 1 .*; got inf"),
+        (
+            ["1,0,1,5", ",1,1,4"],
+            SHORT,
+            "name of a trial in column trial, row 2; got an",
+        ),
+        (
+            ["1,0,1,5", "1,1,2,4"],
+            SHORT,
+            r"one value of action_v .* row 1 and 2.0 in row",
+        ),
+        (
+            ["1,0,1,5", "2,0,1,4", "1,0,1,5"],
+            SHORT,
+            "= 0 s in rows 1 and 3 .* trial 1; do",
+        ),
+        (
+            ["1,1,1,5", "1,0,1,4"],
+            SHORT,
+            r"increase .* got 0 s in row 2 \(trial 1\) after",
+        ),
+        (["1,0,1,5", "2,0,1,5"], SHORT, "the same numbers in trials 1 and 2 of trials"),
+        (["1,0,1,5,ok"], f"{SHORT},role", r"column role, row 1 \(trial 1\); got 'ok'"),
+        (["1,0,1,5,fit", "1,1,1,4,held out"], f"{SHORT},role", "value of role in each"),
+        (["1,0,1,5,3", "2,0,1,4,3"], f"{SHORT},index", "got index 3 in rows 1 and 2"),
+        (
+            ["1;0;1;5"],
+            "trial;time;action_v;x_y",
+            "separated by commas; got 'trial;time",
+        ),
+        (["1,0,1,"], SHORT, "at least one valid trial"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*hold no number")
+def test_a_long_table_that_is_not_understood(rows, header, message):
+    with pytest.raises(ValueError, match=message):
+        read(rows, header)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y; do say"),
+        ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*; x_y is close"),
+        ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
+        ({"units": {"x_z": "m"}}, "got one of x_z; do correct the name"),
+    ],
+)
+def test_options_that_do_not_fit_the_table(options, message):
+    with pytest.raises(ValueError, match=message):
+        read(["1,0,1,5"], SHORT, **options)
+
+
+def test_two_units_of_one_column():
+    with pytest.raises(ValueError, match=r"got \[m/s\] in the header .* and km/h in"):
+        read(SAMPLES, units={"action_speed": "km/h"})
+
+
+def test_a_file_that_is_not_there():
+    with pytest.raises(FileNotFoundError, match="expected a CSV file; got none at"):
+        Trials.from_csv("nowhere.csv")
+
+
+def test_a_trial_in_another_unit_is_noted():
+    rows = [
+        f"{t},{s},1,{(5 - s) * (1000 if t == 2 else 1) + t / 9}"
+        for t in range(4)
+        for s in (0, 1)
+    ]
+    with pytest.warns(UserWarning, match="x_y of trials 2 .* times larger"):
+        read(rows, SHORT)
+    fast = [
+        f"{t},{s * (0.001 if t == 3 else 1)},1,{t + s}"
+        for t in range(4)
+        for s in (0, 1)
+    ]
+    with pytest.warns(UserWarning, match="time of trials 3 .* 1000 times smaller"):
+        read(fast, SHORT)
+
+
+@pytest.mark.filterwarnings("error")
+def test_trials_that_differ_little_are_not_noted():
+    rows = [f"{t},{s},{t + 1},{3.0**t + s}" for t in range(4) for s in (0, 1)]
+    assert len(read(rows, SHORT)) == 4
