@@ -27,6 +27,7 @@ __all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]
 Kind = Literal["clean", "library", "outside", "removed", "pair"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 HELD_OUT = 8  # trials that no step may fit or choose by
+MISMATCH = 3.0  # residual of a number that is there in one outcome alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +128,9 @@ class Truth:
         """
         x = self.predict(parameters, effects, self.action, 0)
         error = (x - target.double()) / self.world.noise_sd
+        # An outcome where there is none, or none where there is one.
+        error = error.where(x.isnan() == target.isnan(), error.new_tensor(MISMATCH))
+        error = error.nan_to_num(nan=0.0)
         return whiten(error, self.correlation).flatten(1)
 
     def predict(
@@ -186,7 +190,8 @@ def draw_case(
     """Draw one case.
 
     The effect is uniform among those of its kind (noise inflation counts as one of the
-    library), its strength has its prior, theta the prior, and actions are uniform.
+    library), or the next of those that the world names as hidden; its strength has its
+    prior, theta the prior, and actions are uniform.
 
     Args:
         world: Where.
@@ -209,11 +214,11 @@ def draw_case(
     seed = derive_seed(number, "case", world.name, kind)
     with forked_generators(seed):
         theta = world.prior.sample((1,))
-        effects = _draw_effects(world, kind)
+        effects = _draw_effects(world, kind, number)
         strengths = tuple(effect.prior.sample((1,)) for effect in effects)
         which = int(torch.randint(len(world.correlations), (1,)))
         action = world.actions.sample((64 + num_held_out,))
-    held_out = action[64:]
+    held_out, spare = action[64:], action[num_trials:64]
     action = action[:num_trials]
     truth = Truth(
         world=world,
@@ -232,7 +237,7 @@ def draw_case(
     problem = Problem(
         model=world.model,
         prior=world.prior,
-        trials=make_trials(truth, action, held_out),
+        trials=make_trials(truth, action, _with_outcome(truth, held_out, spare)),
         effects=library,
         actions=world.actions,
     )
@@ -308,7 +313,22 @@ def whiten(error: Tensor, correlation: float) -> Tensor:
     return torch.cat([error[..., :1], fresh / (1 - correlation**2) ** 0.5], -1)
 
 
-def _draw_effects(world: World, kind: Kind) -> tuple[Effect, ...]:
+def _with_outcome(truth: Truth, action: Tensor, spare: Tensor) -> Tensor:
+    """Return the actions, those without an outcome replaced by spare ones with one."""
+
+    def some(among: Tensor) -> Tensor:
+        index = torch.zeros(len(among), dtype=torch.long)
+        theta = truth.theta.expand(len(among), -1)
+        x, _ = respond(truth.world, theta, among, index, truth.effects, truth.strengths)
+        return among[x.isfinite().flatten(1).all(1)]
+
+    kept = some(action)
+    if len(kept) == len(action):
+        return action
+    return torch.cat([kept, some(spare)])[: len(action)]
+
+
+def _draw_effects(world: World, kind: Kind, number: int) -> tuple[Effect, ...]:
     def one(among: Sequence[Effect]) -> Effect:
         return among[int(torch.randint(len(among), (1,)))]
 
@@ -318,6 +338,9 @@ def _draw_effects(world: World, kind: Kind) -> tuple[Effect, ...]:
         return ()
     if kind == "outside":
         return (one(world.outside),)
+    if kind == "library" and world.hidden:
+        name = world.hidden[number % len(world.hidden)]
+        return (next(e for e in library if e.name == name),)
     if kind == "library":
         return (one([*library, world.scatter]),)
     first = one(visible)

@@ -7,6 +7,7 @@
     python -m benchmarks.criticism.run --table active --world B --trials 10 --cases 40
     python -m benchmarks.criticism.run --table priors --world A --scale 3 --cases 100
     python -m benchmarks.criticism.run --table correlation --world C --cases 100
+    python -m benchmarks.criticism.run --table loop --world D --kind library --cases 60
     python -m benchmarks.criticism.run --table loop --world A --summary
 
 loop: false alarms, power, tracing, calibration, error before and after. open: the
@@ -87,6 +88,7 @@ def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> 
             rows = score_active(case, number)
         else:
             oracle = kind == "library" and case.truth.effects[0].hook != "noise"
+            oracle = oracle and world.has_oracle
             rows = [score_case(case, number, oracle=oracle)]
         append(path, rows, ACTIVE_COLUMNS if active else COLUMNS)
         last = rows[-1]
@@ -125,7 +127,7 @@ def main() -> None:
     """Run what is asked for and print its table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--table", choices=[*TABLES], default="loop")
-    parser.add_argument("--world", choices=["A", "B", "C"], default="A")
+    parser.add_argument("--world", choices=["A", "B", "C", "D"], default="A")
     parser.add_argument("--kind", choices=KINDS)
     parser.add_argument("--trials", type=int, default=8)
     parser.add_argument("--cases", type=int, default=200)

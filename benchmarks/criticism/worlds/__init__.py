@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from benchmarks.criticism.worlds import numerical, sliding_block, trajectories
+from benchmarks.criticism.worlds import box, numerical, sliding_block, trajectories
 from benchmarks.criticism.worlds.world import World
 
 __all__ = ["World", "get_world"]
@@ -11,6 +11,7 @@ WORLDS = {
     "A": numerical.make_world,
     "B": sliding_block.make_world,
     "C": trajectories.make_world,
+    "D": box.make_world,
 }
 
 
@@ -18,7 +19,8 @@ def get_world(name: str, **options: Any) -> World:
     """Return a world by its letter.
 
     Args:
-        name: "A" the numerical model, "B" the sliding block, "C" its trajectories.
+        name: "A" the numerical model, "B" the sliding block, "C" its trajectories,
+            "D" the box collision.
         options: Of the world, see its ``make_world``.
     """
     if name not in WORLDS:

@@ -46,6 +46,9 @@ class World:
             with the names of that term.
         correlations: Of neighboring errors along a trajectory; a case draws one.
         sample_times: Of the entries of x, s; empty without a time axis.
+        hidden: Names of the effects of the library that cases of that kind have, in
+            turn; none has any of the library or noise inflation, at random.
+        has_oracle: Whether the model that is given the true effect is scored besides.
     """
 
     name: str
@@ -61,6 +64,8 @@ class World:
     formulas: Mapping[str, frozenset[str]] = field(default_factory=dict)
     correlations: Sequence[float] = (0.0,)
     sample_times: Sequence[float] = ()
+    hidden: Sequence[str] = ()
+    has_oracle: bool = True
 
     @property
     def effects(self) -> list[Effect]:
