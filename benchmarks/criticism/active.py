@@ -1,6 +1,6 @@
 """Trials chosen by the loop beside random ones.
 
-Both policies begin with the same three trials at random, which count, and have the same
+Both policies begin with the same two trials at random, which count, and have the same
 noise in the trial of a number. Only cases are run whose effect a table of its own would
 expect to be named: lambda above 25 with all of the *random* policy's trials. That
 leaves out effects too weak to be seen, effects equivalent to none, and noise inflation

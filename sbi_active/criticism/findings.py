@@ -86,6 +86,11 @@ def equivalences(report: Report) -> Section:
         for group in tracing.near
         if group not in tracing.equivalent
     ]
+    items += [
+        f"{joined(group)}: nearly the same here, apart by less than the noise; "
+        "repeated trials may separate them"
+        for group in tracing.aliases
+    ]
     by = "these trials" if report.next_action is None else "a permitted action"
     text = () if items else (f"Every pair of models is separated by {by}.",)
     return Section("Equivalence sets", text=text, items=tuple(items))

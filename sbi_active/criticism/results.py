@@ -161,9 +161,11 @@ class Tracing:
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
         near: The same for the trials at hand alone; another action may separate them.
-            After an alarm also pairs of effects that explain the data about as well
+        aliases: After an alarm, pairs of effects that explain the data about as well
             (log evidence within log 20 of the best) with predictions closer than the
-            noise over the permitted actions.
+            noise over the permitted actions; repeated trials may separate them.
+        aliases: Pairs of likely effects whose predictions differ by less than the noise
+            over the permitted actions; repeated trials separate them.
         estimates: One an effect, most probable first.
         evidences: Of every model tried, by name, effects with priors of unknown scale.
         robust: Whether the verdict is that of effect priors a third and three times as
@@ -179,6 +181,7 @@ class Tracing:
     credible_set: tuple[str, ...]
     equivalent: tuple[frozenset[str], ...]
     near: tuple[frozenset[str], ...]
+    aliases: tuple[frozenset[str], ...]
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
     robust: bool

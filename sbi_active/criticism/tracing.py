@@ -89,8 +89,9 @@ def trace(
     probabilities = _normalized(log_p)
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
     near = equivalent_effects(rivals, None) if compare else ()
+    aliases = ()
     if compare and detection.alarm:
-        near += near_aliases(rivals, actions, [*equivalent, *near])
+        aliases = near_aliases(rivals, actions, [*equivalent, *near])
     chosen = _effects_of(verdict)
     inclusion = {
         name: sum(p for k, p in probabilities.items() if name in k.split(" + "))
@@ -104,6 +105,7 @@ def trace(
         credible_set=_credible_set(probabilities),
         equivalent=(*equivalent,),
         near=near,
+        aliases=aliases,
         estimates=_estimates(rivals, inclusion),
         evidences={name: _under_unknown_scale(rivals, name) for name in log_p},
         robust=_is_robust(rivals, log_p, equivalent, verdict, prior),

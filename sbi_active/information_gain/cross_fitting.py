@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["cross_fit", "patterns_of_numbers"]
+__all__ = ["NUM_FOLDS", "cross_fit", "patterns_of_numbers"]
 
 NUM_FOLDS = 4
 

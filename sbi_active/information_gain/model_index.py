@@ -16,7 +16,11 @@ from sbi_active.information_gain.base import (
     InformationGainEstimator,
 )
 from sbi_active.information_gain.class_density import TEMPERATURES, class_members
-from sbi_active.information_gain.cross_fitting import cross_fit, patterns_of_numbers
+from sbi_active.information_gain.cross_fitting import (
+    NUM_FOLDS,
+    cross_fit,
+    patterns_of_numbers,
+)
 from sbi_active.information_gain.noise_kernels import MOST_NUMBERS, noise_members
 from sbi_active.seeding import derive_seed
 
@@ -278,7 +282,9 @@ def _blocks(
     block = torch.empty(len(index)).long()
     for k in range(num_models):
         own = index == k
-        _, block[own] = mean[own].unique(dim=0, return_inverse=True)
+        distinct, block[own] = mean[own].unique(dim=0, return_inverse=True)
+        if len(distinct) < 2 * NUM_FOLDS:  # a fold would have none of the model
+            block[own] = torch.arange(int(own.sum()))
     return block
 
 
@@ -299,15 +305,18 @@ def _score(
 
     def log_shares(train: Tensor) -> Tensor:
         """Log share of the pattern among each model's draws outside the fold."""
-        fold = set((block[rows[train]] % 4).tolist())
-        used = counted & torch.tensor([int(b) % 4 in fold for b in block])
+        folds = set((block[rows[train]] % NUM_FOLDS).tolist())
+        used = counted & torch.tensor([int(b) % NUM_FOLDS in folds for b in block])
         hits = torch.bincount(index[used & inside], minlength=num_models) + 0.5
         return (hits / (torch.bincount(index[used], minlength=num_models) + 1)).log()
 
+    # the same members in every fold, or they could not be compared
+    fold = torch.nn.functional.one_hot(block[rows] % NUM_FOLDS, NUM_FOLDS)
+    each = torch.stack([fold[own == k].sum(0) for k in range(num_models)])
+    enough = (each.sum(1) - each.amax(1)) >= FEW
+
     def score(train: Tensor, test: Tensor) -> Tensor:
         log_prior = log_p + log_shares(train)
-        count = torch.bincount(own[train], minlength=num_models)
-        enough = count >= FEW
         narrow = []
         if noise is not None:
             center, width = (part[train] for part in noise)

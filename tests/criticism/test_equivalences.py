@@ -74,4 +74,4 @@ def test_world_b_speed_gain_is_nearly_camera_scale_where_data_are_weak(number, i
         evaluate=False,
     )
     assert report.tracing.equivalent == ()
-    assert (frozenset(NEAR) in report.tracing.near) is is_near
+    assert (frozenset(NEAR) in report.tracing.aliases) is is_near
