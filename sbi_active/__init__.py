@@ -29,6 +29,7 @@ from sbi_active.simulation import (
     StudentTNoise,
     estimate_noise,
     simulate,
+    unknown_noise,
 )
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ __all__ = [
     "estimate_noise",
     "simulate",
     "to_inference_data",
+    "unknown_noise",
 ]
 
 

@@ -39,7 +39,7 @@ from sbi_active.criticism.predictive import predict
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Tracing
 from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
-from sbi_active.tasks.servo_pendulum.noise import unknown_noise  # pyright: ignore
+from sbi_active.tasks.servo_pendulum.noise import servo_noise  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
 __all__ = ["coarsened", "judge", "main", "simulated"]
@@ -313,7 +313,7 @@ def _stages(task: ServoPendulumTask, rows: dict[str, Any], arguments: Any) -> An
                 clean = simulated(task, bare, full, split, seed=i)
                 yield f"clean {i}", run(f"clean {i}", clean, split, held)
         return
-    iid = ServoPendulumTask(data=task.recordings, noise=unknown_noise(correlated=False))
+    iid = ServoPendulumTask(data=task.recordings, noise=servo_noise(correlated=False))
     for name, parts in (
         ("powered, iid", (on, ())),
         ("motor off, iid", (split, held)),

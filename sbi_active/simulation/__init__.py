@@ -17,6 +17,7 @@ from sbi_active.simulation.outcomes import (
 from sbi_active.simulation.simulator_report import SimulatorReport
 from sbi_active.simulation.store import RowStore
 from sbi_active.simulation.student import StudentTNoise
+from sbi_active.simulation.unknown_noise import unknown_noise
 
 __all__ = [
     "AutocorrelatedNoise",
@@ -39,4 +40,5 @@ __all__ = [
     "require_noise",
     "reuse",
     "simulate",
+    "unknown_noise",
 ]

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import torch
+from sbi_active.simulation import AutocorrelatedNoise, unknown_noise
 
-from sbi_active.simulation import AutocorrelatedNoise
-from sbi_active.simulation.noise_posterior import Cells, NoisePosterior, SdGrid
-
-__all__ = ["unknown_noise"]
+__all__ = ["servo_noise"]
 
 #: Standard deviation, rad: from some quanta of the encoder to the size of the motion.
-SMALLEST, LARGEST, NUM_SDS = 0.005, 0.5, 60
+SD = 0.005, 0.5
 #: Correlation time, s: from a tenth of a sample's distance to the length of a trial.
-SHORTEST, LONGEST, NUM_TIMES = 0.02, 6.0, 12
-NO_TIME = 1e-6  # s; far below any distance of samples
+CORRELATION_TIME = 0.02, 6.0
+NO_TIME = 1e-6, 1.001e-6  # s; far below any distance of samples
 
 
-def unknown_noise(*, correlated: bool = True) -> AutocorrelatedNoise:
+def servo_noise(*, correlated: bool = True) -> AutocorrelatedNoise:
     r"""Return autocorrelated noise whose parameters have log-uniform priors.
 
     The encoder rounds to 1.5 mrad, which is nothing beside what any simulator of the
@@ -25,25 +22,9 @@ def unknown_noise(*, correlated: bool = True) -> AutocorrelatedNoise:
     Args:
         correlated: False forces errors that are independent, of unknown size.
     """
-    sd = _edges(SMALLEST, LARGEST, NUM_SDS)
-    times = _edges(SHORTEST, LONGEST, NUM_TIMES)
-    if not correlated:
-        times = _edges(NO_TIME, 1.001 * NO_TIME, 1)
-    num = len(times) - 1
-    prior = NoisePosterior(
-        SdGrid(sd[None], _uniform(NUM_SDS).expand(num, 1, NUM_SDS)),
-        shared=Cells(times, _uniform(num)),
+    return unknown_noise(
+        sd=SD,
+        correlation_time=CORRELATION_TIME if correlated else NO_TIME,
+        num_sds=60,
+        num_times=12 if correlated else 1,
     )
-    middle = float(times[0] * times[-1]) ** 0.5
-    return AutocorrelatedNoise((SMALLEST * LARGEST) ** 0.5, middle, posterior=prior)
-
-
-def _edges(low: float, high: float, num: int) -> torch.Tensor:
-    ends = torch.tensor([low, high], dtype=torch.float64).log()
-    return torch.linspace(
-        float(ends[0]), float(ends[1]), num + 1, dtype=torch.float64
-    ).exp()
-
-
-def _uniform(num: int) -> torch.Tensor:
-    return -torch.full((num,), float(num), dtype=torch.float64).log()

@@ -23,7 +23,7 @@ from sbi_active.tasks.servo_pendulum.model import (
     PRIOR_LOW,
     angles,
 )
-from sbi_active.tasks.servo_pendulum.noise import unknown_noise
+from sbi_active.tasks.servo_pendulum.noise import servo_noise
 from sbi_active.tasks.servo_pendulum.recordings import (
     RATE,
     Recordings,
@@ -82,7 +82,7 @@ class ServoPendulumTask(Task):
                 f"expected theta_true of {len(PARAMETER_NAMES)} numbers, "
                 f"{', '.join(PARAMETER_NAMES)}; got {theta_true}; do give one each"
             )
-        self.noise = unknown_noise() if noise is None else noise
+        self.noise = servo_noise() if noise is None else noise
         self.prior = BoxUniform(torch.tensor(PRIOR_LOW), torch.tensor(PRIOR_HIGH))
         self.actions = DiscreteActions(
             torch.from_numpy(self.recordings.action).float(),

@@ -11,6 +11,7 @@ from scipy.stats import kstest
 from benchmarks.measured import ball_drops as benchmark
 from benchmarks.measured.ball_tables import tables
 from benchmarks.measured.fall_least_squares import forecast_error, second_drop_error
+from sbi_active import unknown_noise
 from sbi_active.criticism import AugmentedSimulator, Criticism
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.ball_drops import (  # pyright: ignore
@@ -22,7 +23,6 @@ from sbi_active.tasks.ball_drops import (  # pyright: ignore
     read_drops,
     trials_of,
 )
-from sbi_active.tasks.ball_drops.noise import unknown_noise  # pyright: ignore
 from sbi_active.tasks.ball_drops.product import Product  # pyright: ignore
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "ball_drops"
@@ -99,7 +99,9 @@ def test_the_task_is_a_real_system():
 
 def test_the_noise_is_log_uniform_in_size_and_correlation_time():
     bounds = torch.tensor([[0.02, 0.2], [0.015, 7.5]]).double()
-    noise = unknown_noise(sd=(0.02, 0.2), correlation_time=(0.015, 7.5))
+    noise = unknown_noise(
+        sd=(0.02, 0.2), correlation_time=(0.015, 7.5), num_sds=16, num_times=10
+    )
     assert noise.posterior is not None
     low, high = bounds.log().T
     share = (noise.posterior.sample((2_000,)).log() - low) / (high - low)

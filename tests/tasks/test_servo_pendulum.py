@@ -16,7 +16,7 @@ from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
     ServoPendulumTask,
     read_recordings,
 )
-from sbi_active.tasks.servo_pendulum.noise import unknown_noise  # pyright: ignore
+from sbi_active.tasks.servo_pendulum.noise import servo_noise  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
 FOLDER = DATA.resolve()  # before a test changes the working directory
@@ -149,7 +149,7 @@ def test_the_real_system_replays(task):
 
 
 def test_noise_of_unknown_size_covers_its_ranges():
-    noise = unknown_noise()
+    noise = servo_noise()
     assert noise.posterior is not None
     draws = noise.posterior.sample((4_000,))
     low, middle, high = draws.log().quantile(
@@ -160,18 +160,18 @@ def test_noise_of_unknown_size_covers_its_ranges():
     # A uniform's median has the standard error width / 2 / sqrt(n).
     error = (high - low) / 2 / 4_000**0.5
     assert bool(((middle - (low + high) / 2).abs() < 4 * error).all())
-    independent = unknown_noise(correlated=False).sample(torch.zeros(500, 30))
+    independent = servo_noise(correlated=False).sample(torch.zeros(500, 30))
     product = independent[:, 1:] * independent[:, :-1] / independent.square().mean()
     assert abs(float(product.mean())) < 4 * float(product.std()) / 500**0.5
 
 
-def test_the_loop_sums_the_unknown_noise_out(task):
+def test_the_loop_sums_the_servo_noise_out(task):
     """Its likelihood is the sum over the declared prior's cells."""
     trials = task.trials([1])
     measured = Measurements.of(trials)
     residual = 0.05 * torch.sin(3 * torch.from_numpy(task.recordings.times))[None]
-    own = declared_noise(unknown_noise(), measured).log_likelihood(residual.numpy())
-    posterior = unknown_noise().posterior
+    own = declared_noise(servo_noise(), measured).log_likelihood(residual.numpy())
+    posterior = servo_noise().posterior
     times = (posterior.shared.edges[1:] * posterior.shared.edges[:-1]).sqrt()
     sds = posterior.sd.nodes[0]
     parts = [
@@ -193,7 +193,7 @@ def test_the_loop_sums_the_unknown_noise_out(task):
         parameters=draws,
     )
     share = (each - expected).exp()
-    marginal = unknown_noise().log_prob(
+    marginal = servo_noise().log_prob(
         residual, torch.zeros_like(residual), times=trials.sample_times
     )
     error = float(share.std()) / 256**0.5
