@@ -179,14 +179,16 @@ def test_a_nuisance_of_each_trial_is_integrated_out():
 
 def test_an_unseen_trial_draws_its_own_nuisance():
     trials, new = Trials(ACTION, X), Trials([0.5, 1.5], [1.0, 5.0])
-    density = predict(rivals(line, trials, [START]), new).log_density
+    # Only draws in the tail of the nuisance reach the second: of 4,000, each from one of
+    # some 170 effective particles, an error of .1 to .15.
+    sample = rivals(line, trials, [START])
+    density = predict(sample, new, num_draws=4_000).log_density
     every = [torch.cat([ACTION, a[None]]) for a in new.action.float()]
     expected = [
         exact(a, torch.cat([X[:, 0], y.float()]), extra=0.8)
         - exact(ACTION, X[:, 0], extra=0.8)
         for a, y in zip(every, new.x, strict=True)
     ]
-    # 200 draws: the density's relative error is below 0.1 a standard deviation.
     np.testing.assert_allclose(density, expected, atol=0.4)
 
 
