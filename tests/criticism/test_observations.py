@@ -179,7 +179,7 @@ def test_a_nuisance_of_each_trial_is_integrated_out():
 
 def test_an_unseen_trial_draws_its_own_nuisance():
     trials, new = Trials(ACTION, X), Trials([0.5, 1.5], [1.0, 5.0])
-    # Only draws in the tail of the nuisance reach the second: of 4,000, each from one of
+    # Only draws in the tail of the nuisance reach the second: of 4,000, each of one of
     # some 170 effective particles, an error of .1 to .15.
     sample = rivals(line, trials, [START])
     density = predict(sample, new, num_draws=4_000).log_density
