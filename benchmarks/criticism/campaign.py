@@ -43,7 +43,6 @@ RESULTS = Path(__file__).parent / "results"
 KINDS = ("hidden", "clean")
 POLICIES = ("auto", "theta", "check")
 NUM_TRIALS = 6
-LEVELS = (0.9, 0.99)
 NUM_DRAWS = 4_000
 COLUMNS = [
     *["case", "kind", "strength", "theta", "actions", "lambda", "alarm_at", "health"],
