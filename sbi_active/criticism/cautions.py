@@ -149,6 +149,11 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
             f"evidence uncertain of {', '.join(weak)}: so are the probabilities that "
             "rest on it"
         )
+    if detection is not None and detection.alarm and not detection.by_evidence:
+        yield (
+            "the alarm rests on the chi-square alone: no alternative has a Bayes "
+            "factor of 20, so that what is lacking is a suggestion"
+        )
     check = None if detection is None else detection.null_cross_check
     if detection is not None and check is not None:
         difference = check - detection.null_log_evidence

@@ -115,7 +115,7 @@ def residuals(report: Report) -> Section:
         "root mean square of about 1, and 5 % beyond 2, where the model holds. "
         "Refitted to all trials, and each trial predicted from those before it.",
         f"{noise} Chi-square of the bare model "
-        f"{detection.chi_square:.1f} on {detection.degrees_of_freedom} degrees of "
+        f"{detection.chi_square:.1f} on {detection.degrees_of_freedom:.1f} degrees of "
         f"freedom, p {f'= {p:.2g}' if p >= SMALLEST_P else f'< {SMALLEST_P:g}'}.",
     ]
     if before.times is not None:

@@ -56,6 +56,8 @@ def summary_sentence(report: Report) -> str:
         f"log Bayes factor against it {detection.log_bayes_factor:.1f} nats, at least "
         f"{detection.lower:.1f}; {detection.threshold:.1f} raises the alarm"
     )
+    if detection.by_chi_square and not detection.by_evidence:
+        against += f", and so does its chi-square, p = {detection.p_value:.2g}"
     if report.verdict == NONE:
         return f"The bare model explains the {trials} ({against})."
     found = [f"The bare model misses the {trials} ({against})."]

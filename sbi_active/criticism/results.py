@@ -92,29 +92,44 @@ class Detection:
     r"""Whether the bare model, refitted, still misses the data.
 
     Attributes:
-        alarm: True where ``lower`` exceeds ``threshold``.
         log_bayes_factor: Of the mixture of effects and catch-alls
             against the bare model, nats.
         standard_error: Monte Carlo, nats.
         lower: log_bayes_factor minus twice its standard error.
         threshold: log 20.
         chi_square: Smallest whitened residual sum of squares of the bare model.
-        degrees_of_freedom: Measurements less parameters.
+        degrees_of_freedom: Measurements less the parameters that they determine.
         p_value: Of that chi-square; anti-conservative where noise is estimated.
+        level: Below which it is an alarm; 0 where something is unknown of the noise.
         null_log_evidence: By least squares, nats.
         null_cross_check: The same by tempering; None where no alarm was near.
     """
 
-    alarm: bool
     log_bayes_factor: float
     standard_error: float
     lower: float
     threshold: float
     chi_square: float
-    degrees_of_freedom: int
+    degrees_of_freedom: float
     p_value: float
+    level: float
     null_log_evidence: float
     null_cross_check: float | None
+
+    @property
+    def alarm(self) -> bool:
+        """Whether there is something to trace."""
+        return self.by_evidence or self.by_chi_square
+
+    @property
+    def by_evidence(self) -> bool:
+        """Whether the Bayes factor raises the alarm."""
+        return self.lower > self.threshold
+
+    @property
+    def by_chi_square(self) -> bool:
+        """Whether the chi-square raises the alarm."""
+        return self.p_value < self.level
 
 
 @dataclass(frozen=True, kw_only=True)

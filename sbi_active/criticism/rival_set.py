@@ -33,7 +33,7 @@ from sbi_active.criticism.tempering import temper
 from sbi_active.criticism.trial_simulator import TrialSimulator
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 
 __all__ = ["RivalSet"]
 
@@ -150,6 +150,12 @@ class RivalSet:
                 else (DISAGREEMENT,)
             ),
         )
+
+    @property
+    def has_known_noise(self) -> bool:
+        """Whether errors are declared as Gaussian with nothing unknown."""
+        gaussian = isinstance(self.model.noise, GaussianNoise | AutocorrelatedNoise)
+        return gaussian and self.noise.shape == (1, 1)
 
     def residual_process(self) -> ResidualProcess:
         """Return the noise with a smooth function of the action and time."""

@@ -108,7 +108,7 @@ def trace(
         aliases=aliases,
         estimates=_estimates(rivals, inclusion),
         evidences={name: _under_unknown_scale(rivals, name) for name in log_p},
-        robust=_is_robust(rivals, log_p, equivalent, verdict, prior),
+        robust=_is_robust(rivals, detection, log_p, equivalent, verdict),
     )
 
 
@@ -187,12 +187,13 @@ def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate,
 
 def _is_robust(
     rivals: RivalSet,
+    detection: Detection,
     log_p: dict[str, float],
     equivalent: Sequence[frozenset[str]],
     verdict: str,
-    prior: dict[str, float],
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
+    prior = log_priors([*rivals.effects.values()])
     for factor in RESCALED:
         scaled = {**log_p}
         for name in log_p:
@@ -205,6 +206,7 @@ def _is_robust(
         singles = [scaled[k] - prior[k] + np.log(w) for k, w in weights.items()]
         log_b = log_sum_exp(np.array(singles))
         alarm = bool(log_b - (log_p[NONE] - prior[NONE]) > THRESHOLD)
+        alarm = alarm or detection.by_chi_square
         if _verdict(_normalized(scaled), equivalent, alarm=alarm) != verdict:
             return False
     return True

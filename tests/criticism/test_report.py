@@ -163,7 +163,6 @@ def report(**changes):
         "residuals": residuals(size=6.0),
         "residuals_after": residuals(),
         "detection": Detection(
-            alarm=True,
             log_bayes_factor=8.2,
             standard_error=0.1,
             lower=8.0,
@@ -171,6 +170,7 @@ def report(**changes):
             chi_square=180.4,
             degrees_of_freedom=46,
             p_value=1e-16,
+            level=0.01,
             null_log_evidence=-3.0,
             null_cross_check=-3.1,
         ),

@@ -1,0 +1,83 @@
+"""When the bare model raises an alarm: by its Bayes factor, or by its chi-square."""
+
+import numpy as np
+import torch
+from sbi.utils import BoxUniform
+from scipy.stats import kstest
+from torch.distributions import Normal
+
+from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
+from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.detection import LEVEL, num_determined
+from sbi_active.simulation import estimate_noise
+
+NOISE = 0.1
+PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
+CUBIC = Effect(
+    "cubic",
+    hook="observation",
+    prior=Normal(torch.zeros(1), torch.ones(1)),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi * action**3,
+)
+
+
+def line(theta, action):
+    return theta[:, :1] + theta[:, 1:] * action
+
+
+def criticism(x, action, *, noise=None, fn=line, prior=PRIOR):
+    model = SimulatorModel(fn, noise=noise or GaussianNoise(NOISE))
+    return Criticism(model, prior, Trials(action, x), effects=[CUBIC])
+
+
+def draws(num_sets, *, seed, num=8):
+    gen = torch.Generator().manual_seed(seed)
+    for _ in range(num_sets):
+        theta = 2 * torch.rand(1, 2, generator=gen) - 1
+        action = 4 * torch.rand(num, 1, generator=gen) - 2
+        x = line(theta.expand(num, -1), action)
+        yield x + NOISE * torch.randn(x.shape, generator=gen), action
+
+
+def zigzag(size):
+    """A residual that no declared effect takes up, along the actions."""
+    action = torch.linspace(-2, 2, 8)[:, None]
+    return size * NOISE * torch.tensor([1.0, -1.0] * 4)[:, None], action
+
+
+def test_the_chi_square_of_clean_data_is_one():
+    p = [criticism(x, action).detect().p_value for x, action in draws(24, seed=0)]
+    assert kstest(p, "uniform").pvalue > 0.01
+
+
+def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
+    x, action = zigzag(1.7)
+    found = criticism(x, action).detect()
+    assert found.p_value < LEVEL
+    assert not found.by_evidence
+    assert found.alarm
+    repeats = NOISE * torch.randn(6, 1, generator=torch.Generator().manual_seed(0))
+    free = criticism(x, action, noise=estimate_noise(repeats)).detect()
+    assert free.level == 0.0
+    heavy = criticism(x, action, noise=StudentTNoise(NOISE, df=4.0)).detect()
+    assert heavy.level == 0.0
+
+
+def test_the_report_says_what_raised_the_alarm():
+    weak = str(criticism(*zigzag(1.7)).report())
+    assert "chi-square, p = " in weak
+    assert "rests on the chi-square alone" in " ".join(weak.split())
+    x, action = zigzag(0.0)
+    strong = criticism(x + 5 * NOISE * action**3, action)
+    assert strong.detect().by_evidence
+    assert "chi-square alone" not in " ".join(str(strong.report()).split())
+
+
+def test_a_parameter_that_changes_nothing_takes_up_no_residual():
+    x, action = zigzag(1.0)
+    both = criticism(x, action)
+    idle = criticism(x, action, fn=lambda theta, xi: theta[:, :1] + 0 * xi)
+    assert np.isclose(num_determined(both.rivals), 2.0, atol=0.05)
+    # The variance of 400 draws of the idle one has a relative error of about .07.
+    assert np.isclose(num_determined(idle.rivals), 1.0, atol=0.25)
