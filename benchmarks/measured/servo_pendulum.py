@@ -34,7 +34,6 @@ from benchmarks.measured.servo_least_squares import FRICTIONS, Fit, fit
 from benchmarks.measured.servo_rates import RATES, by_rate
 from benchmarks.measured.servo_tables import tables
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.next_action import choose_action
 from sbi_active.criticism.predictive import predict
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Tracing
 from sbi_active.simulation import AutocorrelatedNoise
@@ -42,7 +41,7 @@ from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.noise import servo_noise  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
-__all__ = ["coarsened", "judge", "main", "simulated"]
+__all__ = ["judge", "main", "simulated"]
 
 RESULT = Path(__file__).parent / "results" / "servo_pendulum.json"
 NUM_CLEAN = 3
@@ -81,10 +80,6 @@ def judge(
     if folder is not None:
         report.save(folder)
     tracing, detection = loop.trace(), loop.detect()
-    flat = coarsened(tracing, len(fitted) / len(loop.rivals.measurements))
-    nexts = {"": report.next_action, "coarsened ": None}
-    if tracing.verdict != NONE:
-        nexts["coarsened "] = choose_action(loop.rivals, flat, task.actions)
     row: dict[str, Any] = {
         "fitted": [*fitted],
         "held_out": [*held_out],
@@ -93,7 +88,7 @@ def judge(
         "log_bayes_factor": detection.log_bayes_factor,
         "robust": tracing.robust,
         "probabilities": tracing.probabilities,
-        "coarsened": flat.probabilities,
+        "coarsening": tracing.coarsening,
         "credible_set": [*tracing.credible_set],
         "near": [sorted(group) for group in tracing.near],
         "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
@@ -105,15 +100,12 @@ def judge(
         "seconds": time.process_time() - begin,
         "simulations": loop.rivals.simulator.num_simulations,
     }
-    for kind, chosen in nexts.items():
-        if chosen is not None:
-            row[f"{kind}gain"] = chosen.information_gain.tolist()
-            action = chosen.action
-            row[f"{kind}next"] = (
-                None
-                if action is None
-                else int(task.find(torch.from_numpy(action)[None])[0])
-            )
+    chosen = report.next_action
+    if chosen is not None:
+        row["gain"] = chosen.information_gain.tolist()
+        row["next"] = None
+        if chosen.action is not None:
+            row["next"] = int(task.find(torch.from_numpy(chosen.action)[None])[0])
     if held_out:
         assert report.evaluation is not None
         row["before_after"] = report.before_after.to_dict("list")
@@ -123,35 +115,6 @@ def judge(
         }
         row["draws"] = _predicted(loop, trials.held_out)
     return row
-
-
-def coarsened(tracing: Tracing, share: float) -> Tracing:
-    r"""Return probabilities for models that are all known to be wrong somewhere.
-
-    .. math::
-        p_\alpha(k | x) \propto p(x | k)^\alpha
-
-    over models that are equally likely before, with alpha the number of trials over the
-    number of their samples: a trial then counts as one measurement of how wrong a model
-    is.
-
-    Args:
-        tracing: What the trials say if a model is right.
-        share: alpha.
-
-    References:
-        Miller & Dunson, Journal of the American Statistical Association 114 (2019).
-    """
-    log_p = {
-        name: share * tracing.evidences[name].log_evidence
-        for name in tracing.probabilities
-        if name in tracing.evidences and name not in (UNEXPLAINED, SCATTER)
-    }
-    top = max(log_p.values())
-    weight = {name: float(np.exp(value - top)) for name, value in log_p.items()}
-    total = sum(weight.values())
-    names = sorted(weight, key=weight.__getitem__, reverse=True)
-    return replace(tracing, probabilities={n: weight[n] / total for n in names})
 
 
 def simulated(
@@ -232,11 +195,9 @@ def _least_squares(
 
 def _chosen(row: dict[str, Any], off: Sequence[int]) -> int:
     """Return the motor-off trial that a stage asks for, or would ask for first."""
-    for kind in ("", "coarsened "):
-        if row.get(f"{kind}next") in off:
-            return int(row[f"{kind}next"])
-    gain = np.array(row["coarsened gain" if "coarsened gain" in row else "gain"])
-    return int(off[int(np.argmax(gain[[*off]]))])
+    if row.get("next") in off:
+        return int(row["next"])
+    return int(off[int(np.argmax(np.array(row["gain"])[[*off]]))])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -35,8 +35,8 @@ def tables(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
 
 def _stages(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
     lines = [
-        "| stage | trials | verdict | P | 90 % set | log BF | next trial "
-        "| next, coarsened | CPU s |",
+        "| stage | trials | verdict | P | 90 % set | log BF | power | next trial "
+        "| CPU s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
@@ -44,19 +44,18 @@ def _stages(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
             f"| {name} | {len(row['fitted'])} | {row['verdict']} | "
             f"{_probability(row['probabilities'][row['verdict']])} | "
             f"{', '.join(row['credible_set'])} | {row['log_bayes_factor']:.1f} | "
-            f"{_next(row, '', recordings)} | {_next(row, 'coarsened ', recordings)} | "
+            f"{row['coarsening']:.2g} | {_next(row, recordings)} | "
             f"{row['seconds']:.0f} |"
         )
     return "\n".join(lines)
 
 
-def _next(row: dict[str, Any], kind: str, recordings: Recordings) -> str:
-    if f"{kind}gain" not in row:
+def _next(row: dict[str, Any], recordings: Recordings) -> str:
+    if "gain" not in row:
         return ""
-    best = row[f"{kind}next"]
-    if best is None:
+    if row["next"] is None:
         return "none"
-    return f"{_named(best, recordings)} ({max(row[f'{kind}gain']):.2f} nats)"
+    return f"{_named(row['next'], recordings)} ({max(row['gain']):.2f} nats)"
 
 
 def _models(rows: Mapping[str, dict[str, Any]], stage: str) -> str:
@@ -64,12 +63,11 @@ def _models(rows: Mapping[str, dict[str, Any]], stage: str) -> str:
     row = rows[stage]
     null = row["log_evidence"]["none"]
     lines = [
-        f"| {stage}: model | P | P coarsened | log BF | phi, alone |",
-        "|---|---|---|---|---|",
+        f"| {stage}: model | P | log BF | phi, alone |",
+        "|---|---|---|---|",
     ]
     for name, p in row["probabilities"].items():
-        flat = row["coarsened"].get(name)
-        if p < SHOWN and (flat is None or flat < SHOWN) and " + " in name:
+        if p < SHOWN and " + " in name:
             continue
         phi = ""
         if name in row["singles"]:
@@ -77,7 +75,6 @@ def _models(rows: Mapping[str, dict[str, Any]], stage: str) -> str:
             phi = f"{mean:.3g} +- {sd:.2g}"
         lines.append(
             f"| {name} | {_probability(p)} | "
-            f"{'' if flat is None else _probability(flat)} | "
             f"{row['log_evidence'][name] - null:.1f} | {phi} |"
         )
     return "\n".join(lines)

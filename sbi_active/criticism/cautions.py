@@ -154,6 +154,12 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
             "the alarm rests on the chi-square alone: no alternative has a Bayes "
             "factor of 20, so that what is lacking is a suggestion"
         )
+    if tracing.coarsening < 1:
+        yield (
+            "every model misses the trials by more than the error of measurement: "
+            "between models that are all wrong somewhere evidence counts less, its log "
+            f"times {tracing.coarsening:.2g} in the probabilities"
+        )
     check = None if detection is None else detection.null_cross_check
     if detection is not None and check is not None:
         difference = check - detection.null_log_evidence

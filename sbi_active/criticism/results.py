@@ -179,12 +179,12 @@ class Tracing:
         aliases: After an alarm, pairs of effects that explain the data about as well
             (log evidence within log 20 of the best) with predictions closer than the
             noise over the permitted actions; repeated trials may separate them.
-        aliases: Pairs of likely effects whose predictions differ by less than the noise
-            over the permitted actions; repeated trials separate them.
         estimates: One an effect, most probable first.
         evidences: Of every model tried, by name, effects with priors of unknown scale.
         robust: Whether the verdict is that of effect priors a third and three times as
             wide.
+        coarsening: Power of the evidences in the probabilities; 1 where models are not
+            known to miss by more than the error of measurement.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
     """
@@ -200,6 +200,7 @@ class Tracing:
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
     robust: bool
+    coarsening: float = 1.0
     guesses: tuple[tuple[str, float], ...] = ()
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.coarsening import coarsening
 from sbi_active.criticism.combinations import grow
 from sbi_active.criticism.detection import THRESHOLD, alternatives
 from sbi_active.criticism.effects import Effect
@@ -64,7 +65,9 @@ def trace(
 ) -> Tracing:
     """Return the probabilities of the rivals and the verdict.
 
-    The scales of the effects' priors are unknown. After an alarm the verdict is first
+    The scales of the effects' priors are unknown. Where every model misses by more than
+    the error of measurement, evidence is coarsened
+    (:mod:`~sbi_active.criticism.coarsening`). After an alarm the verdict is first
     one of: declared effects, "unexplained", "scatter", each with all of its
     probability; then, of the effects, the most probable.
 
@@ -76,16 +79,20 @@ def trace(
         compare: Whether to look for effects that these trials do not separate.
     """
     prior = log_priors([*rivals.effects.values()])
-    log_p = {
-        NONE: prior[NONE] + rivals.evidence().log_evidence,
-        UNEXPLAINED: prior[UNEXPLAINED]
-        + rivals.evidence(error=UNEXPLAINED).log_evidence,
-        SCATTER: prior[SCATTER] + rivals.evidence(error=SCATTER).log_evidence,
+    log_z = {
+        NONE: rivals.evidence().log_evidence,
+        UNEXPLAINED: rivals.evidence(error=UNEXPLAINED).log_evidence,
+        SCATTER: rivals.evidence(error=SCATTER).log_evidence,
     }
-    for name in rivals.effects:
-        log_p[name] = prior[name] + log_evidence(rivals, (name,))[0]
+    log_z |= {name: log_evidence(rivals, (name,))[0] for name in rivals.effects}
+    log_prior, share = {**prior}, 1.0
     if detection.alarm:
-        log_p |= grow(rivals, {n: log_p[n] for n in rivals.effects}, prior)
+        singles = {name: prior[name] + log_z[name] for name in rivals.effects}
+        for name, value in grow(rivals, singles, prior).items():
+            log_z[name] = log_evidence(rivals, name.split(" + "))[0]
+            log_prior[name] = value - log_z[name]
+        share = coarsening(rivals, {n: log_prior[n] + log_z[n] for n in log_z})
+    log_p = {name: log_prior[name] + share * log_z[name] for name in log_z}
     probabilities = _normalized(log_p)
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
     near = equivalent_effects(rivals, None) if compare else ()
@@ -108,7 +115,10 @@ def trace(
         aliases=aliases,
         estimates=_estimates(rivals, inclusion),
         evidences={name: _under_unknown_scale(rivals, name) for name in log_p},
-        robust=_is_robust(rivals, detection, log_p, equivalent, verdict),
+        robust=_is_robust(
+            rivals, detection, log_prior, log_z, share, equivalent, verdict
+        ),
+        coarsening=share,
     )
 
 
@@ -188,26 +198,25 @@ def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate,
 def _is_robust(
     rivals: RivalSet,
     detection: Detection,
-    log_p: dict[str, float],
+    log_prior: dict[str, float],
+    log_z: dict[str, float],
+    share: float,
     equivalent: Sequence[frozenset[str]],
     verdict: str,
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
-    prior = log_priors([*rivals.effects.values()])
+    weights = alternatives([*rivals.effects], equivalent)
     for factor in RESCALED:
-        scaled = {**log_p}
-        for name in log_p:
+        scaled = {**log_z}
+        for name in log_z:
             names = _effects_of(name)
             if names:
-                own = log_evidence(rivals, names)[0]
-                other = log_evidence(rivals, names, factor=factor)[0]
-                scaled[name] = log_p[name] + other - own
-        weights = alternatives([*rivals.effects], equivalent)
-        singles = [scaled[k] - prior[k] + np.log(w) for k, w in weights.items()]
-        log_b = log_sum_exp(np.array(singles))
-        alarm = bool(log_b - (log_p[NONE] - prior[NONE]) > THRESHOLD)
-        alarm = alarm or detection.by_chi_square
-        if _verdict(_normalized(scaled), equivalent, alarm=alarm) != verdict:
+                scaled[name] = log_evidence(rivals, names, factor=factor)[0]
+        singles = np.array([scaled[k] + np.log(w) for k, w in weights.items()])
+        log_b = log_sum_exp(singles) - scaled[NONE]
+        alarm = bool(log_b > THRESHOLD) or detection.by_chi_square
+        log_p = {name: log_prior[name] + share * scaled[name] for name in scaled}
+        if _verdict(_normalized(log_p), equivalent, alarm=alarm) != verdict:
             return False
     return True
 

@@ -38,6 +38,9 @@ class AutocorrelatedNoise(ScaleNoise):
         correlation_time: :math:`\tau` in seconds, of all channels. Without time stamps
             it counts samples.
         posterior: Over (sd, correlation_time), event shape (p,).
+        measurement_sd: Known standard deviation of the measurement alone, where the
+            rest of an unknown sd is what a simulator gets wrong; None where nothing is
+            known of it.
 
     Raises:
         ValueError: If a parameter is negative or not finite.
@@ -58,10 +61,17 @@ class AutocorrelatedNoise(ScaleNoise):
         correlation_time: float | Tensor,
         *,
         posterior: Distribution | None = None,
+        measurement_sd: float | None = None,
     ) -> None:
         super().__init__(
             sd, shared={"correlation_time": correlation_time}, posterior=posterior
         )
+        if measurement_sd is not None and not 0 < measurement_sd < float("inf"):
+            raise ValueError(
+                f"expected measurement_sd > 0; got {measurement_sd}; do give the "
+                "sensor's error in the units of x, or None"
+            )
+        self.measurement_sd = measurement_sd
 
     def _check(self, parameters: Tensor) -> None:
         super()._check(parameters)

@@ -15,6 +15,7 @@ def unknown_noise(
     *,
     sd: tuple[float, float],
     correlation_time: tuple[float, float],
+    measurement_sd: float | None = None,
     num_sds: int = 40,
     num_times: int = 12,
 ) -> AutocorrelatedNoise:
@@ -27,6 +28,9 @@ def unknown_noise(
         sd: Bounds of the standard deviation, in the units of x.
         correlation_time: Bounds, s; well below the distance of samples, errors are
             independent.
+        measurement_sd: Of the sensor alone, where it is known. Errors beyond it are the
+            simulator's, and a trial then counts as one measurement of them
+            (:mod:`sbi_active.criticism.coarsening`).
         num_sds: Nodes of the grid over standard deviations.
         num_times: The same over correlation times.
 
@@ -50,7 +54,7 @@ def unknown_noise(
         shared=Cells(times, _uniform(num_times)),
     )
     middle = [(low * high) ** 0.5 for low, high in (sd, correlation_time)]
-    return AutocorrelatedNoise(*middle, posterior=prior)
+    return AutocorrelatedNoise(*middle, posterior=prior, measurement_sd=measurement_sd)
 
 
 def _edges(low: float, high: float, num: int) -> Tensor:

@@ -10,6 +10,7 @@ __all__ = ["servo_noise"]
 SD = 0.005, 0.5
 #: Correlation time, s: from a tenth of a sample's distance to the length of a trial.
 CORRELATION_TIME = 0.02, 6.0
+ENCODER_SD = 0.0015  # rad, one quantum
 NO_TIME = 1e-6, 1.001e-6  # s; far below any distance of samples
 
 
@@ -25,6 +26,7 @@ def servo_noise(*, correlated: bool = True) -> AutocorrelatedNoise:
     return unknown_noise(
         sd=SD,
         correlation_time=CORRELATION_TIME if correlated else NO_TIME,
+        measurement_sd=ENCODER_SD,
         num_sds=60,
         num_times=12 if correlated else 1,
     )
