@@ -79,8 +79,9 @@ def forecast(
     own = rival.residual(u, penalized=False)[0]
     extra = np.zeros(len(m))
     if isinstance(rival.error, ResidualProcess):
-        action = rivals.scaled_actions(whole)
-        shift, extra = rival.error.condition(own, m, action)
+        shift, extra = rival.error.condition(
+            own, m, rivals.scaled_actions(whole), order=rivals.scaled_order(whole)
+        )
         mean = mean + shift
         cells, scales = rival.error.noise_posterior(own, rng)
     else:

@@ -114,8 +114,13 @@ def predict(
     ]
     extra = np.zeros(len(m))
     if isinstance(rival.error, ResidualProcess):
-        action = rivals.scaled_actions(target)
-        shift, extra = rival.error.condition(own_residual, m, action, spread=spread)
+        shift, extra = rival.error.condition(
+            own_residual,
+            m,
+            rivals.scaled_actions(target),
+            order=rivals.scaled_order(target),
+            spread=spread,
+        )
         mean = mean + shift
     cells, scales = _drawn_cells(rival, own_residual, rng)
     errors, sd = _errors(noise, cells, scales, mean.shape, rng)

@@ -1,4 +1,4 @@
-r"""A Gaussian process over the action and time: what no declared effect explains.
+r"""A Gaussian process over action, time and order: what no declared effect explains.
 
 .. math::
     r = a\, b\, g(\xi, t) + \epsilon, \qquad
@@ -8,8 +8,10 @@ r"""A Gaussian process over the action and time: what no declared effect explain
 independent in each channel. The unit b is the noise's standard deviation, or it is
 proportional to the deviation of the prior predictive: what is missing from a simulator
 that multiplies or shifts an input grows with the output. The length :math:`\ell` takes
-two values, the amplitude a is log-uniform from the size of the noise to that of the
-prior predictive; all are summed out.
+two values. In a third process the order of the trials takes the place of the action:
+what warms or wears has structure, if not one of the action. The amplitude a is
+log-uniform from the size of the noise to that of the prior predictive. All are summed
+out.
 
 References:
     Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
@@ -39,6 +41,8 @@ Array = NDArray[Any]
 
 #: Length scales, in ranges of the action space: a local and a global misfit.
 LENGTHS = (0.1, 0.3)
+#: Length scale along the order of the trials, in their span.
+ORDER_LENGTH = 0.3
 #: Length scale along a trajectory, in its span.
 TIME_LENGTH = 0.3
 NUM_AMPLITUDES = 10
@@ -53,7 +57,7 @@ class _Basis:
     """The process in whitened coordinates: cov = I + a^2 Q diag(v) Q^T."""
 
     cell: int
-    length: float
+    kind: int  # of the process: one a length, then that of the order
     is_relative: bool
     log_weight: float
     directions: Array  # Q, (N, m), orthonormal
@@ -67,6 +71,8 @@ class ResidualProcess(ErrorModel):
         noise: The error without the process.
         measurements: What the residuals are of.
         action: Of each trial, in ranges of the action space, shape (t, action_dim).
+        order: Of each trial, in the span of those at hand, shape (t,); None for no
+            process over it.
         largest: Upper end of the amplitude, in standard deviations of the noise.
         lengths: Length scales, in ranges of the action space.
         spread: Deviation of the prior predictive, shape (N,); None has the noise as the
@@ -79,11 +85,13 @@ class ResidualProcess(ErrorModel):
         measurements: Measurements,
         *,
         action: Array,
+        order: Array | None = None,
         largest: float,
         lengths: tuple[float, ...] = LENGTHS,
         spread: Array | None = None,
     ) -> None:
         self.noise, self.measurements, self.spread = noise, measurements, spread
+        self.lengths = lengths
         self.amplitudes = np.geomspace(1.0, max(largest, 3.0), NUM_AMPLITUDES)
         # With an unknown size of the noise, the amplitude is a multiple of it.
         self._log_amplitude = -np.log(NUM_AMPLITUDES)
@@ -92,10 +100,9 @@ class ResidualProcess(ErrorModel):
         units = {False: typical}
         if spread is not None:
             units[True] = self._relative(spread, typical)
-        for length, relative in product(lengths, units):
-            features = units[relative][:, None] * _features(
-                measurements, action, length
-            )
+        inputs = self._inputs(action, order)
+        for kind, relative in product(range(len(inputs)), units):
+            features = units[relative][:, None] * _features(measurements, inputs[kind])
             for k, cell in enumerate(noise.cells):
                 whitened = cell.whiten(features.T).T
                 values, vectors = np.linalg.eigh(whitened.T @ whitened)
@@ -103,9 +110,9 @@ class ResidualProcess(ErrorModel):
                 self._bases.append(
                     _Basis(
                         k,
-                        length,
+                        kind,
                         relative,
-                        float(noise.log_prior[k] - np.log(len(lengths) * len(units))),
+                        float(noise.log_prior[k] - np.log(len(inputs) * len(units))),
                         whitened @ (vectors[:, keep] / np.sqrt(values[keep])),
                         values[keep],
                     )
@@ -153,6 +160,7 @@ class ResidualProcess(ErrorModel):
         new: Measurements,
         action: Array,
         *,
+        order: Array | None = None,
         spread: Array | None = None,
     ) -> tuple[Array, Array]:
         r"""Return the process at new actions, given residuals, by its best amplitude.
@@ -165,6 +173,8 @@ class ResidualProcess(ErrorModel):
             residual: Of the measurements at hand, shape (n, N).
             new: Measurements to predict, M.
             action: Of all trials, those at hand first, in ranges of the action space.
+            order: Of all trials, likewise, in the span of those at hand; needed where
+                there is a process over it.
             spread: Of the new measurements, shape (M,), where there is one of the old.
 
         Returns:
@@ -175,8 +185,9 @@ class ResidualProcess(ErrorModel):
         place = np.unravel_index(np.argmax(joint), joint.shape)
         basis, a = self._bases[place[0]], self.amplitudes[place[1]]
         cell, scale = self.noise.cells[basis.cell], self.noise.scales[place[2]]
-        own = self._points(self.measurements, action, basis.length)
-        there = self._points(new, action[-new.shape[0] :], basis.length)
+        place_of = self._inputs(action, order)[basis.kind]
+        own = _coordinates(self.measurements, place_of, self.measurements.span)
+        there = _coordinates(new, place_of[-new.shape[0] :], self.measurements.span)
         sd, new_sd = cell.sd * scale, np.full(len(new), np.median(cell.sd) * scale)
         unit, new_unit = sd, new_sd
         if basis.is_relative and spread is not None and self.spread is not None:
@@ -206,10 +217,12 @@ class ResidualProcess(ErrorModel):
         """Return the spread, in the median as large as the noise."""
         return spread * np.median(sd / spread)
 
-    def _points(
-        self, m: Measurements, action: Array, length: float
-    ) -> tuple[Array, Array]:
-        return _coordinates(m, action, length, self.measurements.span)
+    def _inputs(self, action: Array, order: Array | None) -> list[Array]:
+        """Return where trials lie for each process, in its lengths, (t, columns)."""
+        inputs = [action / length for length in self.lengths]
+        if order is not None:
+            inputs.append(order[:, None] / ORDER_LENGTH)
+        return inputs
 
     def _joint(self, residual: Array, basis: _Basis) -> Array:
         """Return log p(residual, amplitude, scale), shape (n, amplitudes, scales)."""
@@ -226,12 +239,10 @@ class ResidualProcess(ErrorModel):
         return log_p + basis.log_weight + self._log_amplitude
 
 
-def _coordinates(
-    m: Measurements, action: Array, length: float, span: float
-) -> tuple[Array, Array]:
-    """Return points in length scales, shape (N, action_dim + 1), and channels."""
+def _coordinates(m: Measurements, place: Array, span: float) -> tuple[Array, Array]:
+    """Return points in length scales, shape (N, columns + 1), and channels."""
     time = (m.time - m.time.min()) / (TIME_LENGTH * span)
-    return np.column_stack([action[m.trial] / length, time]), m.channel
+    return np.column_stack([place[m.trial], time]), m.channel
 
 
 def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
@@ -239,9 +250,9 @@ def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
     return np.exp(-0.5 * distance) * (rows[1][:, None] == columns[1][None])
 
 
-def _features(m: Measurements, action: Array, length: float) -> Array:
+def _features(m: Measurements, place: Array) -> Array:
     """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
-    points, channel = _coordinates(m, action, length, m.span)
+    points, channel = _coordinates(m, place, m.span)
     some = np.unique(np.linspace(0, len(m) - 1, MAX_POINTS).astype(int))
     few = points[some], channel[some]
     values, vectors = np.linalg.eigh(_kernel(few, few))

@@ -165,6 +165,7 @@ class RivalSet:
                 self.noise,
                 self.measurements,
                 action=self.scaled_actions(),
+                order=self.scaled_order(),
                 largest=float(np.median(self.spread / sd)),
                 spread=None if self.simulator.is_stochastic else self.spread,
             )
@@ -184,6 +185,18 @@ class RivalSet:
         if trials is not None:
             action = np.concatenate([action, trials.action.numpy()])
         return action / np.where(width > 0, width, 1.0)
+
+    def scaled_order(self, trials: Trials | None = None) -> Array | None:
+        """Return the order of trials in the span of the fit; None where it has none.
+
+        Args:
+            trials: Further trials.
+        """
+        index = own = self.trials.index.double().numpy()
+        if trials is not None:
+            index = np.concatenate([own, trials.index.double().numpy()])
+        span = np.ptp(own)
+        return (index - own.min()) / span if span > 0 else None
 
     def evidence(
         self, names: Sequence[str] = (), *, error: str | None = None

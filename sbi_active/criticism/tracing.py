@@ -34,6 +34,8 @@ __all__ = ["log_priors", "trace"]
 Array = NDArray[Any]
 
 PROBABILITY_OF_NONE = 0.5
+#: That what is missing, if anything is, is neither declared nor noise.
+PROBABILITY_OUTSIDE = 0.05
 MASS = 0.9  # of the credible set
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
@@ -42,17 +44,18 @@ RESCALED = (1 / 3, 3.0)
 def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
     """Return log prior probabilities of none, each effect and the catch-alls.
 
-    Half is "none"; the families share the rest equally, "unexplained" being one, and
-    noise inflation belonging to that of the noise.
+    Half is "none". Of the rest a twentieth is "unexplained", and the families share
+    what is left equally, noise inflation belonging to that of the noise.
     """
-    members: dict[str, list[str]] = {UNEXPLAINED: [UNEXPLAINED], "noise": [SCATTER]}
+    members: dict[str, list[str]] = {"noise": [SCATTER]}
     for effect in effects:
         members.setdefault(str(effect.family), []).append(effect.name)
-    share = np.log((1 - PROBABILITY_OF_NONE) / len(members))
-    found = {NONE: float(np.log(PROBABILITY_OF_NONE))}
+    missing = 1 - PROBABILITY_OF_NONE
+    share = missing * (1 - PROBABILITY_OUTSIDE) / len(members)
+    found = {NONE: PROBABILITY_OF_NONE, UNEXPLAINED: missing * PROBABILITY_OUTSIDE}
     for names in members.values():
-        found |= {name: float(share - np.log(len(names))) for name in names}
-    return found
+        found |= {name: share / len(names) for name in names}
+    return {name: float(np.log(p)) for name, p in found.items()}
 
 
 def trace(

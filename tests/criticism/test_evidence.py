@@ -185,6 +185,31 @@ def test_the_process_interpolates_what_it_was_conditioned_on():
     assert np.all(sd < 0.1)
 
 
+def test_one_process_follows_the_order_of_the_trials():
+    m = Measurements.of(Trials(ACTION, X))
+    noise = declared_noise(GaussianNoise(0.5), m)
+    order = np.arange(8) / 7
+    action = np.random.default_rng(0).permutation(ACTION.double().numpy() / 4)
+    r = X[:, 0].double().numpy()
+    parts = [
+        ResidualProcess(noise, m, action=place, largest=20.0, lengths=(0.3,))
+        for place in (action, order[:, None])
+    ]
+    both = ResidualProcess(
+        noise, m, action=action, order=order, largest=20.0, lengths=(0.3,)
+    )
+    each = [process.log_likelihood(r[None])[0] for process in parts]
+    expected = np.logaddexp(*each) - np.log(2)
+    assert both.log_likelihood(r[None])[0] == pytest.approx(expected)
+    # A slow drift is carried on for a while.
+    drift = 4 * np.sin(2 * order)
+    later = np.concatenate([order, order[-1:] + 0.05])
+    there = np.concatenate([action, action[:1]])
+    one = Measurements.of(Trials(ACTION[:1], X[:1]))
+    mean, _ = both.condition(drift[None], one, there, order=later)
+    assert mean[0, 0] == pytest.approx(4 * np.sin(2 * later[-1]), abs=0.5)
+
+
 TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
 
 
