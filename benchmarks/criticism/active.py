@@ -1,7 +1,10 @@
 """Trials chosen by the loop beside random ones.
 
-Both policies begin with the same two trials at random, which count, and have the same
-noise in the trial of a number. Only cases are run whose effect a table of its own would
+Two trials tell nothing about which model is right, and less cannot be compared. The
+random policy makes them at random; the choosing one designs them before any data, for
+the joint information about the parameters under the prior, and goes on for the model
+index. All trials count, and both policies have the same noise in the trial of a number.
+Only cases are run whose effect a table of its own would
 expect to be named: lambda above 25 with all of the *random* policy's trials. That
 leaves out effects too weak to be seen, effects equivalent to none, and noise inflation
 (lambda 0). It is fixed before any verdict, is the same for both policies, and where it
@@ -12,12 +15,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import cache
 
 import torch
+from torch import Tensor
 
 from benchmarks.criticism.cases import Case, extend
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.scores import counted
+from benchmarks.criticism.worlds import get_world
+from sbi_active import InformationGainDesigner
 from sbi_active.criticism import Criticism
 
 __all__ = ["ACTIVE_COLUMNS", "DETECTABLE", "score_active"]
@@ -26,7 +33,7 @@ ACTIVE_COLUMNS = [
     *["case", "effects", "policy", "trials", "action", "verdict", "top", "place"],
     *["probability", "lambda", "trial_simulations", "cpu_seconds", "failure"],
 ]
-START = 2  # trials at random that both policies share, as few as can be compared
+START = 2  # trials before the first comparison
 DETECTABLE = 25.0  # lambda with all random trials
 
 
@@ -48,21 +55,16 @@ def score_active(case: Case, number: int) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     if case.truth.non_centrality <= DETECTABLE:
         return [_row(case, number, "random")]
-    first = Case(case.problem, replace(case.truth, action=every[: START - 1]))
-    first = extend(first, every[START - 1])
-    shared: tuple[Criticism, dict[str, object]] | None = None
-    for policy in ("random", "chosen"):
-        grown = first
+    starts = {"random": every[:START], "chosen": first_actions(case.truth.world.name)}
+    for policy, action in starts.items():
+        grown = Case(case.problem, replace(case.truth, action=action[:-1]))
+        grown = extend(grown, action[-1])
         for num in range(START, len(every) + 1):
             rows.append(_row(grown, number, policy))
             start = time.process_time()
             following = None
             try:
-                if num > START or shared is None:
-                    criticism, scores = _verdict(grown, number)
-                    shared = shared or (criticism, scores)
-                else:
-                    criticism, scores = shared
+                criticism, scores = _verdict(grown, number)
                 if policy == "chosen" and num < len(every):
                     following = criticism.next_action(beyond=False).action
             except Exception as error:  # a crash is a result of the benchmark
@@ -74,6 +76,17 @@ def score_active(case: Case, number: int) -> list[dict[str, object]]:
                 action = random if following is None else torch.as_tensor(following)
                 grown = extend(grown, action.float())
     return rows
+
+
+@cache
+def first_actions(world: str) -> Tensor:
+    """Return the first trials that are chosen, without data, shape (START, d)."""
+    known = get_world(world)
+    designer = InformationGainDesigner(known.actions)
+    design = designer.select(
+        None, known.model, belief=known.prior, num_actions=START, seed=0
+    )
+    return design.action
 
 
 def _row(case: Case, number: int, policy: str) -> dict[str, object]:

@@ -9,8 +9,9 @@ theta drawn from its prior. "hidden": the real system adds :math:`c \xi^2`, c dr
 N(0, 1), from the first trial on. The campaign is given the bare simulator and the
 library of world A, in which the quadratic is one of seven effects, and designs its
 actions (``--policy auto``): for the parameters, or for which model is right where that
-tells more. After an alarm it adopts what the verdict names. Nothing else of the truth
-reaches it. Other policies: "theta" designs for the parameters alone, which repeats the
+tells more. After an alarm it goes on asking while rivals are open, and adopts what the
+verdict names once that is settled, or when its trials are spent. Nothing else of the
+truth reaches it. Other policies: "theta" designs for the parameters alone, which repeats the
 two settings that tell most about two parameters, at which any two fit, so that lambda
 is 0; "check" does so too, but makes every second trial where none was.
 
@@ -35,6 +36,7 @@ from benchmarks.criticism.run import append, read
 from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.numerical import NOISE_SD, response
 from sbi_active import Campaign, CampaignOptions
+from sbi_active.criticism import Report
 from sbi_active.seeding import derive_seed, forked_generators, row_normals
 
 __all__ = ["COLUMNS", "run_case", "summary"]
@@ -84,8 +86,8 @@ def run_case(
     """Return the row of one campaign.
 
     It runs for ``num_trials`` trials, or until the first alarm. Then, and not without
-    an alarm, the simulator is compared with the trials; where the verdict names no
-    effect yet, further trials are made, up to ``num_trials`` in all.
+    an alarm, the simulator is compared with the trials; while the verdict names no
+    effect, or not one alone, further trials are made, up to ``num_trials`` in all.
 
     Args:
         kind: "hidden" or "clean".
@@ -122,7 +124,8 @@ def run_case(
                 row |= _belief_cells(campaign.belief, theta, "before")
             report = campaign.criticize(world.effects, evaluate=False)
             row["verdict"] = report.verdict
-            if report.tracing.chosen:
+            spent = len(campaign.history) == num_trials
+            if report.tracing.chosen and (spent or settled(report)):
                 row |= _at(campaign, theta, strength) | {"alarm_at": alarm_at}
                 campaign.adopt(report)
                 row |= {"adopted": " + ".join(report.tracing.chosen)}
@@ -134,6 +137,12 @@ def run_case(
         if "log_p_before" not in row:
             row |= _belief_cells(campaign.belief, theta, "before")
     return row | {"cpu_seconds": time.process_time() - start}
+
+
+def settled(report: Report) -> bool:
+    """Return whether the 90 % set is the verdict and what nothing separates from it."""
+    groups = [group for group in report.equivalent if report.verdict in group]
+    return {*report.credible_set} <= {report.verdict}.union(*groups)
 
 
 def _at(campaign: Campaign, theta: Tensor, strength: float) -> dict[str, object]:
