@@ -103,6 +103,40 @@ class Effect:
         if self.family is None:
             object.__setattr__(self, "family", self.hook)
 
+    @classmethod
+    def keyword(
+        cls, name: str, *keywords: str, prior: Distribution, **options: Any
+    ) -> Effect:
+        """Return an effect that the simulator's function already has.
+
+        Args:
+            name: Of the effect.
+            *keywords: Arguments of the simulator's function, one an entry of phi, each
+                of shape (n,); without any the name, its spaces underscored.
+            prior: Of phi.
+            **options: As in the constructor; the null is 0 unless given.
+
+        Raises:
+            ValueError: If there is not one keyword for each entry of phi.
+
+        Example:
+            >>> from torch.distributions import HalfNormal
+            >>> drag = Effect.keyword("drag", prior=HalfNormal(0.3), units="1/m")
+            >>> drag.hook, drag.null
+            ('dynamics', 0.0)
+        """
+        names = keywords or (name.replace(" ", "_"),)
+        options = {"null": 0.0, **options}
+        effect = cls(
+            name, hook="dynamics", prior=prior, apply=_Keywords(names), **options
+        )
+        if len(names) != effect.phi_dim:
+            raise ValueError(
+                f"expected {effect.phi_dim} keywords for effect {name!r}, one an entry "
+                f"of phi; got {', '.join(names)}; do name each"
+            )
+        return effect
+
     @property
     def phi_dim(self) -> int:
         """Number of parameters of the effect."""
@@ -137,6 +171,18 @@ class Effect:
         if finite:
             null = torch.nan_to_num(null, posinf=LARGE, neginf=-LARGE)
         return null.expand(self.phi_dim).repeat(num, 1)
+
+
+@dataclass(frozen=True)
+class _Keywords:
+    """Hands phi to the simulator's function."""
+
+    names: tuple[str, ...]
+
+    def __call__(
+        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
+    ) -> dict[str, Any]:
+        return {**value, **dict(zip(self.names, phi.unbind(-1), strict=True))}
 
 
 def require_distinct(effects: Sequence[Effect]) -> None:

@@ -34,8 +34,8 @@ __all__ = ["log_priors", "trace"]
 Array = NDArray[Any]
 
 PROBABILITY_OF_NONE = 0.5
-#: That what is missing, if anything is, is neither declared nor noise.
-PROBABILITY_OUTSIDE = 0.05
+#: That what is missing, if anything is, is each of the catch-alls.
+PROBABILITY_OF_CATCH_ALL = 0.05
 MASS = 0.9  # of the credible set
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
@@ -44,15 +44,16 @@ RESCALED = (1 / 3, 3.0)
 def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
     """Return log prior probabilities of none, each effect and the catch-alls.
 
-    Half is "none". Of the rest a twentieth is "unexplained", and the families share
-    what is left equally, noise inflation belonging to that of the noise.
+    Half is "none". Of the rest "unexplained" and "scatter" have a twentieth each, and
+    the families share what is left equally.
     """
-    members: dict[str, list[str]] = {"noise": [SCATTER]}
+    members: dict[str, list[str]] = {}
     for effect in effects:
         members.setdefault(str(effect.family), []).append(effect.name)
     missing = 1 - PROBABILITY_OF_NONE
-    share = missing * (1 - PROBABILITY_OUTSIDE) / len(members)
-    found = {NONE: PROBABILITY_OF_NONE, UNEXPLAINED: missing * PROBABILITY_OUTSIDE}
+    each = missing * PROBABILITY_OF_CATCH_ALL
+    found = {NONE: PROBABILITY_OF_NONE, UNEXPLAINED: each, SCATTER: each}
+    share = (missing - 2 * each) / max(len(members), 1)
     for names in members.values():
         found |= {name: share / len(names) for name in names}
     return {name: float(np.log(p)) for name, p in found.items()}

@@ -60,37 +60,27 @@ def make_effects() -> list[Effect]:
             family=DRAG,
             describe="air slows the ball in proportion to its speed squared",
         ),
-        Effect(
+        Effect.keyword(
             "power-law drag",
-            hook="dynamics",
+            *("drag", "exponent"),
             prior=Product([half, exponent]),
             null=torch.tensor([0.0, 1.0]),
-            apply=lambda value, phi, action, context: _drag(
-                value, phi[:, 0], phi[:, 1]
-            ),
             units="m/s^2 at 10 m/s, exponent",
             family=DRAG,
             describe="air slows the ball in proportion to some power of its speed",
         ),
-        Effect(
+        Effect.keyword(
             "buoyancy",
-            hook="dynamics",
+            "lightness",
             prior=_between(0.0, BUOYANCY),
-            null=0.0,
-            apply=lambda value, phi, action, context: {
-                **value,
-                "lightness": phi[:, 0],
-            },
             units="of the weight",
             family="medium",
             describe="air carries a part of the weight",
         ),
-        Effect(
+        Effect.keyword(
             "frame rate",
-            hook="dynamics",
+            "clock",
             prior=_between(-RATE, RATE),
-            null=0.0,
-            apply=lambda value, phi, action, context: {**value, "clock": phi[:, 0]},
             units="relative",
             family="camera",
             describe="the rate of the frames is wrong by a factor",
@@ -101,16 +91,11 @@ def make_effects() -> list[Effect]:
 def release() -> Effect:
     """Return where and when a drop begins, anew in each."""
     middle = torch.tensor([RELEASE_HEIGHT, 0.0])
-    return Effect(
+    return Effect.keyword(
         "release",
-        hook="dynamics",
+        *("height", "start"),
         prior=Independent(Normal(middle, torch.tensor([2.0, 0.2])), 1),
         null=middle,
-        apply=lambda value, phi, action, context: {
-            **value,
-            "height": phi[:, 0],
-            "start": phi[:, 1],
-        },
         units="m, s",
         scope="trial",
         describe="height and time at which the ball is let go",

@@ -12,8 +12,6 @@ of the center of mass shows in y.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.distributions import Beta, Distribution, HalfNormal, Independent, Normal
@@ -34,37 +32,37 @@ def make_effects() -> list[Effect]:
         ['restitution', 'viscosity']
     """
     return [
-        _scene(
+        Effect.keyword(
             "restitution",
             "lost_damping",
-            Independent(Beta(torch.ones(1), 2 * torch.ones(1)), 1),
+            prior=Independent(Beta(torch.ones(1), 2 * torch.ones(1)), 1),
             units="",
             family="impact",
             describe="The impact is springy: its damping ratio is 1 - phi. "
             "At 0.7: +318/+681/+1008 mm.",
         ),
-        _scene(
+        Effect.keyword(
             "viscosity",
             "viscosity",
-            _half_normal(0.3),
+            prior=_half_normal(0.3),
             units="Pa s",
             family="medium",
             describe="The medium drags in proportion to the speed. "
             "At 0.5 Pa s: -402/-996/-1425 mm.",
         ),
-        _scene(
+        Effect.keyword(
             "air",
             "air_density",
-            _half_normal(1.2),
+            prior=_half_normal(1.2),
             units="kg/m^3",
             family="medium",
             describe="The medium drags with the square of the speed. "
             "At 1.2 kg/m^3: -19/-72/-143 mm.",
         ),
-        _scene(
+        Effect.keyword(
             "tilt",
             "tilt",
-            _normal(1.0),
+            prior=_normal(1.0),
             units="deg",
             family="table",
             describe="The table slopes down ahead by phi. At 1 deg: +85/+86/+85 mm.",
@@ -90,37 +88,37 @@ def make_effects() -> list[Effect]:
             describe="The pusher is faster than commanded by phi. "
             "At 0.1 m/s: +21/+132/+53 mm.",
         ),
-        _scene(
+        Effect.keyword(
             "aim",
             "aim",
-            _normal(0.01),
+            prior=_normal(0.01),
             units="m",
             family="alignment",
             describe="The pusher's path is shifted by phi along y. "
             "At 0.01 m: -51/-135/-208 mm in y.",
         ),
-        _scene(
+        Effect.keyword(
             "center of mass",
             "center_of_mass",
-            _normal(0.01),
+            prior=_normal(0.01),
             units="m",
             family="alignment",
             describe="The cube's center of mass is off by phi along y. "
             "At 0.01 m: +50/+140/+223 mm in y.",
         ),
-        _scene(
+        Effect.keyword(
             "pusher friction",
             "extra_pusher_friction",
-            _normal(0.15),
+            prior=_normal(0.15),
             units="",
             family="pusher",
             describe="The pusher's surface has friction .5 + phi. "
             "At 0.3: -71/-97/-56 mm.",
         ),
-        _scene(
+        Effect.keyword(
             "force",
             "force",
-            _normal(0.3),
+            prior=_normal(0.3),
             units="N",
             family="force",
             describe="A constant force, of a cable, pulls the cube ahead. "
@@ -143,43 +141,15 @@ def make_effects() -> list[Effect]:
             apply=_stretch,
             describe="The camera reads x and y times 1 + phi. At 0.02: +19/+47/+72 mm.",
         ),
-        _scene(
+        Effect.keyword(
             "time stamp",
             "delay",
-            _normal(0.03),
+            prior=_normal(0.03),
             units="s",
             family="observation",
             describe="The position is taken late by phi. At 0.05 s: +5/+76/+137 mm.",
         ),
     ]
-
-
-def _scene(
-    name: str,
-    keyword: str,
-    prior: Distribution,
-    *,
-    units: str,
-    family: str,
-    describe: str,
-) -> Effect:
-    """Return an effect that is a keyword argument of the simulator, null 0."""
-
-    def apply(
-        value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
-    ) -> dict[str, Any]:
-        return {**value, keyword: phi[:, 0]}
-
-    return Effect(
-        name,
-        hook="dynamics",
-        prior=prior,
-        null=0.0,
-        apply=apply,
-        units=units,
-        family=family,
-        describe=describe,
-    )
 
 
 def _shift(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:

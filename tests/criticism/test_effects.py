@@ -8,6 +8,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
+    Context,
     Effect,
     generic_effects,
     joint_prior,
@@ -220,3 +221,26 @@ def test_distinct_names():
 def test_generic_effects_need_a_size():
     with pytest.raises(ValueError, match="expected a simulator with declared noise"):
         generic_effects(SimulatorModel(line), ACTIONS)
+
+
+def test_an_effect_through_keywords_of_the_simulator():
+    def fn(theta, action, *, air_drag=0.0, exponent=1.0):
+        return theta * action - torch.as_tensor(air_drag)[..., None] * action**2
+
+    drag = Effect.keyword("air drag", prior=Normal(0.0, 1.0), units="1/m")
+    law = Effect.keyword(
+        *("power law", "air_drag", "exponent"),
+        prior=Normal(torch.zeros(2), torch.ones(2)),
+        null=torch.tensor([0.0, 1.0]),
+    )
+    value = {"tilt": 1.0}
+    phi, action = torch.tensor([[0.5, 2.0]]), torch.ones(1, 1)
+    changed = law.apply(value, phi, action, Context(torch.zeros(1)))
+    assert {k: float(v) for k, v in changed.items()} == {
+        **{"tilt": 1.0, "air_drag": 0.5, "exponent": 2.0}
+    }
+    model = AugmentedSimulator(SimulatorModel(fn), [drag])
+    x = model(torch.tensor([[3.0, 0.5]]), 2 * action)
+    assert float(x) == pytest.approx(3 * 2 - 0.5 * 4)
+    with pytest.raises(ValueError, match="expected 2 keywords .* got air_drag"):
+        Effect.keyword("law", "air_drag", prior=Normal(torch.zeros(2), torch.ones(2)))

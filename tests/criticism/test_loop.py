@@ -42,13 +42,7 @@ BIAS = Effect(
     null=0.0,
     apply=lambda x, phi, action, context: x + phi,
 )
-CUBIC = Effect(
-    "cubic",
-    hook="dynamics",
-    prior=normal(0.5),
-    null=0.0,
-    apply=lambda value, phi, action, context: {**value, "cubic": phi[:, 0]},
-)
+CUBIC = Effect.keyword("cubic", prior=normal(0.5))
 DRIFT = Effect(
     "drift",
     hook="observation",

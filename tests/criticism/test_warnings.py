@@ -55,13 +55,7 @@ def bias(sd: float = 1.0) -> Effect:
     )
 
 
-CUBIC = Effect(
-    "cubic",
-    hook="dynamics",
-    prior=normal(0.5),
-    null=0.0,
-    apply=lambda value, phi, action, context: {**value, "cubic": phi[:, 0]},
-)
+CUBIC = Effect.keyword("cubic", prior=normal(0.5))
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def library(scale: float = 1.0) -> list[Effect]:
             apply=lambda x, phi, action, context: x * (1 + phi),
             units="",
         ),
-        _term("quadratic", normal(1.0 * scale)),
+        Effect.keyword("quadratic", prior=normal(1.0 * scale)),
         Effect(
             "action offset",
             hook="action",
@@ -140,10 +140,10 @@ def make_world() -> World:
             units="",
         ),
         outside=[
-            _term("sine", signed_uniform(5.0, 12.0)),
-            _term("step", signed_uniform(5.0, 12.0)),
-            _term("bump", signed_uniform(5.0, 12.0)),
-            _term("power", signed_uniform(5.0, 10.0)),
+            Effect.keyword("sine", prior=signed_uniform(5.0, 12.0)),
+            Effect.keyword("step", prior=signed_uniform(5.0, 12.0)),
+            Effect.keyword("bump", prior=signed_uniform(5.0, 12.0)),
+            Effect.keyword("power", prior=signed_uniform(5.0, 10.0)),
         ],
         equivalences=[
             frozenset({"none", "gain"}),
@@ -156,16 +156,4 @@ def make_world() -> World:
             "step": frozenset({"step(xi)", "sign(xi)"}),
             "power": frozenset({"|xi|^1.5"}),
         },
-    )
-
-
-def _term(name: str, prior: torch.distributions.Distribution) -> Effect:
-    """Return an effect that is a keyword argument of the simulator."""
-    return Effect(
-        name,
-        hook="dynamics",
-        prior=prior,
-        null=0.0,
-        apply=lambda value, phi, action, context: {**value, name: phi[:, 0]},
-        units="",
     )

@@ -13,7 +13,6 @@ from functools import partial
 import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
-from torch.distributions import Distribution
 
 from benchmarks.criticism.worlds.block import slide
 from benchmarks.criticism.worlds.world import (
@@ -37,9 +36,9 @@ ALIASES = {"stribeck": frozenset({"speed gain", "speed offset"})}
 def library(scale: float = 1.0) -> list[Effect]:
     """Return the declared effects, the scales of their priors multiplied."""
     return [
-        _force("quadratic drag", half_normal(0.2 * scale), "1/m"),
-        _force("viscous drag", half_normal(0.4 * scale), "1/s"),
-        _force("tilt", normal(math.radians(2.0) * scale), "rad"),
+        Effect.keyword("quadratic drag", prior=half_normal(0.2 * scale), units="1/m"),
+        Effect.keyword("viscous drag", prior=half_normal(0.4 * scale), units="1/s"),
+        Effect.keyword("tilt", prior=normal(math.radians(2.0) * scale), units="rad"),
         Effect(
             "speed gain",
             hook="action",
@@ -72,7 +71,9 @@ def library(scale: float = 1.0) -> list[Effect]:
             apply=lambda x, phi, action, context: x * (1 + phi),
             units="",
         ),
-        _force("time offset", normal(0.03 * scale), "s", family="observation"),
+        Effect.keyword(
+            "time offset", prior=normal(0.03 * scale), units="s", family="observation"
+        ),
     ]
 
 
@@ -91,10 +92,10 @@ def scatter() -> Effect:
 def outside() -> list[Effect]:
     """Return the effects that the library lacks."""
     return [
-        _force("stribeck", uniform(0.3, 0.8), ""),
-        _force("magnet", signed_uniform(0.4, 1.2), "m/s^2"),
-        _force("edge shift", uniform(-0.25, -0.1), "m"),
-        _force("wall", uniform(0.6, 1.2), "m", null=torch.inf),
+        Effect.keyword("stribeck", prior=uniform(0.3, 0.8)),
+        Effect.keyword("magnet", prior=signed_uniform(0.4, 1.2), units="m/s^2"),
+        Effect.keyword("edge shift", prior=uniform(-0.25, -0.1), units="m"),
+        Effect.keyword("wall", prior=uniform(0.6, 1.2), units="m", null=torch.inf),
     ]
 
 
@@ -128,25 +129,4 @@ def make_world(*, one_way: bool = False) -> World:
         equivalences=[frozenset({"none", "tilt"})] if one_way else [],
         aliases=ALIASES,
         formulas={"camera bias": frozenset({"1"}), "camera scale": frozenset({"x"})},
-    )
-
-
-def _force(
-    name: str,
-    prior: Distribution,
-    units: str,
-    *,
-    null: float = 0.0,
-    family: str | None = None,
-) -> Effect:
-    """Return an effect that is a keyword argument of the simulator."""
-    keyword = name.replace(" ", "_")
-    return Effect(
-        name,
-        hook="dynamics",
-        family=family,
-        prior=prior,
-        null=null,
-        apply=lambda value, phi, action, context: {**value, keyword: phi[:, 0]},
-        units=units,
     )
