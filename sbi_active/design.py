@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from sbi_active.actions import DiscreteActions
+from sbi_active.actions import ActionSpace
 from sbi_active.information_gain.base import Bound
 
 if TYPE_CHECKING:
@@ -22,16 +22,19 @@ class Design:
     """The chosen action and the estimates behind the choice.
 
     Attributes:
-        action: The chosen action, shape (action_dim,).
-        candidates: All candidates, shape (a, action_dim).
+        action: The chosen action, shape (action_dim,), or the chosen batch, shape
+            (num_actions, action_dim).
+        candidates: All candidates that were compared at last, shape (a, action_dim).
+            Of a batch all that follows is about the choice of its last action, given
+            the others: what it tells beyond them.
         expected_information_gain: Estimates on simulations that had no part in the
             choice, nats, shape (a,); NaN for a random choice.
         standard_error: Of each estimate, shape (a,).
         difference_standard_error: Of each estimate's difference to the chosen
             candidate's, on common random numbers, shape (a,); zero at the chosen one.
         probability_best: Probability that a candidate has the largest expectation of
-            the estimate, given the simulations, shape (a,); zero where a candidate is
-            excluded.
+            the estimate, by its cost if there is one, given the simulations, shape
+            (a,); zero where a candidate is excluded.
         probability_valid: Share of the simulations of each candidate that gave a
             measurement, partly observed ones included, shape (a,). Rows lost to a fault
             do not count; NaN where nothing else is left.
@@ -43,10 +46,13 @@ class Design:
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.
         stopped: Why no further simulations were run: "leader separated", "difference
-            negligible" or "budget spent".
+            negligible", "budget spent" or "simulations given".
         num_missing: Simulations of them all that were lost to faults of the simulator.
         notes: What to know: estimators that failed a check or disagree, where an
             estimate is a bound, candidates that were excluded.
+        cost: Of each candidate, shape (a,); None where there is none.
+        steps: Designs of the actions of a batch in turn, each given the former and the
+            pending ones; empty for a single action.
     """
 
     action: Tensor
@@ -65,8 +71,26 @@ class Design:
     stopped: str = "at random"
     num_missing: int = 0
     notes: tuple[str, ...] = ()
+    cost: Tensor | None = None
+    steps: tuple[Design, ...] = ()
+
+    @property
+    def utility(self) -> Tensor:
+        """Expected information gain by cost, nats a unit of cost, shape (a,)."""
+        if self.cost is None:
+            return self.expected_information_gain
+        return self.expected_information_gain / self.cost
+
+    @property
+    def joint_information_gain(self) -> float:
+        """What the action or the batch tells together, nats, beyond pending trials."""
+        steps = self.steps or (self,)
+        return sum(float(s.expected_information_gain[s.index]) for s in steps)
 
     def __repr__(self) -> str:
+        if self.steps:
+            gain = self.joint_information_gain
+            return f"Design({len(self.steps)} actions, joint EIG {gain:.2f} nats)"
         action = ", ".join(f"{v:g}" for v in self.action.tolist())
         if self.expected_information_gain.isnan().all():
             return f"Design(action [{action}], at random)"
@@ -88,10 +112,12 @@ class Design:
         ax = plt.subplots()[1] if ax is None else ax
         scalar = self.candidates.shape[1] == 1
         place = self.candidates[:, 0] if scalar else torch.arange(len(self.candidates))
-        gain, error = self.expected_information_gain, self.standard_error
-        ax.errorbar(
-            place.numpy(), gain.numpy(), 2 * error.numpy(), fmt="o-", ms=4, capsize=2
+        order = place.argsort()
+        gain, error = (
+            part[order].numpy()
+            for part in (self.expected_information_gain, self.standard_error)
         )
+        ax.errorbar(place[order].numpy(), gain, 2 * error, fmt="o-", ms=4, capsize=2)
         ax.axvline(float(place[self.index]), ls=":", color="k", label="chosen")
         ax.set_xlabel(self.name if scalar else "candidate")
         note = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}
@@ -100,7 +126,7 @@ class Design:
         return ax
 
 
-def action_name(actions: DiscreteActions) -> str:
+def action_name(actions: ActionSpace) -> str:
     """Return the name of a scalar action with its unit."""
     if actions.action_dim > 1:
         return "action"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,49 +12,61 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.design import Design, action_name
-from sbi_active.eligibility import discrete, excluded_note, reaches, warn_missing
-from sbi_active.information_gain import (
-    CandidateSimulations,
-    InformationGainEstimator,
-    ModelIndexGain,
-    ParameterGain,
-    RivalPredictive,
-    RivalSampler,
-)
-from sbi_active.information_gain.automatic import (
-    choose_estimator,
-    disagreements,
-    find_estimator,
-)
-from sbi_active.information_gain.candidates import CandidateSampler
-from sbi_active.information_gain.race import Race, paired_errors, standard_error
+from sbi_active.choice import as_batch, pricing
+from sbi_active.design import Design
+from sbi_active.eligibility import Permission, rows_of, warn_missing
+from sbi_active.information_gain import InformationGainEstimator
+from sbi_active.information_gain.automatic import find_estimator
 from sbi_active.random_designer import RandomDesigner
-from sbi_active.threads import single_thread
+from sbi_active.search import (
+    BayesianOptimization,
+    ExhaustiveSearch,
+    GradientSearch,
+    Search,
+)
+from sbi_active.seeding import derive_seed
+from sbi_active.selection import Selection
+from sbi_active.simulation import Simulations
+from sbi_active.target import Target
 
 __all__ = ["Design", "InformationGainDesigner", "RandomDesigner"]
 
+#: Name of a search: its class.
+SEARCHES: dict[str, type[Search]] = {
+    "exhaustive": ExhaustiveSearch,
+    "gradient": GradientSearch,
+    "bayesopt": BayesianOptimization,
+}
+
 
 class InformationGainDesigner:
-    r"""Choose :math:`\xi^* = \arg\max_\xi I(\theta; x | \xi)` among discrete actions.
+    r"""Choose :math:`\xi^* = \arg\max_\xi I(\theta; x | \xi) / c(\xi)`.
 
-    All candidates are simulated at the same parameters, so that estimates are compared
-    on common random numbers. Half of the simulations choose; the others report, since
-    the largest of many noisy estimates is too large. Every candidate first gets half
-    of ``num_samples``. Those within some standard errors of the leader then get twice
-    as many again and again, until the leader is the best with a probability of .95, or
-    is expected to lose less than .05 nat, or the budget is spent (successive
-    elimination). The report has no part in this.
+    A search finds the candidates: all actions of a list; in a continuous or mixed space
+    those at which a regression of the gain is largest. They are then simulated at the
+    same parameters, so that estimates are compared on common random numbers. Half of
+    these simulations choose; the others report, since the largest of many noisy
+    estimates is too large. Every candidate first gets half of ``num_samples``. Those
+    within some standard errors of the leader then get twice as many again and again,
+    until the leader is the best with a probability of .95, or is expected to lose less
+    than .05 nat, or the budget is spent (successive elimination). The report has no
+    part in this.
 
     Args:
-        actions: The candidates.
+        actions: The action space.
         num_samples: Simulations a candidate on average; an action that stays among the
-            leading ones gets at most four times as many.
-        estimator: Of the information gain: an estimator; "entropy", "nested" or
-            "posterior" (see :mod:`sbi_active.information_gain`); or "auto". That takes
-            declared noise first (entropies by nearest neighbors where x is one number,
-            nested Monte Carlo where it is more), then the same with noise from
-            replicates that pass a test of normality, else the network's bound.
+            leading ones gets at most four times as many. A search of a box spends as
+            many as for four candidates, four more each entry, and four more each
+            category after the first; half of them on comparing its finalists.
+        estimator: Of the information gain: an estimator; the name of one (see
+            :mod:`sbi_active.information_gain`); or "auto". That takes declared noise
+            first (entropies by nearest neighbors where x is one number, nested Monte
+            Carlo where it is more), then the same with noise from replicates that pass
+            a test of normality, else what the model can say.
+        search: A search; "exhaustive", "gradient" or "bayesopt" (see
+            :mod:`sbi_active.search`); or "auto", exhaustive for lists, else gradient.
+        exponent: k, of a choice with a probability proportional to the utility to the
+            power of k among the candidates; inf takes the best.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
         num_workers: Of the simulations, see
@@ -62,8 +76,9 @@ class InformationGainDesigner:
         num_retries: How often a row that a fault lost is tried again.
 
     Raises:
-        ValueError: If ``num_samples`` is below 8 or the estimator's name is unknown.
-        TypeError: If the action space is not discrete.
+        ValueError: If ``num_samples`` is below 8, the exponent is negative, or the name
+            of an estimator or a search is unknown.
+        TypeError: If the search does not apply to the action space.
 
     Example:
         >>> from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
@@ -76,7 +91,8 @@ class InformationGainDesigner:
         (tensor([4.]), 'EntropyGain')
 
     References:
-        Even-Dar, Mannor & Mansour, JMLR 2006 (successive elimination).
+        Even-Dar, Mannor & Mansour, JMLR 2006 (successive elimination); Kirsch et al.,
+        TMLR 2023 (choice in proportion to a power of the utility).
     """
 
     def __init__(
@@ -85,6 +101,8 @@ class InformationGainDesigner:
         *,
         num_samples: int = 1_500,
         estimator: str | InformationGainEstimator = "auto",
+        search: str | Search = "auto",
+        exponent: float = math.inf,
         eliminate: bool = True,
         num_workers: int = 1,
         time_limit: float | None = None,
@@ -95,10 +113,16 @@ class InformationGainDesigner:
                 f"expected num_samples >= 8, half to choose and half to report; got "
                 f"{num_samples}; do use about 1000"
             )
-        self.actions = discrete(actions)
-        self.num_samples = num_samples
-        self.estimator = estimator
-        self.eliminate = eliminate
+        if not exponent >= 0:
+            raise ValueError(
+                f"expected exponent >= 0; got {exponent}; do use inf for the best "
+                "action, or about 8 for one at random among good ones"
+            )
+        self.actions = actions
+        self.num_samples, self.exponent = num_samples, exponent
+        self.estimator, self.eliminate = estimator, eliminate
+        self.search = _find_search(search, actions)
+        self.search.size(actions)  # a search that does not apply is an error here
         self.engine: dict[str, Any] = {
             "num_workers": num_workers,
             "time_limit": time_limit,
@@ -113,11 +137,17 @@ class InformationGainDesigner:
         *,
         belief: Distribution | None = None,
         target: str | Sequence[str] = "theta",
+        simulations: Simulations | None = None,
+        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        constraint: Callable[[Tensor], Tensor] | None = None,
+        exclude: Tensor | None = None,
+        pending: Tensor | None = None,
         min_probability_valid: float = 0.0,
+        num_actions: int = 1,
         budget: int | None = None,
         seed: int | None = None,
     ) -> Design:
-        """Return the action that tells most about the target.
+        """Return the action that tells most about the target, or a batch of them.
 
         Args:
             model: What the estimator needs, for :class:`PosteriorGain` anything with
@@ -132,187 +162,94 @@ class InformationGainDesigner:
                 index of the rivals
                 (:class:`~sbi_active.information_gain.ModelIndexGain`). The estimates of
                 the latter two are lower bounds.
+            simulations: Rows under the belief, such as those that the model was trained
+                on; then nothing is simulated. Half of them choose and half report, but
+                where the model has seen them, both are too high.
+            cost: Of actions (n, action_dim), shape (n,), positive; or one number an
+                action of a list, shape (a,). The utility is information by cost.
+            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
+                bool.
+            exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
+                within a hundredth of its width.
+            pending: Actions under way, shape (p, action_dim), whose outcomes will be
+                known: what counts is the information beyond them.
             min_probability_valid: Candidates that give a measurement less often, by
                 the share of the first simulations, are not chosen; 0 excludes none.
-            budget: Simulations in all; None is ``num_samples`` a candidate.
+            num_actions: Of a batch, chosen one after the other by joint information
+                with those before, each with the budget of one.
+                This and ``pending`` take joint outcomes, which estimators by the noise
+                ("entropy", "nested"), a likelihood, or named parameters have; a
+                posterior or a ratio of single outcomes has not.
+            budget: Simulations of an action in all; None is ``num_samples`` a
+                candidate.
             seed: Of the simulations; None draws one from torch's global generator.
 
         Returns:
             The design.
 
         Raises:
-            ValueError: If there is no belief, the budget is below 8 a candidate, the
-                simulator is deterministic, the estimator needs a model, the target is
-                unknown, or no candidate is valid often enough.
+            ValueError: If there is no belief, the budget is too small, the simulator is
+                deterministic, the estimator needs a model or has no joint information,
+                the target is unknown, or no candidate is permitted or valid often
+                enough.
         """
-        num_actions = len(self.actions)
-        budget = self.num_samples * num_actions if budget is None else budget
-        if budget < 8 * num_actions:
+        if num_actions < 1:
             raise ValueError(
-                f"expected a budget >= {8 * num_actions}, 8 a candidate; got {budget}; "
-                "do allow more simulations or fewer candidates"
+                f"expected num_actions >= 1; got {num_actions}; do ask for one or more"
             )
+        others = rows_of(self.actions, pending, "pending")
+        permission = Permission(
+            self.actions, constraint, rows_of(self.actions, exclude, "exclude")
+        )
+        price = pricing(cost, self.actions)
         seed = int(torch.randint(2**62, ())) if seed is None else seed
-        sampler, estimator, belief = self._prepare(
-            model, simulator, belief, target, seed
+        about = Target.of(
+            target,
+            self.estimator,
+            model,
+            simulator,
+            belief,
+            simulates=simulations is None,
         )
-        replicates = estimator is None or estimator.needs_noise
-        size = max(8, self.num_samples // (2 if self.eliminate else 1))
-        size = min(size, budget // num_actions) // 4 * 4
-        first = sampler.draw(size, torch.arange(num_actions), replicates=replicates)
-        notes: list[str] = []
-        if estimator is None:
-            estimator, notes = choose_estimator(model, first)
-        else:
-            notes = estimator.problems(first)
-        notes += estimator.remarks(first)
-        replicates = first.replicate is not None
-        halves = _halves(first)
-        num_valid, num_counted = first.num_valid()
-        eligible = reaches(num_valid / num_counted, min_probability_valid)
-        notes += excluded_note(eligible, min_probability_valid)
-
-        gains = [[torch.empty(0)] * num_actions for _ in range(2)]
-
-        def estimate(index: Tensor, halves: list[CandidateSimulations]) -> None:
-            for half, gain in zip(halves, gains, strict=True):
-                with single_thread():
-                    contributions = estimator(model, half, belief)
-                for a, row in zip(index.tolist(), contributions, strict=True):
-                    gain[a] = row
-
-        active, excluded = (torch.nonzero(e)[:, 0] for e in (eligible, ~eligible))
-        if len(excluded):  # estimated once, never chosen
-            estimate(excluded, [half.candidates(excluded) for half in halves])
-            halves = [half.candidates(active) for half in halves]
-        while True:
-            estimate(active, halves)
-            race = Race.run([gains[0][a] for a in active], seed)
-            keep = race.in_reach
-            spent = 2 * len(halves[0].theta) * (2 if replicates else 1)
-            more = min(
-                spent,
-                4 * self.num_samples - spent,
-                (budget - sampler.num_drawn) // int(keep.sum()) // 4 * 4,
-            )
-            stop = race.reason()
-            if stop is None and more < 8:
-                stop = "budget spent"
-            if stop is not None:
-                break
-            active = active[keep]
-            drawn = sampler.draw(more, active, replicates=replicates)
-            for count, new in zip(
-                (num_valid, num_counted), drawn.num_valid(), strict=True
-            ):
-                count[active] += new
-            halves = [
-                half.candidates(keep).join(new)
-                for half, new in zip(halves, _halves(drawn), strict=True)
-            ]
-
-        warn_missing(sampler.num_missing, sampler.num_drawn)
-        contributions = torch.stack([gains[0][a] for a in active])
-        with single_thread():
-            notes += disagreements(estimator, model, halves[0], belief, contributions)
-        chosen = int(active[race.leader])
-        report = gains[1]
-        both = [torch.cat(rows) for rows in zip(*gains, strict=True)]
-        probability_best = torch.zeros(num_actions, dtype=torch.float64)
-        probability_best[eligible] = Race.run(
-            [row for row, e in zip(both, eligible.tolist(), strict=True) if e], seed
-        ).probability_best
-        samples = [(2 if replicates else 1) * len(row) for row in both]
-        return Design(
-            action=self.actions.values[chosen],
-            candidates=self.actions.values,
-            expected_information_gain=torch.stack([row.nanmean() for row in report]),
-            standard_error=torch.stack([standard_error(row) for row in report]),
-            difference_standard_error=paired_errors(report, chosen),
-            probability_best=probability_best,
-            probability_valid=num_valid / num_counted.double(),
-            bound=estimator.bound,
-            index=chosen,
-            num_simulations=sampler.num_drawn,
-            name=action_name(self.actions),
-            estimator=type(estimator).__name__,
-            num_samples=torch.tensor(samples),
-            stopped=stop,
-            num_missing=sampler.num_missing,
-            notes=tuple(notes),
+        selection = Selection(
+            target=about,
+            permission=permission,
+            price=price,
+            search=self.search,
+            num_samples=self.num_samples,
+            early=self.eliminate,
+            exponent=self.exponent,
+            engine=self.engine,
+            least=min_probability_valid,
+            seed=seed,
         )
-
-    def _prepare(
-        self,
-        model: Any,
-        simulator: Callable[..., Any] | None,
-        belief: Distribution | None,
-        target: str | Sequence[str],
-        seed: int,
-    ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None, Any]:
-        """Return what draws outcomes, the estimator (None: by checks), and belief."""
-        if target != "theta" and self.estimator != "auto":
-            raise ValueError(
-                f"expected estimator='auto' for target={target!r}, whose estimator is "
-                f"its own; got {self.estimator!r}; do leave out estimator="
-            )
-        if target == "model":
-            if not isinstance(model, Sequence):
+        if simulations is not None:
+            if num_actions > 1 or len(others):
                 raise ValueError(
-                    "expected a sequence of rivals for target='model'; got "
-                    f"{type(model).__name__}; do pass objects with probability and "
-                    "predict(action, num_samples, seed)"
+                    "expected one action and none pending with simulations=, rows of "
+                    f"single outcomes; got {num_actions} and {len(others)} pending; do "
+                    "leave out simulations="
                 )
-            rivals: Sequence[RivalPredictive] = model
-            sampler = RivalSampler(rivals, self.actions.values, seed)
-            return sampler, ModelIndexGain(sampler.probability), None
-        if simulator is None:
-            raise ValueError(
-                "expected a simulator; got None; do pass the one that the belief's "
-                "parameters belong to"
-            )
-        belief = getattr(model, "belief", None) if belief is None else belief
-        if belief is None:
-            raise ValueError(
-                "expected belief=, the distribution of the parameters; got none, and "
-                "the model has none; do pass the belief of this round"
-            )
-        if target == "theta":
-            estimator = find_estimator(self.estimator)
-        else:
-            estimator = ParameterGain(_parameters(target, simulator))
-        if estimator is not None and estimator.needs_model and model is None:
-            raise ValueError(
-                f"expected a model for {type(estimator).__name__}; got None; do pass "
-                "the trained posterior, or estimator='auto'"
-            )
-        sampler = CandidateSampler(
-            simulator, belief, self.actions.values, seed, self.engine
-        )
-        return sampler, estimator, belief
+            return selection.by_given(simulations)
+        steps: list[Design] = []
+        for k in range(num_actions):
+            if k:
+                selection = replace(selection, seed=derive_seed(seed, "action", k))
+            steps.append(selection.by_simulation(others, budget))
+            others = torch.cat([others, steps[-1].action[None]])
+        design = as_batch(steps)
+        warn_missing(design.num_missing, design.num_simulations)
+        return design
 
 
-def _parameters(target: str | Sequence[str], simulator: Any) -> list[int]:
-    """Return the places of parameters by name."""
-    names = getattr(simulator, "parameter_names", None)
-    if not names:
+def _find_search(search: str | Search, actions: ActionSpace) -> Search:
+    if isinstance(search, Search):
+        return search
+    if search == "auto":
+        return GradientSearch() if actions.listed() is None else ExhaustiveSearch()
+    if search not in SEARCHES:
         raise ValueError(
-            f"expected a simulator with parameter_names for target={target!r}; got "
-            "none; do build SimulatorModel(fn, parameter_names=[...])"
+            f"expected search among 'auto', {', '.join(map(repr, SEARCHES))}; got "
+            f"{search!r}; do choose one of these or pass a search"
         )
-    wanted = [target] if isinstance(target, str) else list(target)
-    unknown = [name for name in wanted if name not in names]
-    if unknown or not wanted:
-        raise ValueError(
-            f"expected target 'theta', 'model' or names among {list(names)}; got "
-            f"{target!r}; do choose one or more of these"
-        )
-    return [list(names).index(name) for name in wanted]
-
-
-def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:
-    half = len(simulations.theta) // 2
-    return [
-        simulations.samples(slice(half)),
-        simulations.samples(slice(half, 2 * half)),
-    ]
+    return SEARCHES[search]()

@@ -3,23 +3,109 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import ActionSpace, BoxActions
 from sbi_active.simulation import MissingRowsWarning
 
-__all__ = ["discrete", "excluded_note", "reaches", "warn_missing"]
+__all__ = [
+    "Permission",
+    "excluded_note",
+    "reaches",
+    "rows_of",
+    "warn_missing",
+]
+
+SAME = 0.01  # of the width of a box, within which two actions are the same
 
 
-def discrete(actions: ActionSpace) -> DiscreteActions:
-    """Return the action space if it lists its candidates, else raise."""
-    if not isinstance(actions, DiscreteActions):
-        raise TypeError(
-            f"expected DiscreteActions; got {type(actions).__name__}; do list the "
-            "candidates, DiscreteActions(values)"
+@dataclass(frozen=True)
+class Permission:
+    """Which actions may be chosen at all.
+
+    Attributes:
+        actions: The space.
+        constraint: Of actions (n, action_dim), which are permitted, shape (n,), bool;
+            None permits all.
+        exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
+            nor others within a hundredth of its width in every entry.
+    """
+
+    actions: ActionSpace
+    constraint: Callable[[Tensor], Tensor] | None
+    exclude: Tensor
+
+    def __call__(self, action: Tensor) -> Tensor:
+        """Return which of actions (n, action_dim) are permitted, shape (n,), bool.
+
+        Raises:
+            ValueError: If the constraint returns another shape.
+        """
+        inside = torch.ones(len(action)).bool()
+        if self.constraint is not None:
+            answer = torch.as_tensor(self.constraint(action))
+            if answer.shape != inside.shape:
+                raise ValueError(
+                    f"expected a constraint that maps actions {tuple(action.shape)} to "
+                    f"({len(action)},), bool; got shape {tuple(answer.shape)}; do "
+                    "return one answer a row"
+                )
+            inside = answer.bool()
+        if len(self.exclude):
+            offset = (action[:, None].float() - self.exclude).abs()
+            inside = inside & ~(offset <= self._tolerance()).all(-1).any(1)
+        return inside
+
+    def listed(self) -> tuple[Tensor | None, tuple[str, ...]]:
+        """Return the permitted actions of a list, and how many are not.
+
+        Raises:
+            ValueError: If none is.
+        """
+        values = self.actions.listed()
+        if values is None:
+            return None, ()
+        inside = self(values)
+        if not bool(inside.any()):
+            raise ValueError(
+                f"expected a permitted action; got none of {len(values)}; do loosen "
+                "constraint= or exclude="
+            )
+        out = int((~inside).sum())
+        note = f"{out} of {len(values)} candidates not permitted"
+        return values[inside], (note,) if out else ()
+
+    def _tolerance(self) -> Tensor:
+        parts = []
+        for part in self.actions.parts():
+            if isinstance(part, BoxActions):
+                parts.append(SAME * (part.high - part.low))
+            else:
+                parts.append(torch.full((part.action_dim,), 1e-6))
+        return torch.cat(parts)
+
+
+def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
+    """Return actions as rows (t, action_dim); none for None.
+
+    Raises:
+        ValueError: If the shape is another.
+    """
+    dim = actions.action_dim
+    if given is None:
+        return torch.empty(0, dim)
+    rows = torch.as_tensor(given, dtype=torch.float32)
+    rows = rows[None] if rows.shape == (dim,) else rows
+    if rows.ndim != 2 or rows.shape[1] != dim:
+        raise ValueError(
+            f"expected {name} of shape (t, {dim}); got {tuple(rows.shape)}; do give "
+            "one row an action"
         )
-    return actions
+    return rows
 
 
 def reaches(valid: Tensor, least: float) -> Tensor:

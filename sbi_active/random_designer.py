@@ -12,11 +12,20 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design import Design, action_name
-from sbi_active.eligibility import discrete, excluded_note, reaches, warn_missing
+from sbi_active.eligibility import (
+    Permission,
+    excluded_note,
+    reaches,
+    rows_of,
+    warn_missing,
+)
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 
 __all__ = ["RandomDesigner"]
+
+MANY = 1_024  # draws of a space without end, of which the permitted are candidates
+FEW = 32  # of these that are simulated for their share of measurements
 
 
 class RandomDesigner:
@@ -41,7 +50,7 @@ class RandomDesigner:
         time_limit: float | None = None,
         num_retries: int = 0,
     ) -> None:
-        self.actions = discrete(actions)
+        self.actions = actions
         self.num_samples = num_samples
         self.engine: dict[str, Any] = {
             "num_workers": num_workers,
@@ -55,6 +64,8 @@ class RandomDesigner:
         simulator: Callable[..., Any] | None = None,
         *,
         belief: Distribution | None = None,
+        constraint: Callable[[Tensor], Tensor] | None = None,
+        exclude: Tensor | None = None,
         min_probability_valid: float = 0.0,
         seed: int | None = None,
     ) -> Design:
@@ -66,19 +77,30 @@ class RandomDesigner:
                 ``min_probability_valid``.
             belief: Of the parameters, at which candidates are simulated; None is
                 ``model.belief``.
+            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
+                bool.
+            exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
+                within a hundredth of its width.
             min_probability_valid: Candidates that give a measurement less often are
-                excluded; 0 excludes none.
+                excluded; 0 excludes none. Of a space without end, 32 actions are
+                simulated.
             seed: Of the choice and the simulations; None draws one from torch's global
                 generator.
 
         Returns:
-            The design.
+            The design. Of a space without end the candidates are those drawn.
 
         Raises:
             ValueError: If a share of measurements is asked for without a simulator or a
                 belief, or no candidate reaches it.
         """
-        num = len(self.actions)
+        permission = Permission(
+            self.actions, constraint, rows_of(self.actions, exclude, "exclude")
+        )
+        candidates, notes = permission.listed()
+        if candidates is None:
+            candidates = self._draw(permission, seed, few=min_probability_valid > 0)
+        num = len(candidates)
         unknown = torch.full((num,), torch.nan, dtype=torch.float64)
         valid, num_simulations, num_missing = unknown, 0, 0
         eligible = torch.ones(num).bool()
@@ -91,7 +113,7 @@ class RandomDesigner:
                     "both, or leave min_probability_valid at 0"
                 )
             seed = int(torch.randint(2**62, ())) if seed is None else seed
-            status = self._outcomes(simulator, belief, seed)
+            status = self._outcomes(simulator, belief, candidates, seed)
             counted = (status != Outcome.MISSING).sum(1)
             valid = (status == Outcome.OK).sum(1).double() / counted
             num_simulations = status.numel()
@@ -102,8 +124,8 @@ class RandomDesigner:
             remaining = torch.nonzero(eligible)[:, 0]
             chosen = int(remaining[int(torch.randint(len(remaining), ()))])
         return Design(
-            action=self.actions.values[chosen],
-            candidates=self.actions.values,
+            action=candidates[chosen],
+            candidates=candidates,
             expected_information_gain=unknown,
             standard_error=unknown,
             difference_standard_error=unknown,
@@ -115,14 +137,31 @@ class RandomDesigner:
             name=action_name(self.actions),
             num_samples=torch.full((num,), num_simulations // num).long(),
             num_missing=num_missing,
-            notes=excluded_note(eligible, min_probability_valid),
+            notes=(*excluded_note(eligible, min_probability_valid), *notes),
         )
 
+    def _draw(self, permission: Permission, seed: int | None, *, few: bool) -> Tensor:
+        """Return permitted actions of a space without end, one or a few."""
+        own = None if seed is None else derive_seed(seed, "candidates")
+        drawn = self.actions.sample((MANY,), seed=own)
+        drawn = drawn[permission(drawn)]
+        if len(drawn) == 0:
+            raise ValueError(
+                f"expected a constraint that permits a part of {self.actions!r}; got "
+                f"none of {MANY} actions; do narrow the space to about what is "
+                "permitted"
+            )
+        return drawn[: FEW if few else 1]
+
     def _outcomes(
-        self, simulator: Callable[..., Any], belief: Distribution, seed: int
+        self,
+        simulator: Callable[..., Any],
+        belief: Distribution,
+        values: Tensor,
+        seed: int,
     ) -> Tensor:
         """Simulate candidates at the same parameters; statuses, shape (a, n)."""
-        n, values = self.num_samples, self.actions.values
+        n = self.num_samples
         with forked_generators(seed, "theta"):
             theta = belief.sample(torch.Size([n]))
         rows = theta.repeat(len(values), 1), values.repeat_interleave(n, 0)

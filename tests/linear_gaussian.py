@@ -40,3 +40,73 @@ class ExactModel:
         z = (theta - mean) / (self.spread * variance.sqrt())
         scale = 0.5 * variance.log() + math.log(self.spread)
         return (-0.5 * z**2 - scale - 0.5 * math.log(2 * math.pi)).sum(-1)
+
+    def sample_batched(
+        self, sample_shape: torch.Size, x: Tensor, action: Tensor, **options: object
+    ) -> Tensor:
+        mean, variance = moments(x, action)
+        sd = self.spread * variance.sqrt()
+        return mean + sd * torch.randn(*sample_shape, *mean.shape)
+
+
+class ExactLikelihood:
+    """The likelihood as a model for the designer.
+
+    Args:
+        spread: Of the noise, 1 is exact.
+    """
+
+    belief = PRIOR
+
+    def __init__(self, spread: float = 1.0) -> None:
+        self.spread = spread
+        self.exact_likelihood = spread == 1
+
+    def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        return log_normal(x - action * theta, self.spread)
+
+
+class ExactLikelihoodAndPosterior(ExactLikelihood):
+    """Both.
+
+    Args:
+        spread: Of the likelihood's noise, 1 is exact.
+        proposal: Of the posterior, 1 is exact.
+    """
+
+    def __init__(self, spread: float = 1.0, proposal: float = 1.0) -> None:
+        super().__init__(spread)
+        self._posterior = ExactModel(proposal)
+
+    def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        return self._posterior.log_posterior(theta, x, action)
+
+    def sample_batched(
+        self, sample_shape: torch.Size, x: Tensor, action: Tensor, **options: object
+    ) -> Tensor:
+        return self._posterior.sample_batched(sample_shape, x, action)
+
+
+class ExactRatio:
+    """The ratio of likelihood to marginal as a model for the designer.
+
+    Args:
+        offset: What it is off by, a function of x as its normalization may be.
+        power: To which it is raised; 1 is exact.
+    """
+
+    belief = PRIOR
+
+    def __init__(self, offset: float = 0.0, power: float = 1.0) -> None:
+        self.offset, self.power = offset, power
+
+    def log_ratio(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        marginal = log_normal(x, (1 + action**2).sqrt())
+        ratio = log_normal(x - action * theta, 1.0) - marginal
+        return self.power * ratio + self.offset * x.abs().sum(-1)
+
+
+def log_normal(z: Tensor, sd: float | Tensor) -> Tensor:
+    """Log density of independent normal numbers, (n, d) -> (n,)."""
+    scale = torch.as_tensor(sd)
+    return (-0.5 * (z / scale) ** 2 - scale.log() - 0.5 * math.log(2 * math.pi)).sum(-1)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sbi_active import DiscreteActions
+from sbi_active import BoxActions, DiscreteActions, MixedActions
 
 
 def test_scalar_values_become_rows():
@@ -50,3 +50,90 @@ def test_bad_values(values, text):
 def test_wrong_number_of_names():
     with pytest.raises(ValueError, match="expected 1 names and units"):
         DiscreteActions([1.0], names=["a", "b"])
+
+
+BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "angle"], units=["m/s", ""])
+TOOLS = DiscreteActions([0.0, 1.0, 2.0], names=["tool"])
+MIXED = MixedActions(BOX, TOOLS)
+
+
+def test_box_samples_are_uniform_and_seeded():
+    draws = BOX.sample((20_000,), seed=0)
+    assert draws.shape == (20_000, 2)
+    assert torch.equal(draws, BOX.sample((20_000,), seed=0))
+    share = (draws - BOX.low) / (BOX.high - BOX.low)
+    assert ((share >= 0) & (share <= 1)).all()
+    for moment in (1, 2, 3):
+        error = (1 / (2 * moment + 1) - 1 / (moment + 1) ** 2) ** 0.5 / 20_000**0.5
+        distance = (share**moment).mean(0) - 1 / (moment + 1)
+        assert (distance.abs() < 4 * error).all()
+    assert BOX.sample((2, 3)).shape == (2, 3, 2)
+
+
+def test_a_box_contains_its_edges_and_has_no_end():
+    inside = BOX.contains(torch.tensor([[2.0, -1.0], [2.01, 0.0], [1.0, 1.1]]))
+    assert inside.tolist() == [True, False, False]
+    assert BOX.contains(torch.zeros(4, 5, 2)).shape == (4, 5)
+    assert BOX.listed() is None
+    assert TOOLS.listed().tolist() == [[0.0], [1.0], [2.0]]
+    assert BoxActions(0.0, 1.0).action_dim == 1
+
+
+def test_names_and_units_travel_with_the_parts():
+    assert MIXED.names == ["speed", "angle", "tool"]
+    assert MIXED.units == ["m/s", "", ""]
+    assert MIXED.action_dim == 3
+    nested = MixedActions(TOOLS, MixedActions(BoxActions(0.0, 1.0), TOOLS))
+    assert nested.names == ["action_1", "action_2", "action_3"]  # not unique
+    assert len(nested.parts()) == 3
+    assert BOX.parts() == [BOX]
+
+
+def test_mixed_samples_are_those_of_independent_parts():
+    draws = MIXED.sample((30_000,), seed=1)
+    assert torch.equal(draws, MIXED.sample((30_000,), seed=1))
+    assert MIXED.contains(draws).all()
+    share = torch.bincount(draws[:, 2].long()) / 30_000
+    assert ((share - 1 / 3).abs() < 4 * (2 / 9 / 30_000) ** 0.5).all()
+    correlation = torch.corrcoef(draws.T)[~torch.eye(3).bool()]
+    assert (correlation.abs() < 4 / 30_000**0.5).all()
+    two = MixedActions(BoxActions(0.0, 1.0), BoxActions(0.0, 1.0)).sample((9,), seed=0)
+    assert not torch.equal(two[:, 0], two[:, 1])  # a seed of its own each
+
+
+def test_mixed_contains_and_lists():
+    some = torch.tensor([[1.0, 0.0, 2.0], [1.0, 0.0, 0.5], [3.0, 0.0, 2.0]])
+    assert MIXED.contains(some).tolist() == [True, False, False]
+    assert MIXED.listed() is None
+    lists = MixedActions(TOOLS, DiscreteActions([[1.0, 2.0], [3.0, 4.0]]))
+    assert lists.listed().shape == (6, 3)
+    assert lists.listed()[:3].tolist() == [[0, 1, 2], [0, 3, 4], [1, 1, 2]]
+    assert lists.contains(lists.listed()).all()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (0.0, [1.0, 2.0], r"same shape .*; got \(\) and \(2,\)"),
+        (
+            torch.zeros(2, 2),
+            torch.ones(2, 2),
+            "expected low and high of the same shape",
+        ),
+        (1.0, 1.0, "expected finite low < high"),
+        (0.0, float("inf"), "expected finite low < high"),
+        ([], [], "expected low and high of the same shape"),
+    ],
+)
+def test_bad_boxes(low, high, text):
+    with pytest.raises(ValueError, match=text):
+        BoxActions(low, high)
+
+
+def test_bad_parts():
+    with pytest.raises(ValueError, match="one or more action spaces; got none"):
+        MixedActions()
+    with pytest.raises(TypeError, match="expected action spaces; got list"):
+        MixedActions([0.0, 1.0])
+    with pytest.raises(ValueError, match="expected 2 names and units"):
+        BoxActions([0.0, 0.0], [1.0, 1.0], names=["speed"])

@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.eligibility import discrete
 
 __all__ = ["most_unlike"]
 
+MANY = 1_024  # draws of a space without end
 
-def most_unlike(actions: ActionSpace, executed: Tensor) -> DiscreteActions:
+
+def most_unlike(actions: ActionSpace, executed: Tensor) -> ActionSpace:
     r"""Return the permitted actions farthest from all executed ones.
 
     .. math::
@@ -32,12 +33,13 @@ def most_unlike(actions: ActionSpace, executed: Tensor) -> DiscreteActions:
         >>> most_unlike(speeds, torch.tensor([[0.0], [4.0]])).values
         tensor([[2.]])
     """
-    permitted = discrete(actions)
-    values = permitted.values
     if len(executed) == 0:
-        return permitted
+        return actions
+    values = actions.listed()
+    if values is None:
+        values = actions.sample((MANY,), seed=0)
     width = values.max(0).values - values.min(0).values
     width = torch.where(width > 0, width, torch.ones_like(width))
     distance = torch.cdist(values / width, executed / width).min(1).values
     best = distance >= distance.max() - 1e-6
-    return DiscreteActions(values[best], names=permitted.names, units=permitted.units)
+    return DiscreteActions(values[best], names=actions.names, units=actions.units)

@@ -12,10 +12,15 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
+from sbi_active.information_gain.contrastive import ContrastiveGain
 from sbi_active.information_gain.entropy import EntropyGain
+from sbi_active.information_gain.info_nce import InfoNCEGain
+from sbi_active.information_gain.likelihood import LikelihoodGain
 from sbi_active.information_gain.nested import NestedGain
 from sbi_active.information_gain.posterior import PosteriorGain
 from sbi_active.information_gain.race import standard_error
+from sbi_active.information_gain.ratio import RatioGain
+from sbi_active.information_gain.variational_nested import VariationalNestedGain
 
 __all__ = [
     "ESTIMATORS",
@@ -27,12 +32,18 @@ __all__ = [
 
 #: Name of an estimator: its class.
 ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
+    "contrastive": ContrastiveGain,
     "entropy": EntropyGain,
+    "info_nce": InfoNCEGain,
+    "likelihood": LikelihoodGain,
     "nested": NestedGain,
     "posterior": PosteriorGain,
+    "ratio": RatioGain,
+    "variational_nested": VariationalNestedGain,
 }
 MAX_NEIGHBOR_OUTCOMES = 2  # numbers of x up to which nearest neighbors are trusted
 DISAGREEMENT = 0.3  # nats, beyond four standard errors
+FEW = 256  # simulations by which to see whether a bound is near its largest value
 
 
 def find_estimator(
@@ -62,7 +73,10 @@ def choose_estimator(
 
     With declared noise: entropies where x is one number, else nested Monte Carlo.
     With replicates: entropies for one or two numbers, else nested Monte Carlo on the
-    smoothed outcomes. Where checks fail, the network's bound.
+    smoothed outcomes. Where checks fail, what the model can say: the bound of a
+    posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
+    normalization of it can fool, but the mean log ratio where that is near its largest
+    value.
 
     Args:
         model: What was learned, or None.
@@ -86,6 +100,14 @@ def choose_estimator(
         notes += [f"{type(option).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes
+    if hasattr(model, "log_likelihood"):
+        return LikelihoodGain(), notes
+    if hasattr(model, "log_ratio"):
+        bound, few = InfoNCEGain(), simulations.samples(slice(FEW))
+        cautions = bound.cautions(bound(model, few, None))
+        if not cautions:
+            return bound, notes
+        return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
     return options[0], [*notes, "used all the same: there is no model"]
 
 
@@ -96,7 +118,7 @@ def disagreements(
     belief: Distribution | None,
     gain: Tensor,
 ) -> list[str]:
-    """Compare an estimator with the others that apply.
+    """Say what an estimate gives to know, and compare it with others that apply.
 
     Args:
         estimator: The one used.
@@ -114,12 +136,17 @@ def disagreements(
         others.append(EntropyGain())
     if hasattr(model, "log_posterior") and estimator.bound == "none":
         others.append(PosteriorGain())
-    notes = []
+    if isinstance(estimator, RatioGain):
+        others.append(InfoNCEGain())
+    notes = estimator.cautions(gain)
     for other in others:
-        difference = other(model, simulations, belief) - gain
+        estimate = other(model, simulations, belief)
+        difference = estimate - gain
         error = torch.stack([standard_error(row) for row in difference])
         mean = difference.nanmean(1)
         apart = mean.abs() > DISAGREEMENT + 4 * error
+        for a in torch.nonzero(apart)[:, 0].tolist():
+            apart[a] = not other.cautions(estimate[a : a + 1])
         if not bool(apart.any()):
             continue
         worst = int(torch.where(apart, mean.abs(), 0.0).argmax())

@@ -116,14 +116,18 @@ class InformationGainEstimator(ABC):
     r"""Estimator of :math:`I(\theta; x | \xi)` in nats for a set of candidates.
 
     Attributes:
-        bound: Which side of the information the estimate's expectation lies on.
+        bound: Which side of the information the estimate's expectation lies on,
+            whatever the model.
         needs_noise: Whether it uses the declared noise, or else replicates.
         needs_model: Whether it uses something learned.
+        rowwise: Whether a contribution depends on its own row alone, as given by
+            :meth:`CandidateSimulations.rows`.
     """
 
     bound: Bound = "none"
     needs_noise: bool = False
     needs_model: bool = True
+    rowwise: bool = False
 
     def __call__(
         self,
@@ -163,6 +167,23 @@ class InformationGainEstimator(ABC):
         with torch.no_grad():
             gain = self._contributions(model, simulations, belief).double()
         return gain.masked_fill(~simulations.counted, torch.nan)
+
+    def bound_on(self, model: Any) -> Bound:
+        """Return which side of the information the estimate's expectation lies on.
+
+        Args:
+            model: What the estimate is made with. With ``exact_likelihood = True`` its
+                likelihood is exact, otherwise learned.
+        """
+        return self.bound
+
+    def cautions(self, gain: Tensor) -> list[str]:
+        """Return what an estimate itself gives to know, as a limit that it is near.
+
+        Args:
+            gain: Contributions, shape (a, n).
+        """
+        return []
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
         """Return what speaks against the estimator on these simulations.

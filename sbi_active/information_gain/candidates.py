@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.information_gain.base import CandidateSimulations
+from sbi_active.information_gain.joint import join_outcomes
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation import (
     MissingRowsWarning,
@@ -37,8 +38,12 @@ class CandidateSampler:
         action: Candidates, shape (a, action_dim).
         seed: Of everything drawn.
         engine: Options of every :func:`~sbi_active.simulation.simulate`; None for none.
+        others: Actions whose outcomes will be known as well, shape (p, action_dim);
+            every draw then holds joint outcomes
+            (:func:`~sbi_active.information_gain.joint.join_outcomes`). None for none.
 
     Attributes:
+        action: Candidates, to which more may be added between draws.
         declared: Whether the simulator declares its noise around an output that does
             not change from run to run.
         num_drawn: Simulations so far.
@@ -52,9 +57,11 @@ class CandidateSampler:
         action: Tensor,
         seed: int,
         engine: Mapping[str, Any] | None = None,
+        others: Tensor | None = None,
     ) -> None:
         self.simulator, self.belief = simulator, belief
         self.action, self.seed = action, seed
+        self.others = action[:0] if others is None else others
         self.engine = dict(engine or {})
         self.num_drawn = self.num_missing = 0
         self._num_waves = 0
@@ -76,12 +83,39 @@ class CandidateSampler:
         num = num_samples // 2 if paired else num_samples
         with forked_generators(self.seed, "theta", self._num_waves):
             theta = self.belief.sample((num,))
-        action = self.action[candidates]
+        drawn = self._draw(theta, self.action[candidates], paired, "")
+        if drawn is not None and len(self.others):
+            beside = self._draw(theta, self.others, paired, "others")
+            drawn = None if beside is None else join_outcomes(drawn, beside)
+        if drawn is None:  # what is declared as noise-free is not
+            self.declared = False
+            return self.draw(num_samples, candidates, replicates=replicates)
+        return drawn
+
+    def rewind(self) -> None:
+        """Repeat the parameters and the noise of the first draw in the next."""
+        self._num_waves = 0
+
+    def _draw(
+        self, theta: Tensor, action: Tensor, paired: bool, label: str
+    ) -> CandidateSimulations | None:
+        """Simulate actions (a, action_dim) at parameters (n, theta_dim).
+
+        Args:
+            theta: Parameters.
+            action: Actions.
+            paired: Whether to simulate every row twice.
+            label: Of the seeds: outcomes that are joined have noise of their own.
+
+        Returns:
+            None where the declared mean turns out to change from run to run.
+        """
+        num = len(theta)
         rows = theta.repeat(len(action), 1), action.repeat_interleave(num, 0)
         shape = (len(action), num)
 
         def run(simulator: Callable[..., Any], key: str) -> tuple[Tensor, Tensor]:
-            seed = derive_seed(self.seed, key, self._num_waves)
+            seed = derive_seed(self.seed, label + key, self._num_waves)
             drawn = self._simulate(simulator, rows, seed)
             self.num_drawn += len(drawn)
             self.num_missing += drawn.counts["missing"]
@@ -94,10 +128,12 @@ class CandidateSampler:
             assert noise is not None
             mean, missing = run(self.simulator.mean, "x")
             if self._num_waves == 1 and self._lost_by_luck(rows, mean.flatten(0, 1)):
-                self.declared = False
-                return self.draw(num_samples, candidates, replicates=replicates)
-            seeds = row_seeds(derive_seed(self.seed, "noise", self._num_waves), num)
-            seeds = seeds.repeat(len(action))  # the same noise for all candidates
+                return None
+            noise_seed = derive_seed(self.seed, label + "noise", self._num_waves)
+            if label:  # they are not compared but measured together
+                seeds = row_seeds(noise_seed, len(action) * num)
+            else:  # the same noise for all candidates
+                seeds = row_seeds(noise_seed, num).repeat(len(action))
             x = noise.sample(mean.flatten(0, 1), seeds).float().reshape(mean.shape)
             return CandidateSimulations(
                 theta, action, x, mean, noise, missing=_if_any(missing)

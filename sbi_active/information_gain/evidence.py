@@ -161,16 +161,21 @@ def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
 
 def log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tensor:
     """Log density of the belief in the emulator's coordinates, shape (n,)."""
-    theta = emulator.parameters(z).float()
+    log_b = log_density(belief, emulator.parameters(z).float())
+    return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
+
+
+def log_density(belief: Distribution, theta: Tensor) -> Tensor:
+    """Log density of the belief, -inf outside its support, shape (n,), float64."""
     try:
         inside = belief.support.check(theta)  # type: ignore[union-attr]
     except NotImplementedError:
         inside = torch.ones(len(theta)).bool()
-    log_b = torch.full((len(z),), -torch.inf).double()
+    log_b = torch.full((len(theta),), -torch.inf).double()
     if bool(inside.any()):
         density = getattr(belief, "smooth_log_prob", belief.log_prob)
         log_b[inside] = density(theta[inside]).double()
-    return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
+    return log_b
 
 
 def _log_mean(log_term: Tensor, m: int, num: int) -> tuple[Tensor, Tensor]:

@@ -168,6 +168,10 @@ class RivalSampler:
         mean, sd = noise or (None, None)
         return RivalSimulations(index, self.action[candidates], x, mean=mean, sd=sd)
 
+    def rewind(self) -> None:
+        """Repeat the draws of the first call in the next."""
+        self._num_waves = 0
+
     def _predict(self, k: int, action: Tensor, num: int, seed: int) -> Tensor:
         """Return outcomes, and where all rivals know them their means and deviations.
 

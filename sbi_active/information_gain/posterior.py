@@ -48,6 +48,7 @@ class PosteriorGain(InformationGainEstimator):
     """
 
     bound: Bound = "lower"
+    rowwise = True
 
     def __init__(self, *, batch_size: int = 50_000) -> None:
         self.batch_size = batch_size

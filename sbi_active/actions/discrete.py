@@ -1,68 +1,17 @@
-"""Action spaces: what the robot may do in the next trial."""
+"""A list of actions."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.actions.space import ActionSpace
 from sbi_active.seeding import forked_generators
 
-__all__ = ["ActionSpace", "DiscreteActions"]
-
-
-class ActionSpace(ABC):
-    """A set of actions that can be sampled and tested for membership.
-
-    Attributes:
-        names: One an entry of the action.
-        units: One an entry of the action; empty where unknown.
-    """
-
-    names: list[str]
-    units: list[str]
-
-    @property
-    @abstractmethod
-    def action_dim(self) -> int:
-        """Numbers in an action."""
-
-    @abstractmethod
-    def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
-        """Return uniform draws.
-
-        Args:
-            sample_shape: Any shape, as in torch's distributions.
-            seed: None uses torch's global generator.
-
-        Returns:
-            Shape (*sample_shape, action_dim).
-        """
-
-    @abstractmethod
-    def contains(self, action: Tensor) -> Tensor:
-        """Return which actions belong to the space.
-
-        Args:
-            action: Shape (..., action_dim).
-
-        Returns:
-            Shape (...), bool.
-        """
-
-    def _label(self, names: Sequence[str] | None, units: Sequence[str] | None) -> None:
-        dim = self.action_dim
-        default = ["action"] if dim == 1 else [f"action_{i + 1}" for i in range(dim)]
-        self.names = default if names is None else [*names]
-        self.units = [""] * dim if units is None else [*units]
-        if len(self.names) != dim or len(self.units) != dim:
-            raise ValueError(
-                f"expected {dim} names and units, one an entry of the action; got "
-                f"{self.names} and {self.units}; do give one each"
-            )
+__all__ = ["DiscreteActions"]
 
 
 class DiscreteActions(ActionSpace):
@@ -123,3 +72,6 @@ class DiscreteActions(ActionSpace):
         action = torch.as_tensor(action, dtype=torch.float32)
         near = torch.isclose(action[..., None, :], self.values, rtol=1e-5, atol=1e-7)
         return near.all(-1).any(-1)
+
+    def listed(self) -> Tensor:
+        return self.values

@@ -1,0 +1,244 @@
+"""Continuous and mixed action spaces: regret and simulations of the searches.
+
+    python -m benchmarks.search.run [--cases numerical mixed]
+
+"numerical": the numerical task with any action in [-5, 5], under the prior and under
+the exact posterior after one trial at -5, also by a cost that moves the optimum off the
+end of the range; beside the exhaustive search of a grid of 101 actions. "mixed": a box
+of one or two entries with a category of three or four, the information known and of
+three local optima a category, another function each seed:
+
+    x = theta sqrt(exp(2 V(action)) - 1) + noise, theta and noise standard normal,
+
+whose information is V. All by the designer's defaults. Regret is exact, in nats (by
+cost: the loss of utility times the cost of the best action). Rows are added to
+result.csv beside this file, and those that are there are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, MultivariateNormal
+
+from benchmarks.information_gain.run import ExactBelief
+from sbi_active import (
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    InformationGainDesigner,
+    MixedActions,
+    SimulatorModel,
+)
+from sbi_active.actions import ActionSpace
+from sbi_active.plots import as_table
+from sbi_active.seeding import derive_seed
+from sbi_active.tasks import get_task
+
+RESULT = Path(__file__).with_name("result.csv")
+COLUMNS = ["case", "search", "seed", "regret", "error", "num_simulations", "cpu_s"]
+GRID = DiscreteActions(torch.linspace(-5, 5, 101))
+FOUND = 0.05  # nats of regret
+
+
+@dataclass(frozen=True)
+class Case:
+    """One design problem with its exact answer."""
+
+    name: str
+    seed: int
+    space: ActionSpace
+    simulator: Any
+    belief: Distribution
+    utility: Callable[[Tensor], Tensor]
+    best: float
+    scale: float = 1.0
+    cost: Callable[[Tensor], Tensor] | None = None
+
+
+def dear(action: Tensor) -> Tensor:
+    """Return a cost with its least at -1."""
+    return 1 + ((action[:, 0] + 1) / 2) ** 2
+
+
+def numerical(num_seeds: int) -> Iterator[Case]:
+    """Yield the cases of the numerical task."""
+    box = BoxActions(-5.0, 5.0, names=["xi"])
+    fine = torch.linspace(-5, 5, 401)[:, None]
+    for variant in ("linear", "sinh", "square"):
+        task = get_task("numerical", variant=variant)
+        before = task.reference(torch.empty(0, 1), torch.empty(0, 1))
+        action = torch.tensor([[-5.0]])
+        after = task.reference(action, task.real_system(action[0], seed=0)[None])
+        for trials, exact in enumerate((before, after)):
+            assert exact is not None
+            gain = exact.expected_information_gain
+            belief = ExactBelief(exact, task.prior) if trials else task.prior
+            name = f"numerical {variant}, round {trials + 1}"
+            best = float(gain(fine).max())
+            for seed in range(num_seeds):
+                yield Case(name, seed, box, task.simulator, belief, gain, best)
+            if trials or variant != "linear":
+                continue
+
+            def by_cost(action: Tensor, gain: Any = gain) -> Tensor:
+                return gain(action) / dear(action)
+
+            value = by_cost(fine)
+            scale = float(dear(fine)[value.argmax()])
+            best = float(value.max())
+            for seed in range(num_seeds):
+                yield Case(
+                    f"{name}, by cost",
+                    seed,
+                    box,
+                    task.simulator,
+                    belief,
+                    by_cost,
+                    best,
+                    scale,
+                    dear,
+                )
+
+
+def mixed(num_seeds: int) -> Iterator[Case]:
+    """Yield functions with known optima on a box and a category."""
+    prior = MultivariateNormal(torch.zeros(1), torch.eye(1))
+    for dim, num in ((1, 3), (2, 4)):
+        space = MixedActions(
+            BoxActions([0.0] * dim, [1.0] * dim),
+            DiscreteActions([float(k) for k in range(num)]),
+        )
+        for seed in range(num_seeds):
+            gain = Bumps(dim, num, seed)
+            model = SimulatorModel(gain.mean, noise=GaussianNoise(1.0))
+            name = f"mixed {dim}-D x {num}"
+            yield Case(name, seed, space, model, prior, gain, gain.best())
+
+
+class Bumps:
+    """A known information gain: three bumps a category, one of them the highest."""
+
+    def __init__(self, dim: int, num: int, seed: int) -> None:
+        g = torch.Generator().manual_seed(derive_seed(seed, "bumps", dim))
+        self.dim = dim
+        self.center = 0.05 + 0.9 * torch.rand(num, 3, dim, generator=g)
+        self.width = 0.12 + 0.13 * torch.rand(num, 3, generator=g)
+        self.height = 0.8 + 1.2 * torch.rand(num, 3, generator=g)
+        self.height[int(torch.randint(num, (), generator=g)), 0] = 2.4
+
+    def __call__(self, action: Tensor) -> Tensor:
+        k = action[:, self.dim].long()
+        square = (action[:, None, : self.dim] - self.center[k]).square().sum(-1)
+        bumps = self.height[k] * torch.exp(-square / (2 * self.width[k] ** 2))
+        return 0.1 + bumps.amax(1)
+
+    def mean(self, theta: Tensor, action: Tensor) -> Tensor:
+        return theta * torch.expm1(2 * self(action)).sqrt()[:, None]
+
+    def best(self) -> float:
+        # bumps do not add up, so that the largest is at a center
+        k = torch.arange(len(self.center)).repeat_interleave(3)[:, None]
+        return float(self(torch.cat([self.center.flatten(0, 1), k], 1)).max())
+
+
+CASES = {"numerical": (numerical, 20), "mixed": (mixed, 40)}
+
+
+def run(case: Case, search: str) -> dict[str, Any]:
+    space = GRID if search == "exhaustive" else case.space
+    designer = InformationGainDesigner(space, search=search)
+    start = time.process_time()
+    design = designer.select(
+        None, case.simulator, belief=case.belief, cost=case.cost, seed=case.seed
+    )
+    seconds = time.process_time() - start
+    utility = float(case.utility(design.action[None])[0])
+    return {
+        "case": case.name,
+        "search": search,
+        "seed": case.seed,
+        "regret": round(case.scale * (case.best - utility), 5),
+        "error": round(float(design.utility[design.index]) - utility, 4),
+        "num_simulations": design.num_simulations,
+        "cpu_s": round(seconds, 2),
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["case"], row["search"]), []).append(row)
+    lines = []
+    for (case, search), group in groups.items():
+        regret = torch.tensor([float(r["regret"]) for r in group])
+        error = torch.tensor([float(r["error"]) for r in group])
+        mean = [
+            sum(float(r[key]) for r in group) / len(group)
+            for key in ("num_simulations", "cpu_s")
+        ]
+        share = ""
+        if (case, "exhaustive") in groups:
+            full = groups[case, "exhaustive"]
+            total = sum(float(r["num_simulations"]) for r in full) / len(full)
+            share = f"{mean[0] / total:.1%}"
+        lines.append(
+            [
+                case,
+                search,
+                f"{len(group)}",
+                f"{float(regret.mean()):.3f}",
+                f"{float(regret.max()):.3f}",
+                f"{float((regret <= FOUND).double().mean()):.1%}",
+                f"{float(error.mean()):+.3f}",
+                f"{mean[0]:.0f}",
+                share,
+                f"{mean[1]:.1f}",
+            ]
+        )
+    header = ["case", "search", "runs", "regret", "largest", "<= .05"]
+    header += ["error of report", "simulations", "of the grid's", "CPU s"]
+    return as_table(lines, header)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--cases", nargs="+", choices=[*CASES], default=[*CASES])
+    parser.add_argument("--searches", nargs="+", default=["exhaustive", "gradient"])
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    rows: list[dict[str, Any]] = []
+    if RESULT.exists():
+        with RESULT.open() as file:
+            rows = [*csv.DictReader(file)]
+    done = {(r["case"], r["search"], int(r["seed"])) for r in rows}
+    with RESULT.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        if not rows:
+            writer.writeheader()
+        for name in arguments.cases:
+            make, num_seeds = CASES[name]
+            for case in make(num_seeds):
+                for search in arguments.searches:
+                    key = (case.name, search, case.seed)
+                    skipped = name == "mixed" and search == "exhaustive"
+                    if key in done or skipped:
+                        continue
+                    rows.append(run(case, search))
+                    writer.writerow(rows[-1])
+                    file.flush()
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,8 @@
+"""Action spaces: what the robot may do in the next trial, one kind a file."""
+
+from sbi_active.actions.box import BoxActions
+from sbi_active.actions.discrete import DiscreteActions
+from sbi_active.actions.mixed import MixedActions
+from sbi_active.actions.space import ActionSpace
+
+__all__ = ["ActionSpace", "BoxActions", "DiscreteActions", "MixedActions"]

@@ -1,0 +1,95 @@
+"""Actions whose entries are of different kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions.space import ActionSpace
+from sbi_active.seeding import derive_seed
+
+__all__ = ["MixedActions"]
+
+
+class MixedActions(ActionSpace):
+    r"""The product :math:`\mathcal D_1 \times \cdots \times \mathcal D_k` of spaces.
+
+    An action is an action of each part, one behind the other. A part that lists its
+    actions is taken as categorical by a search: that two of them are close in number
+    says nothing about how much they tell.
+
+    Args:
+        *spaces: The parts, such as a box of speeds and a list of tools.
+
+    Raises:
+        ValueError: If there is no part.
+        TypeError: If a part is not an action space.
+
+    Example:
+        >>> from sbi_active import BoxActions, DiscreteActions
+        >>> actions = MixedActions(
+        ...     BoxActions(0.0, 2.0, names=["speed"], units=["m/s"]),
+        ...     DiscreteActions([0.0, 1.0, 2.0], names=["tool"]))
+        >>> actions
+        MixedActions(BoxActions(speed in [0, 2]) x DiscreteActions(3 x tool))
+        >>> actions.names, actions.units
+        (['speed', 'tool'], ['m/s', ''])
+        >>> actions.sample((5,), seed=0).shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(self, *spaces: ActionSpace) -> None:
+        strange = [s for s in spaces if not isinstance(s, ActionSpace)]
+        if strange:
+            raise TypeError(
+                f"expected action spaces; got {type(strange[0]).__name__}; do pass "
+                "BoxActions(low, high) or DiscreteActions(values), one a part"
+            )
+        if not spaces:
+            raise ValueError(
+                "expected one or more action spaces; got none; do pass some"
+            )
+        self._parts = [part for space in spaces for part in space.parts()]
+        names = [name for part in self._parts for name in part.names]
+        unique = len(set(names)) == len(names)
+        units = [unit for part in self._parts for unit in part.units]
+        self._label(names if unique else None, units)
+
+    def __repr__(self) -> str:
+        return f"MixedActions({' x '.join(map(repr, self._parts))})"
+
+    @property
+    def action_dim(self) -> int:
+        return sum(part.action_dim for part in self._parts)
+
+    def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
+        columns = [
+            part.sample(
+                sample_shape,
+                seed=None if seed is None else derive_seed(seed, "part", i),
+            )
+            for i, part in enumerate(self._parts)
+        ]
+        return torch.cat(columns, -1)
+
+    def contains(self, action: Tensor) -> Tensor:
+        columns = torch.as_tensor(action).split([p.action_dim for p in self._parts], -1)
+        inside = [p.contains(c) for p, c in zip(self._parts, columns, strict=True)]
+        return torch.stack(inside).all(0)
+
+    def listed(self) -> Tensor | None:
+        """Return all combinations, the last part varying fastest."""
+        values = [part.listed() for part in self._parts]
+        rows = torch.empty(1, 0)
+        for value in values:
+            if value is None:
+                return None
+            rows = torch.cat(
+                [rows.repeat_interleave(len(value), 0), value.repeat(len(rows), 1)], 1
+            )
+        return rows
+
+    def parts(self) -> list[ActionSpace]:
+        return [*self._parts]

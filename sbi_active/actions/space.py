@@ -1,0 +1,69 @@
+"""What every action space offers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from torch import Tensor
+
+__all__ = ["ActionSpace"]
+
+
+class ActionSpace(ABC):
+    """A set of actions that can be sampled and tested for membership.
+
+    Attributes:
+        names: One an entry of the action.
+        units: One an entry of the action; empty where unknown.
+    """
+
+    names: list[str]
+    units: list[str]
+
+    @property
+    @abstractmethod
+    def action_dim(self) -> int:
+        """Numbers in an action."""
+
+    @abstractmethod
+    def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
+        """Return uniform draws.
+
+        Args:
+            sample_shape: Any shape, as in torch's distributions.
+            seed: None uses torch's global generator.
+
+        Returns:
+            Shape (*sample_shape, action_dim).
+        """
+
+    @abstractmethod
+    def contains(self, action: Tensor) -> Tensor:
+        """Return which actions belong to the space.
+
+        Args:
+            action: Shape (..., action_dim).
+
+        Returns:
+            Shape (...), bool.
+        """
+
+    def listed(self) -> Tensor | None:
+        """Return all actions, shape (a, action_dim); None where there is no end."""
+        return None
+
+    def parts(self) -> list[ActionSpace]:
+        """Return the spaces that this one is the product of."""
+        return [self]
+
+    def _label(self, names: Sequence[str] | None, units: Sequence[str] | None) -> None:
+        dim = self.action_dim
+        default = ["action"] if dim == 1 else [f"action_{i + 1}" for i in range(dim)]
+        self.names = default if names is None else [*names]
+        self.units = [""] * dim if units is None else [*units]
+        if len(self.names) != dim or len(self.units) != dim:
+            raise ValueError(
+                f"expected {dim} names and units, one an entry of the action; got "
+                f"{self.names} and {self.units}; do give one each"
+            )

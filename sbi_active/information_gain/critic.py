@@ -1,0 +1,126 @@
+"""What a model says of outcomes and parameters, where it can say it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+__all__ = ["Critic", "LikelihoodModel", "RatioModel"]
+
+
+class LikelihoodModel(Protocol):
+    """Anything with a conditional density of outcomes.
+
+    Where its likelihood is exact rather than learned, ``exact_likelihood = True`` says
+    so. It may have ``log_likelihood_table(x, theta, action)`` as well: outcomes
+    (n, *x_shape), parameters (m, theta_dim) and one action (action_dim,), all pairs of
+    them, -> (n, m). A network whose condition is (theta, action) then runs m times, not
+    n m times.
+    """
+
+    def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        """Return log q(x_i | theta_i, action_i), shape (n,).
+
+        Rows of x are NaN where there was no measurement; the log probability of that is
+        then asked for.
+        """
+        ...
+
+
+class RatioModel(Protocol):
+    """Anything with a likelihood-to-marginal ratio."""
+
+    def log_ratio(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        """Return log q(x_i | theta_i, action_i) - log q(x_i | action_i), shape (n,).
+
+        Rows of x are NaN where there was no measurement.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Critic:
+    r"""A function :math:`f(x, \theta | \xi)` of the model, evaluated in batches.
+
+    Attributes:
+        model: What was learned.
+        method: Its method.
+        user: Who asks, for errors.
+        batch_size: Rows in one pass.
+    """
+
+    model: Any
+    method: Literal["log_likelihood", "log_ratio", "log_posterior"]
+    user: str
+    batch_size: int
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.model, self.method):
+            raise ValueError(
+                f"expected a model with {self.method} for {self.user}; got "
+                f"{type(self.model).__name__}; do pass one that has it, or choose "
+                "estimator='auto'"
+            )
+
+    def rows(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        """Return f of every row.
+
+        Args:
+            x: Outcomes, shape (n, *x_shape).
+            theta: Parameters, shape (n, theta_dim).
+            action: Shape (n, action_dim).
+
+        Returns:
+            Shape (n,), float64.
+
+        Raises:
+            ValueError: If the model cannot say of a row.
+        """
+        evaluate = getattr(self.model, self.method)
+        parts = [part.split(self.batch_size) for part in (x, theta, action)]
+        values = [
+            evaluate(*self._order(*batch)).double()
+            for batch in zip(*parts, strict=True)
+        ]
+        return self._known(torch.cat(values))
+
+    def table(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        """Return f of every outcome with every parameter set.
+
+        Args:
+            x: Outcomes, shape (n, *x_shape).
+            theta: Parameters, shape (m, theta_dim).
+            action: One action, shape (action_dim,).
+
+        Returns:
+            Shape (n, m), float64.
+
+        Raises:
+            ValueError: If the model cannot say of a pair.
+        """
+        all_pairs = getattr(self.model, f"{self.method}_table", None)
+        if all_pairs is not None:
+            return self._known(all_pairs(*self._order(x, theta, action)).double())
+        n, m = len(x), len(theta)
+        values = self.rows(
+            x.repeat_interleave(m, 0), theta.repeat(n, 1), action.expand(n * m, -1)
+        )
+        return values.reshape(n, m)
+
+    def _order(self, x: Tensor, theta: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        if self.method == "log_likelihood":
+            return x, theta, action
+        return theta, x, action
+
+    def _known(self, values: Tensor) -> Tensor:
+        if bool(values.isnan().any()):
+            raise ValueError(
+                f"expected numbers from {type(self.model).__name__}.{self.method} for "
+                f"{self.user}; got NaN in {int(values.isnan().sum())} of "
+                f"{values.numel()} rows; do give a model that says how probable an "
+                "outcome without a measurement is, x = NaN"
+            )
+        return values

@@ -1,0 +1,225 @@
+"""Multi-start gradient ascent of a regression of the utility."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from sbi_active.search.base import Evaluations, Objective
+from sbi_active.search.coordinates import Coordinates
+from sbi_active.search.sequential import (
+    SequentialSearch,
+    permitted_points,
+    spaced,
+)
+from sbi_active.search.surrogate import Surrogate
+
+__all__ = ["GradientSearch"]
+
+NUM_STEPS = 50  # of the ascent
+STEP = 0.03  # in the unit cube
+RANGE = 0.1  # of the penalty on being close, in the unit cube
+#: Of the penalty at its largest, in standard deviations of the utility between actions.
+REPULSION = 0.3
+OPTIMISM = 2.0  # standard deviations of the regression that a proposal may hope for
+APART = 0.02  # least distance of actions chosen together, in the unit cube
+PENALTY = 10.0  # for a measurement that is too improbable, a unit of probability
+
+
+class GradientSearch(SequentialSearch):
+    r"""Ascend a smooth regression of the utility from many starts.
+
+    The simulator has no gradient, but the contributions to the utility are unbiased at
+    every action that was simulated,
+
+    .. math::
+        E[\log q(\theta_i | x_i, \xi_i) - \log p(\theta_i) \mid \xi_i] = U(\xi_i),
+
+    so that a regression :math:`\mu(\xi) \pm s(\xi)` of them
+    (:class:`~sbi_active.search.Surrogate`) has the gradient that U is lacking; as has
+    one of what other estimators give, on common random numbers. Where simulations are
+    given and the estimator scores rows one by one, such as the paper's, they are all
+    that is needed. Otherwise the utility is evaluated at actions that fill the space,
+    at common parameters and with common noise, and then in rounds where
+
+    .. math::
+        \mu(\xi_b) + 2 s(\xi_b) - \lambda \sum_{b' \ne b}
+        \exp\left(- |\xi_b - \xi_{b'}|^2 / 2 r^2\right)
+
+    is largest; :math:`\lambda`, which keeps the starts apart, falls to zero on the way.
+    The actions of a round are chosen from the ends one after the other, each as if
+    those before had been evaluated. A point that leaves what is permitted stays where
+    it was.
+
+    Args:
+        num_rounds: Rounds after the first.
+        num_finalists: Actions to compare in the end.
+        num_starts: Of an ascent.
+
+    References:
+        Klein et al., arXiv 2602.06900 (design by gradients of neural estimates);
+        Desautels, Krause & Burdick, JMLR 2014 (batches by upper confidence bounds).
+    """
+
+    def __init__(
+        self, *, num_rounds: int = 6, num_finalists: int = 5, num_starts: int = 64
+    ) -> None:
+        super().__init__(num_rounds=num_rounds, num_finalists=num_finalists)
+        if num_starts < 1:
+            raise ValueError(
+                f"expected num_starts >= 1; got {num_starts}; do use about 64"
+            )
+        self.num_starts = num_starts
+
+    def _propose(
+        self,
+        objective: Objective,
+        coordinates: Coordinates,
+        found: Evaluations,
+        num: int,
+        index: int,
+    ) -> Tensor:
+        score, regression = _score(objective, coordinates, found, OPTIMISM)
+        point = self._ascend(objective, coordinates, found, score, f"round {index}")
+        with torch.no_grad():
+            covariance = regression.covariance(point)
+            best = _batch(
+                point, score(point), covariance, num, coordinates.num_continuous
+            )
+        return coordinates.actions(point[best])
+
+    def _best(
+        self,
+        objective: Objective,
+        coordinates: Coordinates,
+        found: Evaluations,
+        num: int,
+    ) -> Tensor:
+        score, _ = _score(objective, coordinates, found, 0.0)
+        point = self._ascend(objective, coordinates, found, score, "finalists")
+        with torch.no_grad():
+            height = score(point)
+        c = coordinates.num_continuous
+        best = spaced(point, height, num, num_continuous=c, apart=APART)
+        return coordinates.actions(point[best])
+
+    def _ascend(
+        self,
+        objective: Objective,
+        coordinates: Coordinates,
+        found: Evaluations,
+        score: Callable[[Tensor], Tensor],
+        key: str,
+    ) -> Tensor:
+        """Return permitted points, where ascents started and ended, (s, dim)."""
+        start = permitted_points(objective, coordinates, self.num_starts, key)
+        known = coordinates.points(found.action)
+        start = torch.cat([start, known[objective.permitted(found.action)]])
+        with torch.enable_grad():
+            end = ascend(
+                score,
+                start,
+                num_continuous=coordinates.num_continuous,
+                permitted=lambda z: objective.permitted(coordinates.actions(z)),
+                repulsion=REPULSION * float(found.utility.std()),
+            )
+        return torch.cat([end, start])  # an ascent may end lower than it started
+
+
+def ascend(
+    score: Callable[[Tensor], Tensor],
+    start: Tensor,
+    *,
+    num_continuous: int,
+    permitted: Callable[[Tensor], Tensor],
+    repulsion: float,
+) -> Tensor:
+    """Return points that rose from permitted starts, shape (s, dim).
+
+    Args:
+        score: Of points (s, dim), differentiable in the first entries, shape (s,).
+        start: Shape (s, dim).
+        num_continuous: Entries that move, in a unit cube.
+        permitted: Of points (s, dim), shape (s,), bool.
+        repulsion: The penalty on two points that coincide, in units of the score.
+    """
+    c = num_continuous
+    fixed = start[:, c:]
+    other = (fixed[:, None] != fixed[None]).any(-1) | torch.eye(len(start)).bool()
+    u = start[:, :c].clone().requires_grad_(True)
+    optimizer = torch.optim.Adam([u], lr=STEP)
+    for step in range(NUM_STEPS):
+        optimizer.zero_grad()
+        left = 1 - (step + 1) / NUM_STEPS
+        square = (u[:, None] - u[None]).square().sum(-1) / (2 * RANGE**2)
+        close = (-square).exp().masked_fill(other, 0.0).sum()
+        total = score(torch.cat([u, fixed], 1)).sum() - 0.5 * repulsion * left * close
+        (-total).backward()
+        before = u.detach().clone()
+        optimizer.step()
+        with torch.no_grad():
+            u.clamp_(0, 1)
+            inside = permitted(torch.cat([u, fixed], 1))
+            u.copy_(torch.where(inside[:, None], u, before))
+        for group in optimizer.param_groups:
+            group["lr"] = STEP * (0.1 + 0.9 * left)
+    return torch.cat([u.detach(), fixed], 1)
+
+
+def _score(
+    objective: Objective,
+    coordinates: Coordinates,
+    found: Evaluations,
+    optimism: float,
+) -> tuple[Callable[[Tensor], Tensor], Surrogate]:
+    """Return what to ascend, and the regression of the utility in it."""
+    point = coordinates.points(found.action)
+    c = coordinates.num_continuous
+    utility = Surrogate(point, found.utility, found.standard_error, num_continuous=c)
+    least, share = objective.min_probability_valid, found.probability_valid.double()
+    presence = None
+    if least > 0 and bool((share < 1).any()):
+        error = (share * (1 - share) / 100 + 1e-4).sqrt()
+        presence = Surrogate(point, share, error, num_continuous=c)
+
+    def score(z: Tensor) -> Tensor:
+        mean, sd = utility(z)
+        if presence is None:
+            return mean + optimism * sd
+        lacking = (least - presence(z)[0]).clamp_min(0.0)
+        return mean + optimism * sd - PENALTY * utility.scale * lacking
+
+    return score, utility
+
+
+def _batch(
+    point: Tensor, score: Tensor, covariance: Tensor, num: int, num_continuous: int
+) -> Tensor:
+    """Return the points of a round, one after the other.
+
+    Each is chosen as if those before had been evaluated: what it may hope for falls
+    with the variance that they leave (GP-BUCB). An evaluation beside another, on common
+    random numbers, tells nothing new.
+
+    Args:
+        point: Shape (m, dim).
+        score: With what may be hoped for, shape (m,).
+        covariance: Of the regression, shape (m, m).
+        num: Points to choose.
+        num_continuous: Entries in the unit cube.
+    """
+    c, least = num_continuous, 1e-6 * float(covariance.diagonal().amax())
+    mean = score - OPTIMISM * covariance.diagonal().clamp_min(0.0).sqrt()
+    taken = torch.zeros(len(point)).bool()
+    chosen: list[int] = []
+    while len(chosen) < num and not bool(taken.all()):
+        hope = mean + OPTIMISM * covariance.diagonal().clamp_min(0.0).sqrt()
+        i = int(hope.masked_fill(taken, -torch.inf).argmax())
+        chosen.append(i)
+        column = covariance[:, i]
+        covariance = covariance - column.outer(column) / (column[i] + least)
+        same = (point[:, c:] == point[i, c:]).all(1)
+        taken |= same & (torch.cdist(point[:, :c], point[i : i + 1, :c])[:, 0] < APART)
+    return torch.tensor(chosen).long()

@@ -1,0 +1,255 @@
+"""Costs, constraints, exclusion, chance and given simulations."""
+
+import math
+
+import pytest
+import torch
+
+from sbi_active import (
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    InformationGainDesigner,
+    MixedActions,
+    RandomDesigner,
+    Simulations,
+    SimulatorModel,
+)
+from sbi_active.choice import choose
+from sbi_active.search.elimination import Estimates
+from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
+from tests.test_designer import ACTIONS, VALUES
+
+MODEL = SimulatorModel(lambda theta, action: action * theta, noise=GaussianNoise(1.0))
+BOX = BoxActions(0.0, 2.0, names=["push"], units=["m/s"])
+
+
+def select(actions=ACTIONS, num_samples=1_000, exponent=math.inf, **options):
+    designer = InformationGainDesigner(
+        actions, num_samples=num_samples, exponent=exponent
+    )
+    options = {"seed": 0} | options
+    return designer.select(None, MODEL, belief=PRIOR, **options)
+
+
+def dear(action):
+    """A cost that makes an action of about 1.4 the best a unit of cost."""
+    return 1 + action[:, 0] ** 3 / 4
+
+
+def test_information_by_cost():
+    design = select(cost=dear)
+    assert design.action.tolist() == [1.0]  # log 2 / 1.25 against log 5 / 3
+    assert torch.allclose(design.cost, dear(VALUES[:, None]).double())
+    ratio = design.expected_information_gain / design.cost
+    assert torch.equal(design.utility, ratio)
+    exact = information(VALUES[:, None])
+    distance = (design.expected_information_gain - exact).abs()
+    assert (distance < 4 * design.standard_error + 0.05).all()
+    assert design.probability_best[2] > 0.9
+    free = select()
+    assert free.action.tolist() == [2.0]  # negative control
+    assert free.cost is None
+    assert torch.equal(free.utility, free.expected_information_gain)
+    by_table = select(cost=dear(VALUES[:, None]))
+    assert by_table.action.tolist() == [1.0]
+    with pytest.raises(ValueError, match=r"expected a cost of shape \(a,\)"):
+        select(cost=torch.ones(3))
+    with pytest.raises(ValueError, match=r"expected positive costs of shape \(4,\)"):
+        select(cost=lambda action: -action[:, 0])
+
+
+def test_information_by_cost_in_a_box():
+    design = select(BOX, cost=dear)
+    grid = torch.linspace(0, 2, 401)[:, None]
+    utility = information(grid) / dear(grid)
+    own = information(design.action[None]) / dear(design.action[None])
+    assert float(utility.max() - own) < 0.03
+    assert 0.3 < float(design.action) < 1.7
+
+
+def test_a_constraint_and_actions_not_to_repeat():
+    design = select(constraint=lambda action: action[:, 0] < 1.5)
+    assert design.action.tolist() == [1.0]
+    assert design.candidates[:, 0].tolist() == [0.0, 0.5, 1.0]
+    assert design.num_simulations == int(design.num_samples.sum())
+    assert "1 of 4 candidates not permitted" in design.notes
+    again = select(exclude=torch.tensor([[2.0], [1.0]]))
+    assert again.candidates[:, 0].tolist() == [0.0, 0.5]
+    with pytest.raises(ValueError, match="expected a permitted action; got none of 4"):
+        select(exclude=VALUES[:, None])
+    with pytest.raises(ValueError, match=r"expected a constraint that maps actions"):
+        select(constraint=lambda action: action > 0)
+    with pytest.raises(ValueError, match=r"expected exclude of shape \(t, 1\)"):
+        select(exclude=torch.zeros(2, 2))
+
+
+def test_a_constraint_and_actions_not_to_repeat_in_a_box():
+    design = select(BOX, constraint=lambda action: action[:, 0] < 1.5)
+    assert 1.3 < float(design.action) < 1.5
+    best = select(BOX)
+    assert float(best.action) > 1.9
+    again = select(BOX, exclude=best.action)
+    assert abs(float(again.action) - float(best.action)) > 0.02  # 1% of the width
+    assert float(again.action) > 1.8
+
+
+def test_a_measurement_that_is_too_improbable_in_a_box():
+    def fails(theta, action):
+        lost = torch.rand(len(theta), 1) < 0.4 * action
+        return (action * theta + torch.randn_like(theta)).masked_fill(lost, torch.nan)
+
+    designer = InformationGainDesigner(BOX, num_samples=400)
+    design = designer.select(
+        None, fails, belief=PRIOR, min_probability_valid=0.6, seed=0
+    )
+    # .6 is at an action of 1; the share of 200 has an error of .035
+    assert float(design.action) < 1 + 4 * 0.035 / 0.4
+    assert float(design.probability_valid[design.index]) >= 0.6
+
+
+def test_chance_in_proportion_to_a_power_of_the_utility():
+    gain = information(VALUES[:, None]).double()
+    noise = torch.randn(40, generator=torch.Generator().manual_seed(0)).double()
+    rows = [g + 0.1 * (noise - noise.mean()) for g in gain]
+    estimates = Estimates(
+        action=VALUES[:, None],
+        choosing=rows,
+        reporting=rows,
+        num_samples=torch.full((4,), 80),
+        probability_valid=torch.ones(4).double(),
+        eligible=torch.tensor([True, True, False, True]),
+        leader=3,
+        stopped="budget spent",
+        notes=(),
+    )
+
+    def share(exponent, num=1_000):
+        chosen = torch.zeros(4).double()
+        for seed in range(num):
+            design = choose(
+                estimates,
+                ACTIONS,
+                cost=None,
+                exponent=exponent,
+                estimator="EntropyGain",
+                bound="none",
+                num_simulations=320,
+                num_missing=0,
+                seed=seed,
+            )
+            assert torch.equal(design.action, VALUES[design.index, None])
+            chosen[design.index] += 1 / num
+        return chosen
+
+    for exponent in (0.0, 2.0):
+        weight = gain**exponent * estimates.eligible
+        weight = weight / weight.sum()
+        error = (weight * (1 - weight) / 1_000).sqrt()
+        assert ((share(exponent) - weight).abs() <= 4 * error).all()
+    assert share(math.inf, 5).tolist() == pytest.approx([0, 0, 0, 1])
+    drawn = {select(num_samples=64, exponent=0.5, seed=s).index for s in range(12)}
+    assert len(drawn) > 1
+    with pytest.raises(ValueError, match="expected exponent >= 0; got -1"):
+        select(exponent=-1.0)
+
+
+def rows(num, actions, seed=0):
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        theta, action = PRIOR.sample((num,)), actions.sample((num,))
+        return Simulations(theta, action, simulator(theta, action))
+
+
+@pytest.mark.parametrize("estimator", ["auto", "posterior"])
+def test_given_simulations_need_no_others(estimator):
+    designer = InformationGainDesigner(ACTIONS, estimator=estimator)
+
+    def never(theta, action):
+        raise AssertionError("nothing is to be simulated")
+
+    given = rows(8_000, ACTIONS)
+    design = designer.select(ExactModel(), never, simulations=given, seed=0)
+    assert design.action.tolist() == [2.0]
+    assert design.num_simulations == 0
+    assert int(design.num_samples.sum()) == 8_000
+    assert (design.estimator, design.bound) == ("PosteriorGain", "none")
+    assert design.stopped == "simulations given"
+    assert "too high where the model was trained on them" in design.notes[0]
+    exact = information(VALUES[:, None])
+    distance = (design.expected_information_gain - exact).abs()
+    assert (distance < 4 * design.standard_error + 1e-6).all()
+    again = designer.select(ExactModel(), simulations=given, seed=0, cost=dear)
+    assert again.action.tolist() == [1.0]
+
+
+def test_given_simulations_in_a_box():
+    designer = InformationGainDesigner(BOX)
+    given = rows(5_000, BOX)
+    design = designer.select(ExactModel(), simulations=given, seed=0)
+    exact = information(design.candidates)
+    assert float(information(torch.tensor([[2.0]])) - exact[design.index]) < 0.1
+    distance = (design.expected_information_gain - exact).abs()
+    assert (distance < 4 * design.standard_error + 0.05).all()
+    assert (design.standard_error < 0.2).all()
+    assert design.num_simulations == 0
+    mixed = MixedActions(BOX, DiscreteActions([0.0, 1.0]))
+
+    class Second(ExactModel):
+        """The second tool does nothing."""
+
+        def log_posterior(self, theta, x, action):
+            log_q = super().log_posterior(theta, x, action[:, :1])
+            return torch.where(action[:, 1] == 1, PRIOR.log_prob(theta), log_q)
+
+    given = rows(4_000, BOX)
+    tool = (torch.arange(4_000) % 2).float()[:, None]
+    given = Simulations(given.theta, torch.cat([given.action, tool], 1), given.x)
+    design = InformationGainDesigner(mixed).select(Second(), simulations=given, seed=0)
+    assert float(design.action[1]) == 0.0
+    assert float(design.action[0]) > 1.6
+
+
+def test_errors_of_given_simulations():
+    designer = InformationGainDesigner(ACTIONS)
+    given = rows(400, ACTIONS)
+    with pytest.raises(ValueError, match="expected a model with simulations="):
+        designer.select(None, belief=PRIOR, simulations=given)
+    with pytest.raises(
+        ValueError, match="expected one action and none pending with si"
+    ):
+        designer.select(ExactModel(), simulations=given, num_actions=2)
+    with pytest.raises(ValueError, match="at least 16 rows of a candidate; got fewer"):
+        designer.select(ExactModel(), simulations=rows(400, BOX))
+    entropy = InformationGainDesigner(BOX, estimator="entropy")
+    with pytest.raises(ValueError, match="scores rows one by one with simulations="):
+        entropy.select(None, belief=PRIOR, simulations=rows(400, BOX))
+    wrong = Simulations(given.theta, given.action.repeat(1, 2), given.x)
+    with pytest.raises(TypeError, match=r"expected Simulations\(theta, action, x\)"):
+        designer.select(ExactModel(), simulations=(given.theta, given.action, given.x))
+    with pytest.raises(ValueError, match=r"of actions \(n, 1\); got \(400, 2\)"):
+        designer.select(ExactModel(), simulations=wrong)
+    with pytest.raises(ValueError, match="target='model'; got given simulations"):
+        designer.select([], simulations=given, target="model")
+
+
+def test_random_choices_of_any_space():
+    mixed = MixedActions(BOX, DiscreteActions([0.0, 1.0]))
+    drawn = torch.stack(
+        [RandomDesigner(mixed).select(seed=s).action for s in range(400)]
+    )
+    assert mixed.contains(drawn).all()
+    share = drawn[:, 0] / 2
+    assert abs(float(share.mean()) - 0.5) < 4 * (1 / 12 / 400) ** 0.5
+    assert abs(float(drawn[:, 1].mean()) - 0.5) < 4 * (0.25 / 400) ** 0.5
+    design = RandomDesigner(mixed).select(seed=0, constraint=lambda a: a[:, 0] > 1.5)
+    assert float(design.action[0]) > 1.5
+    again = RandomDesigner(ACTIONS).select(seed=0, exclude=VALUES[:3, None])
+    assert again.action.tolist() == [2.0]
+    with pytest.raises(ValueError, match="permits a part of BoxActions"):
+        RandomDesigner(BOX).select(seed=0, constraint=lambda a: a[:, 0] > 3)
+    floor = RandomDesigner(BOX).select(
+        None, MODEL, belief=PRIOR, min_probability_valid=0.5, seed=0
+    )
+    assert floor.candidates.shape == (32, 1)
+    assert (floor.probability_valid == 1).all()
