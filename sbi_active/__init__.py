@@ -9,16 +9,28 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import (
+    ActionSpace,
+    BoxActions,
+    DiscreteActions,
+    MixedActions,
+)
 from sbi_active.campaign import Campaign, CampaignOptions, StopRules, Trial
 from sbi_active.designer import Design, InformationGainDesigner, RandomDesigner
 from sbi_active.inference import (
+    ALHI,
     ASBI,
     ActionEmbedding,
+    ActionLikelihood,
     ActionPosterior,
+    ActionRatio,
+    ActiveInference,
     Belief,
     MixtureDensity,
     Refinement,
+    SeqBED,
+    SeqBED_B,
+    SeqBED_C,
 )
 from sbi_active.simulation import (
     AutocorrelatedNoise,
@@ -38,22 +50,31 @@ if TYPE_CHECKING:
 __version__ = version("sbi-active")
 
 __all__ = [
+    "ALHI",
     "ASBI",
     "ActionEmbedding",
+    "ActionLikelihood",
     "ActionPosterior",
+    "ActionRatio",
     "ActionSpace",
+    "ActiveInference",
     "AutocorrelatedNoise",
     "Bank",
     "Belief",
+    "BoxActions",
     "Campaign",
     "CampaignOptions",
     "Design",
     "DiscreteActions",
     "GaussianNoise",
     "InformationGainDesigner",
+    "MixedActions",
     "MixtureDensity",
     "RandomDesigner",
     "Refinement",
+    "SeqBED",
+    "SeqBED_B",
+    "SeqBED_C",
     "Simulations",
     "SimulatorModel",
     "StopRules",

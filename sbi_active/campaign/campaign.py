@@ -15,7 +15,8 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.health import Health, assess
 from sbi_active.campaign.learner import Learner
-from sbi_active.campaign.planner import METHODS, Planner
+from sbi_active.campaign.methods import METHODS, find_method
+from sbi_active.campaign.planner import Planner
 from sbi_active.campaign.revision import criticize, revise
 from sbi_active.campaign.state import CampaignOptions, CampaignState, Status, Trial
 from sbi_active.campaign.telling import outcome_told, same_outcome, trial_to_tell
@@ -39,7 +40,8 @@ class Campaign:
             (n, action_dim), giving x of shape (n, *x_shape).
         prior: Over the parameters, with a support.
         actions: What the robot may do.
-        method: "asbi" designs actions, "nsbi" draws them at random.
+        method: "asbi", "alhi" (a surrogate likelihood) and "seqbed" (ratios) design
+            actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
         effects: What the simulator may lack, see :class:`~sbi_active.criticism.Effect`.
             With them, actions are also chosen to tell whether it does.
         seed: Of everything random; the same seed and outcomes give the same campaign.
@@ -78,11 +80,7 @@ class Campaign:
         seed: int = 0,
         options: CampaignOptions | None = None,
     ) -> None:
-        if method not in METHODS:
-            raise ValueError(
-                f"expected method to be one of {', '.join(map(repr, METHODS))}; got "
-                f"{method!r}; do choose one of these"
-            )
+        find_method(method)  # an unknown name is an error here
         self.actions = actions
         options = CampaignOptions() if options is None else options
         self.state = CampaignState(method=method, seed=seed, options=options)
@@ -324,7 +322,7 @@ class Campaign:
             self.state,
             self._planner.compare(self._learner, effects),
             evaluate=evaluate,
-            designed=METHODS[self.state.method],
+            designed=find_method(self.state.method).designs,
         )
 
     def adopt(self, report: Report) -> Distribution:

@@ -12,9 +12,10 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
+from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.inference import ASBI, information_gained
+from sbi_active.inference import information_gained
 from sbi_active.inference.belief import require_support
 from sbi_active.inference.rounds import Observation
 from sbi_active.seeding import derive_seed, forked_generators
@@ -49,9 +50,7 @@ class Learner:
     ) -> None:
         self.simulator, self.prior = simulator, require_support(prior)
         self._actions, self._state = actions, state
-        self._inference = ASBI(
-            prior, state.options.density_estimator, show_progress_bars=False
-        )
+        self._inference = find_method(state.method).build(prior, state.options)
         self.x_shape = self._probe()
         seed = derive_seed(state.seed, "index")
         self._has_index = depends_on_index(simulator, prior, actions, seed=seed)
@@ -164,6 +163,7 @@ class Learner:
                 action = self._actions.sample(
                     (options.num_simulations,), seed=derive_seed(seed, "action", index)
                 )
+                theta, action = self._inference.arrange(theta, action)
                 rows = simulate(
                     self.at(index),
                     theta,

@@ -9,21 +9,19 @@ import torch
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.revision import compare
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.unlike import most_unlike
 from sbi_active.design import Design, action_name
 from sbi_active.designer import InformationGainDesigner, RandomDesigner
-from sbi_active.eligibility import discrete
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Criticism, Effect
 
-__all__ = ["METHODS", "Planner"]
+__all__ = ["Planner"]
 
-#: Name of a method: whether its actions are designed.
-METHODS = {"asbi": True, "nsbi": False}
 FEWEST_TRIALS = 2  # that rivals can be compared on
 
 
@@ -44,7 +42,7 @@ class Planner:
     ) -> None:
         self._actions, self._state, self.effects = actions, state, (*effects,)
         options = state.options
-        self._designs = METHODS[state.method]
+        self._designs = find_method(state.method).designs
         self._designer = (
             InformationGainDesigner(
                 actions,
@@ -65,7 +63,7 @@ class Planner:
             raise ValueError(
                 f"expected target 'auto' or 'theta', since the method "
                 f"{self._state.method!r} draws actions at random; got {target!r}; do "
-                "use the method 'asbi'"
+                "use a method that designs them, such as 'asbi'"
             )
         told = sum(t.status in ("ok", "invalid") for t in self._state.trials)
         if target == "model" and not (self.effects and told >= FEWEST_TRIALS):
@@ -142,11 +140,13 @@ class Planner:
         model: Any = None,
         **options: Any,
     ) -> Design:
+        # A model that knows single parameters alone has a belief of these.
+        belief = getattr(model, "belief", None)
         with self._state.stage(index, "design"):
             return designer.select(
                 model,
                 learner.at(index),
-                belief=learner.belief,
+                belief=learner.belief if belief is None else belief,
                 seed=derive_seed(self._state.seed, "design", index),
                 **options,
             )
@@ -185,7 +185,7 @@ def _model_design(criticism: Criticism, actions: ActionSpace) -> Design | None:
         bound="lower",
         index=int((candidates == action).all(1).int().argmax()),
         num_simulations=criticism.rivals.simulator.num_simulations - spent,
-        name=action_name(discrete(actions)),
+        name=action_name(actions),
         estimator="ModelIndexGain",
         stopped="budget spent",
         notes=(f"about which is right: {', '.join(found.separates)}",),

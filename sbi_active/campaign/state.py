@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sbi_active.campaign.stopping import StopRules
 from sbi_active.designer import Design
+from sbi_active.inference.kernel_belief import Bandwidth
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.refine import Refinement
 
@@ -28,7 +29,12 @@ class CampaignOptions:
         num_simulations: Rows a round to train on.
         num_samples: Simulations a candidate action for the expected information gain,
             half to choose and half to report.
-        density_estimator: As in :class:`~sbi_active.ASBI`.
+        density_estimator: What is learned: as in :class:`~sbi_active.ASBI` and
+            :class:`~sbi_active.ALHI`; for "seqbed" a classifier as in
+            :class:`~sbi_active.SeqBED_C`, or :class:`~sbi_active.inference.LFIRE`.
+        posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
+            :class:`~sbi_active.ALHI`.
+        bandwidth: Of kernels, where a belief has them.
         estimator: Of the expected information gain, as in
             :class:`~sbi_active.InformationGainDesigner`; "posterior" is the paper's.
         eliminate: Whether candidates far behind the leader get no further samples.
@@ -53,6 +59,8 @@ class CampaignOptions:
     num_simulations: int = 5_000
     num_samples: int = 1_500
     density_estimator: Any = None
+    posterior: str = "importance"
+    bandwidth: Bandwidth = "scott"
     estimator: Any = "auto"
     eliminate: bool = True
     refine: bool = True

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
-from sbi_active.campaign.campaign import METHODS
+from sbi_active.campaign.methods import METHODS, faithful_options, find_method
 from sbi_active.cli.options import add_options, make_task
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
@@ -30,7 +30,7 @@ from sbi_active.tasks import TASKS, Task  # pyright: ignore
 
 __all__ = ["add_parser"]
 
-SETTINGS = {"default": CampaignOptions, "faithful": CampaignOptions.faithful}
+SETTINGS = {"default": lambda _: CampaignOptions(), "faithful": faithful_options}
 
 
 def add_parser(commands: Any) -> None:
@@ -120,14 +120,20 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _campaign_options(arguments: argparse.Namespace) -> CampaignOptions:
     """Return the named setting with the sizes that were given."""
-    options = SETTINGS[arguments.setting]()
+    options = SETTINGS[arguments.setting](arguments.method)
     sizes = {
         "num_simulations": arguments.simulations,
         "num_samples": arguments.samples,
     }
     options = replace(options, **{k: v for k, v in sizes.items() if v is not None})
     if arguments.iterations is not None:
-        estimator = options.density_estimator or MixtureDensity()
+        default = find_method(arguments.method).estimator
+        estimator = options.density_estimator or default
+        if not isinstance(estimator, MixtureDensity):
+            raise ValueError(
+                f"expected --iterations with a method that trains a mixture density; "
+                f"got --method {arguments.method}; do leave it out"
+            )
         estimator = replace(estimator, num_iterations=arguments.iterations)
         options = replace(options, density_estimator=estimator)
     return options

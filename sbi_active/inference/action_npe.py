@@ -11,7 +11,6 @@ import torch
 from sbi.inference import NPE_C
 from sbi.inference.trainers._contracts import (
     LossArgs,
-    StartIndexContext,
     TrainConfig,
 )
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
@@ -20,19 +19,15 @@ from sbi.neural_nets.estimators.base import (
     ConditionalEstimatorBuilder,
 )
 from sbi.sbi_types import Tracker
-from sbi.utils.sbiutils import mask_sims_from_prior
 from torch import Tensor
 from torch.distributions import Distribution
 from torch.utils.data import DataLoader
 from typing_extensions import Self
 
-from sbi_active.inference.belief import require_support
-from sbi_active.inference.condition import pack
+from sbi_active.inference.action_rounds import ActionRounds
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.posterior import ActionPosterior
-from sbi_active.inference.rounds import Observation, check_proposal, round_rows
-from sbi_active.inference.tracking import SilentTracker
 from sbi_active.inference.train_arguments import (
     NPE_DEFAULTS,
     action_arguments,
@@ -44,7 +39,7 @@ from sbi_active.threads import single_thread
 __all__ = ["ActionNPE"]
 
 
-class ActionNPE(NPE_C):
+class ActionNPE(ActionRounds, NPE_C):
     r"""Action-extended neural posterior estimation, section 4.2 of the paper.
 
     Without ``action=`` it is sbi's :class:`~sbi.inference.NPE_C`. With it, rows belong
@@ -92,22 +87,10 @@ class ActionNPE(NPE_C):
         self._action_estimator = (
             MixtureDensity() if density_estimator is None else self._build_neural_net
         )
-        self._belief: Distribution | None = None
-        self._round_belief: Distribution | None = None
-        self._action_dim: int | None = None
-        self._outcome_shape: torch.Size | None = None
-        self._trained_round: int | None = None
-        self.trials: list[Observation] = []  # real ones, each of which ended a round
 
     @property
-    def belief(self) -> Distribution | None:
-        """The current belief over parameters; the prior before any trial."""
-        return self._prior if self._belief is None else self._belief
-
-    @property
-    def has_actions(self) -> bool:
-        """Whether the rounds so far have actions."""
-        return self._action_dim is not None
+    def _keeps_invalid(self) -> bool:
+        return isinstance(self._action_estimator, MixtureDensity)
 
     def append_simulations(
         self,
@@ -146,70 +129,15 @@ class ActionNPE(NPE_C):
             ValueError: If rounds with and without action mix, shapes do not fit, theta
                 leaves the prior's support, or no row is valid.
         """
-        if action is None:
-            if self.has_actions or belief is not None:
-                raise ValueError(
-                    "expected action=, since "
-                    + (
-                        "belief= was given"
-                        if not self.has_actions
-                        else "earlier rounds of this trainer have actions"
-                    )
-                    + "; got none; do pass the action of each row, or start a new "
-                    "trainer for rounds without actions"
-                )
+        if not self._is_round(action, belief):
             return super().append_simulations(
                 theta, x, proposal, exclude_invalid_x, data_device
             )
-        if self._data_round_index and not self.has_actions:
-            raise ValueError(
-                "expected rounds without action, since earlier rounds of this trainer "
-                "have none; got action=; do start a new ASBI(prior) for rounds with "
-                "actions"
-            )
-        return self._append_round(
-            theta, x, action, belief, proposal, exclude_invalid_x, data_device
+        assert action is not None
+        self._append_round(
+            theta, x, action, belief, exclude_invalid_x, data_device, proposal
         )
-
-    def _append_round(
-        self,
-        theta: Tensor,
-        x: Tensor,
-        action: Tensor,
-        belief: Distribution | None,
-        proposal: Any,
-        exclude_invalid_x: bool | None,
-        data_device: str | None,
-    ) -> Self:
-        belief = self.belief if belief is None else belief
-        check_proposal(proposal, belief)
-        keeps_invalid = isinstance(self._action_estimator, MixtureDensity)
-        rows = round_rows(
-            theta,
-            x,
-            action,
-            prior=require_support(self._prior),
-            x_shape=self._outcome_shape,
-            action_dim=self._action_dim,
-            exclude_invalid=(
-                not keeps_invalid if exclude_invalid_x is None else exclude_invalid_x
-            ),
-            may_be_invalid=bool(self.trials),
-        )
-        self._action_dim = rows.action.shape[1]
-        self._outcome_shape = rows.x.shape[1:]
-        current = max(self._data_round_index, default=-1)
-        if belief is not self._round_belief:
-            self._round_belief = belief
-            current += 1
-        self._belief = belief
-        self._trained_round = None
-        device = self._device if data_device is None else data_device
-        self._theta_roundwise.append(rows.theta.to(device))
-        self._x_roundwise.append(pack(rows.x, rows.action).to(device))
-        self._prior_masks.append(mask_sims_from_prior(current, len(rows.theta)))
         self._proposal_roundwise.append(None)
-        self._data_round_index.append(current)
         return self
 
     def train(
@@ -249,11 +177,7 @@ class ActionNPE(NPE_C):
         given = given_arguments(locals())
         if not self.has_actions:
             return super().train(**{**NPE_DEFAULTS, **given})
-        if resume_training and self._trained_round != max(self._data_round_index):
-            raise ValueError(
-                "expected resume_training after train() on the same rows; got rows "
-                "appended since; do train() without resume_training"
-            )
+        self._require_same_rows(resume_training)
         settings = self._action_estimator
         lean = isinstance(settings, MixtureDensity)
         arguments = action_arguments(given, settings if lean else None)
@@ -266,12 +190,6 @@ class ActionNPE(NPE_C):
             network = PosteriorEstimatorTrainer.train(self, **arguments)
         self._trained_round = self._round
         return network
-
-    def _get_start_index(self, context: StartIndexContext) -> int:
-        if not self.has_actions:
-            return super()._get_start_index(context)
-        self._round = max(self._data_round_index)
-        return self._round  # this round's rows only
 
     def _initialize_neural_network(
         self, retrain_from_scratch: bool, start_idx: int
@@ -382,17 +300,11 @@ class ActionNPE(NPE_C):
         }
         if not self.has_actions:
             return super().build_posterior(**arguments)
-        if density_estimator is None and self._trained_round is None:
-            raise RuntimeError(
-                "expected a network trained on this round's simulations; got new rows "
-                "since the last train(); do call train() first"
-            )
+        if density_estimator is None:
+            self._require_trained()
         if prior is None:
             arguments["prior"] = self._round_belief
         packed = super().build_posterior(**arguments)
         assert self._action_dim is not None
         assert self._outcome_shape is not None
         return ActionPosterior(packed, self._outcome_shape, self._action_dim)
-
-    def _default_tracker(self) -> Tracker:
-        return SilentTracker()

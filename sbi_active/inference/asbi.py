@@ -21,7 +21,7 @@ from sbi_active.inference.belief import (
     require_support,
 )
 from sbi_active.inference.comparison import compare
-from sbi_active.inference.condition import action_rows, outcome_rows, pack
+from sbi_active.inference.condition import pack
 from sbi_active.inference.mixture_density import MixtureDensityNetwork
 from sbi_active.inference.refine import Refinement, refine
 from sbi_active.inference.refined_belief import RefinedBelief
@@ -149,22 +149,6 @@ class ASBI(ActionNPE):
         self.trials = [*trials]
         self._belief, self._trained_round = belief, None
         return belief
-
-    def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
-        """Return the checked trial."""
-        x = torch.as_tensor(x_o, dtype=torch.float32)
-        shape = self._outcome_shape
-        if shape is None:  # no simulations yet: the first trial says
-            shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
-        rows = outcome_rows(x, shape)
-        if len(rows) != 1:
-            raise ValueError(
-                f"expected one outcome; got {len(rows)} rows; do update with one trial "
-                "at a time"
-            )
-        return Observation(
-            action_rows(action, self._action_dim, num_rows=1)[0], rows[0]
-        )
 
     def _chained(self, trial: Observation, *, required: bool) -> Belief | None:
         """Return the network's value at the trial.

@@ -5,25 +5,14 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from sbi_active.inference.scaling import (
-    ActionScaling,
-    Polynomials,
-    best_prefix,
-    exponents_of,
-    fit_location_and_scale,
-    held_out,
-)
+from sbi_active.inference.response import Response
+from sbi_active.inference.scaling import ActionScaling, held_out
 
 __all__ = ["Baseline", "Frames"]
 
 BLOCK = 4_096  # rows held in memory at once
-MAX_FEATURES = 260  # of (action, parameters)
-MAX_ACTION_DEGREE = 14
-MAX_DEGREE = 9  # of the parameters
-MAX_NOISE_DEGREE = 8
-JOINT_COST = 1.5  # degrees that a product of two parameters counts more
 NUM_CENTERS = 32
 NUM_STEPS = 7
 INITIAL_DAMPING = 1e-2
@@ -50,15 +39,13 @@ class Frames(NamedTuple):
         return self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-class Baseline(nn.Module):
+class Baseline(Response):
     r"""Gaussian posterior of whitened parameters u, exact where x is linear in u.
 
-    The outcome is regressed on polynomials of action and parameters, with a covariance
-    that depends on the action, and the regression is inverted by Bayes' rule:
+    The regression f of the outcome, with noise of covariance S, is inverted by Bayes'
+    rule for :math:`u \sim \mathcal N(0, I)`:
 
     .. math::
-        x &= f(\xi, u) + e, \qquad f = \sum_{kj} \beta_{kj}\, \phi_k(\xi)\, \psi_j(u),
-        \quad e \sim \mathcal N(0, S(\xi)), \quad u \sim \mathcal N(0, I), \\
         m &= \arg\min_u \tfrac12 |u|^2 + \tfrac12 |x - f(\xi, u)|^2_{S^{-1}}, \qquad
         U^\top U = I + J^\top S^{-1} J, \quad J = \partial_u f(\xi, m).
 
@@ -74,11 +61,6 @@ class Baseline(nn.Module):
         kind: Whether f is linear in u.
     """
 
-    beta: Tensor
-    gamma: Tensor
-    whitener: Tensor
-    log_low: Tensor
-    log_high: Tensor
     centers: Tensor
 
     def __init__(
@@ -90,53 +72,8 @@ class Baseline(nn.Module):
         kind: Literal["linear", "curved"],
         log_scale: Tensor | None = None,
     ) -> None:
-        super().__init__()
-        self.kind = kind
+        super().__init__(u, y, action, kind=kind, log_scale=log_scale)
         test = held_out(len(u))
-        num_train, dim = int((~test).sum()), u.shape[1]
-        most = min(MAX_FEATURES, num_train // 8)
-        exponents, sizes = exponents_of(
-            action, max_degree=MAX_ACTION_DEGREE, max_terms=max(1, most // (1 + dim))
-        )
-        degree = MAX_DEGREE if kind == "curved" else 1
-        # A degree more than there is data for costs nothing: terms are cut off below.
-        inner, _ = exponents_of(u, max_degree=degree, max_terms=max(1 + dim, most))
-        self.action_basis = Polynomials(action, exponents)
-        self.parameter_basis = Polynomials(u, inner)
-        phi, psi = self.action_basis(action), self.parameter_basis(u)
-        degrees = min(len(sizes), MAX_NOISE_DEGREE + 1)
-        noise = phi[:, : sizes[degrees - 1]]
-
-        k, j, prefixes = _joint_terms(exponents, inner, most)
-        beta, gamma = fit_location_and_scale(
-            phi[:, k] * psi[:, j],
-            prefixes,
-            noise,
-            sizes[:degrees],
-            y,
-            test,
-            log_scale=log_scale,
-            num_iterations=3,
-        )
-        log_sigma = noise @ gamma
-        z = (y - (phi[:, k] * psi[:, j]) @ beta) / log_sigma.exp()
-        z = z.clamp(-5.0, 5.0)  # few wild rows must not set the correlations
-        correlation = torch.corrcoef(z.T).reshape(y.shape[1], -1).nan_to_num(0.0)
-        correlation.fill_diagonal_(1.0)
-        eye = torch.eye(y.shape[1], dtype=y.dtype)
-        root = torch.linalg.cholesky(0.999 * correlation + 0.001 * eye)
-        dense = y.new_zeros(len(exponents), len(inner), y.shape[1])
-        dense[k, j] = beta
-        used = dense.ne(0).any(-1).any(0)
-        used[: 1 + dim] = True
-        self.parameter_basis = Polynomials(u, inner[used])
-        self.register_buffer("beta", dense[:, used])
-        self.register_buffer("gamma", gamma)
-        self.register_buffer("log_low", log_sigma.min(0).values)
-        self.register_buffer("log_high", log_sigma.max(0).values)
-        self.register_buffer(
-            "whitener", torch.linalg.solve_triangular(root, eye, upper=False)
-        )
         self.register_buffer("centers", u[~test][:NUM_CENTERS].clone())
 
         self.residual_scaling: ActionScaling | None = None
@@ -151,40 +88,10 @@ class Baseline(nn.Module):
         parts = zip(*(self._frames(*block) for block in blocks), strict=True)
         return Frames(*(torch.cat(part) for part in parts))
 
-    def bend(self, u: Tensor, y: Tensor, action: Tensor) -> float:
-        """Return the fraction of the held-out residual that u's powers explain.
-
-        Args:
-            u: Shape (n, d), as in the fit.
-            y: Shape (n, m), as in the fit.
-            action: Shape (n, action_dim), as in the fit.
-        """
-        test = held_out(len(u))
-        phi = self.action_basis(action)
-        predicted = torch.einsum(
-            "nk,kjm,nj->nm", phi, self.beta, self.parameter_basis(u)
-        )
-        z = (y - predicted) / (phi[:, : len(self.gamma)] @ self.gamma).exp()
-        z = z.clamp(-5.0, 5.0)
-        few = phi[:, : max(4, 1 + action.shape[1])]
-        most = int((~test).sum()) // (10 * few.shape[1])
-        exponents, sizes = exponents_of(
-            u, max_degree=3, max_terms=max(1, min(40, most))
-        )
-        design = Polynomials(u, exponents)(u)[..., None] * few[:, None]
-        design = design.flatten(1)
-        sizes = [size * few.shape[1] for size in sizes]
-        left = z[test] - design[test] @ best_prefix(design, sizes, z, test)
-        return float((1 - left.square().mean(0) / z[test].square().mean(0)).max())
-
     def _frames(self, y: Tensor, action: Tensor) -> Frames:
-        phi = self.action_basis(action)
-        log_sigma = phi[:, : len(self.gamma)] @ self.gamma
-        log_sigma = torch.minimum(torch.maximum(log_sigma, self.log_low), self.log_high)
         # From here on outcomes are in units of their noise, which is N(0, I).
-        whitener = self.whitener / log_sigma.exp()[:, None, :]
+        whitener, beta = self.weights(action)
         y = (whitener @ y[..., None])[..., 0]
-        beta = (phi @ self.beta.flatten(1)).unflatten(1, self.beta.shape[1:])
         beta = beta @ whitener.mT
         if self.kind == "linear":
             start = torch.zeros_like(self.centers[:1]).expand(len(y), 1, -1)
@@ -293,22 +200,3 @@ def nearest(v: Tensor, frames: Frames) -> Tensor:
 
 def _like(mask: Tensor, values: Tensor) -> Tensor:
     return mask.reshape(*mask.shape, *[1] * (values.ndim - mask.ndim))
-
-
-def _joint_terms(
-    outer: Tensor, inner: Tensor, most: int
-) -> tuple[Tensor, Tensor, list[int]]:
-    """Return pairs of exponents from coarse to fine, and numbers to choose from.
-
-    Terms linear in u come with every polynomial of the action; for others, degrees of
-    action and parameters add up against one bound.
-    """
-    outer_degree, inner_degree = outer.sum(1), inner.sum(1)
-    ratio = MAX_DEGREE / max(int(outer_degree.max()), 1)
-    joint = (inner.ne(0).sum(1) - 1).clamp_min(0) * JOINT_COST
-    cost = outer_degree[:, None] * ratio + (inner_degree + joint)[None]
-    order = cost.flatten().argsort(stable=True)[:most]
-    costs = cost.flatten()[order]
-    levels = torch.linspace(1.0, float(costs[-1]), 9).tolist()
-    prefixes = sorted({int((costs <= level).sum()) for level in levels})
-    return order // len(inner), order % len(inner), prefixes

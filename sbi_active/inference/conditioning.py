@@ -9,9 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from sbi_active.inference.baseline import Baseline, Frames, local
+from sbi_active.inference.response import STRAIGHT
 from sbi_active.inference.scaling import ActionScaling, held_out
 
-__all__ = ["BaselineKind", "Conditioning"]
+__all__ = ["BaselineKind", "Conditioning", "covariance_factor", "scale_of"]
 
 BaselineKind = Literal["none", "linear", "curved"]
 
@@ -22,7 +23,6 @@ KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
 #: Nats by which a baseline must beat the simpler one: its frames and what the network
 #: sees of them are more to overfit.
 MARGIN = {"linear": 0.0, "curved": 0.25}
-STRAIGHT = 0.01  # fraction of the residual below which f is taken to be linear
 
 
 class Conditioning(nn.Module):
@@ -80,16 +80,16 @@ class Conditioning(nn.Module):
         self.x_dim = condition.shape[1] - action_dim
         theta = theta.double()
         self.register_buffer("theta_mean", theta.mean(0))
-        self.register_buffer("theta_factor", _covariance_factor(theta, whiten))
+        self.register_buffer("theta_factor", covariance_factor(theta, whiten))
 
         x, action = condition.double().split([self.x_dim, action_dim], 1)
         valid = x.isfinite().all(1)
         few = int(valid.sum()) < MIN_ROWS or self.x_dim > MAX_OUTCOMES
         self.register_buffer("action_mean", action.mean(0))
-        self.register_buffer("action_scale", _scale(action))
+        self.register_buffer("action_scale", scale_of(action))
         columns = [x[row, j] for j, row in enumerate(x.isfinite().mT)]
         center = [c.mean() if len(c) else x.new_zeros(()) for c in columns]
-        spread = [_scale(c) if len(c) else x.new_ones(()) for c in columns]
+        spread = [scale_of(c) if len(c) else x.new_ones(()) for c in columns]
         self.register_buffer("y_mean", torch.stack(center))
         self.register_buffer("y_scale", torch.stack(spread))
         y = (x[valid] - self.y_mean) / self.y_scale
@@ -204,14 +204,15 @@ def _log_mixture(u: Tensor, frames: Frames) -> Tensor:
     return (log_density + weight.to(u).log()).logsumexp(-1)
 
 
-def _scale(rows: Tensor) -> Tensor:
+def scale_of(rows: Tensor) -> Tensor:
+    """Return the columns' standard deviations, one where a column is constant."""
     scale, mean = rows.std(0, correction=0), rows.mean(0)
     return torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
 
 
-def _covariance_factor(theta: Tensor, whiten: bool) -> Tensor:
-    """Return the lower factor of the covariance, shape (d, d), or its diagonal."""
-    scale = _scale(theta)
+def covariance_factor(theta: Tensor, whiten: bool) -> Tensor:
+    """Return the lower factor of the covariance, shape (d, d), or its diagonal's."""
+    scale = scale_of(theta)
     if not whiten or len(theta) <= theta.shape[1]:
         return scale.diag()
     z = (theta - theta.mean(0)) / scale

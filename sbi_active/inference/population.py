@@ -145,6 +145,11 @@ class GaussianMixture:
             float(total.mean() - log_volume),
         )
 
+    def log_prob(self, points: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        joint = self.log_weight + _gaussian_log_prob(points, self.mean, self.factor)
+        return np.asarray(logsumexp(joint, axis=1))
+
     def assign(self, points: Array) -> NDArray[np.intp]:
         """Return the likeliest component of each point, shape (n,)."""
         joint = self.log_weight + _gaussian_log_prob(points, self.mean, self.factor)

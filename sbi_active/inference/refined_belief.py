@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.belief import Belief
+from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.histories import HistoryRecord
 from sbi_active.inference.population import Particles
-from sbi_active.inference.surrogate import Surrogate
 from sbi_active.seeding import forked_generators
 
-__all__ = ["RefinedBelief"]
+__all__ = ["LearnedLikelihood", "RefinedBelief"]
 
 #: Least share of draws that sampling keeps.
 MIN_ACCEPTANCE = 0.03
+
+
+class LearnedLikelihood(Protocol):
+    """A likelihood of all trials as a function of the prior's coordinates."""
+
+    @property
+    def coordinates(self) -> PriorCoordinates:
+        """Of the prior."""
+        ...
+
+    def log_likelihood(self, z: NDArray[Any]) -> NDArray[Any]:
+        """Return the log likelihood, (n, d) -> (n,)."""
+        ...
+
+    def log_joint(self, z: NDArray[Any]) -> NDArray[Any]:
+        """Return the log of prior times likelihood, -inf outside the support."""
+        ...
 
 
 class RefinedBelief(Belief):
@@ -43,7 +63,7 @@ class RefinedBelief(Belief):
     def __init__(
         self,
         prior: Distribution,
-        surrogate: Surrogate,
+        surrogate: LearnedLikelihood,
         particles: Particles,
         *,
         defensive: float,

@@ -15,7 +15,13 @@ from torch.distributions import Distribution
 from sbi_active.inference.belief import parameter_dim
 from sbi_active.inference.condition import action_rows, outcome_rows
 
-__all__ = ["Observation", "RoundRows", "check_proposal", "round_rows"]
+__all__ = [
+    "Observation",
+    "RoundRows",
+    "check_proposal",
+    "require_whole",
+    "round_rows",
+]
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,27 @@ def round_rows(
         stacklevel=4,
     )
     return RoundRows(theta[~invalid], x[~invalid], action[~invalid])
+
+
+def require_whole(x: Tensor) -> None:
+    """Raise where some numbers of an outcome are missing and others are not.
+
+    Args:
+        x: Shape (n, *x_shape).
+
+    Raises:
+        ValueError: If there is such an outcome.
+    """
+    present = torch.as_tensor(x).reshape(len(x), -1).isfinite()
+    partly = present.any(1) & ~present.all(1)
+    if bool(partly.any()):
+        row = int(partly.nonzero()[0])
+        raise ValueError(
+            "expected outcomes that are measured or NaN throughout, since a likelihood "
+            f"of some of the numbers is not learned; got {int(partly.sum())} of "
+            f"{len(x)} measured in part, the first in row {row}; do leave out the "
+            "numbers that go missing, or use ASBI"
+        )
 
 
 def check_proposal(proposal: Any, belief: Distribution | None) -> None:

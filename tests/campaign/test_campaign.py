@@ -209,7 +209,11 @@ def test_an_error_while_designing_loses_nothing():
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"method": "abc"}, "expected method to be one of 'asbi', 'nsbi'; got 'abc'"),
+        (
+            {"method": "abc"},
+            "expected method to be one of 'asbi', 'nsbi', "
+            "'alhi', 'nlhi', 'seqbed'; got 'abc'",
+        ),
     ],
 )
 def test_unknown_method(changes, text):

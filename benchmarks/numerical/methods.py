@@ -1,0 +1,196 @@
+"""Table 1 of the paper: five methods on the numerical model, at equal simulations.
+
+    python -m benchmarks.numerical.methods --setting faithful --trials 10
+    python -m benchmarks.numerical.methods --setting default --methods asbi alhi
+
+Every simulation counts: to train on, for the information gain, to refine a belief and
+to score a trial. "faithful" has each method as its authors do, 54,000 simulations a
+round. "default" has this library's defaults, 24,000 to 25,000 a round, those of the
+adaptive parts measured and not fixed; the method SeqBED is then the amortized one. A
+method that draws its actions at random trains on what the others spend on designing.
+
+Actions are scored by the exact information gain lost (regret), under the exact
+posterior of the same trials; beliefs by the log density of the truth, its gap to the
+exact posterior's, the reproduction error and a classifier test against draws of the
+exact posterior (.5 is perfect, 1 tells all draws apart).
+
+Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
+method and setting, in benchmarks/numerical/results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from sbi.utils.metrics import c2st
+from torch import Tensor
+
+from benchmarks.numerical.run import (
+    COLUMNS,
+    PUBLISHED,
+    REPORTED,
+    RESULTS,
+    column,
+    make_task,
+    read,
+    reference,
+    round_row,
+    short,
+)
+from sbi_active import Campaign, CampaignOptions, Refinement
+from sbi_active.campaign.methods import METHODS, faithful_options
+from sbi_active.plots import as_table
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import Task
+
+NUM_ROUNDS = 4
+NUM_COMPARED = 1_000  # draws of each in the classifier test
+#: Of a round in the faithful setting, and in the default one for designing alone.
+NUM_FAITHFUL, NUM_DESIGN = 52_000, 15_700
+#: Parameters in a refinement, so that methods that spend all of them, at each executed
+#: action, spend what ASBI's, which stops by itself, does on average.
+HISTORIES = Refinement(num_histories=600)
+PAPER = {
+    "paper, ALHI": ("", "940 +- 556", "46.7", "4.35"),
+    "paper, SeqBED": ("", "895 +- 264", "44.4", "2.92"),
+}
+
+
+def options_of(setting: str, method: str) -> CampaignOptions:
+    """Return a method's options, such that totals of simulations are alike."""
+    designs = METHODS[method].designs
+    if setting == "faithful":
+        options = faithful_options(method)
+        return options if designs else replace(options, num_simulations=NUM_FAITHFUL)
+    options = CampaignOptions()
+    if method not in ("asbi", "nsbi"):
+        options = replace(options, refinement=HISTORIES)
+    if not designs:
+        num = options.num_simulations + NUM_DESIGN
+        options = replace(options, num_simulations=num)
+    return options
+
+
+def run_trial(task: Task, method: str, setting: str, seed: int) -> list[dict[str, Any]]:
+    """Return one row a round of one campaign."""
+    campaign = Campaign(
+        task.simulator,
+        task.prior,
+        task.actions,
+        method=method,
+        seed=seed,
+        options=options_of(setting, method),
+    )
+    rows = []
+    for index in range(NUM_ROUNDS):
+        before = reference(task, campaign.history)
+        gain = before.expected_information_gain(task.actions.values)
+        trial = campaign.ask()
+        real_seed = derive_seed(seed, "real", index)
+        campaign.tell(task.real_system(trial.action, seed=real_seed))
+        campaign.update()
+        rows.append(
+            {"seed": seed, "round": index + 1, "c2st": compared(task, campaign, index)}
+            | round_row(task, campaign, gain, index)
+        )
+    return rows
+
+
+def compared(task: Task, campaign: Campaign, index: int) -> Tensor | str:
+    """Return how well draws of the last belief are told from exact ones, else ""."""
+    if index + 1 < NUM_ROUNDS:
+        return ""
+    exact = reference(task, campaign.history).sample(NUM_COMPARED, seed=index).float()
+    with forked_generators(derive_seed(index, "c2st")):
+        draws = campaign.belief.sample((NUM_COMPARED,))
+    # The posterior is a thin ridge: whitened, so that no axis hides it.
+    factor = torch.linalg.cholesky(torch.cov(exact.double().T))
+    pair = [
+        torch.linalg.solve_triangular(factor, each.double().T, upper=False).T.float()
+        for each in (exact, draws)
+    ]
+    return c2st(*pair, seed=1)
+
+
+def run_method(setting: str, method: str, trials: int) -> list[dict[str, str]]:
+    """Run the trials that are not in the file yet and return all its rows."""
+    path = RESULTS / f"methods_{setting}_{method}.csv"
+    done = {int(row["seed"]) for row in read(path)}
+    for seed in range(trials):
+        if seed in done:
+            continue
+        start = time.process_time()
+        rows = run_trial(make_task("linear", "fixed", seed), method, setting, seed)
+        append(path, rows)
+        spent = time.process_time() - start
+        print(f"{setting} {method} trial {seed}: {spent:.0f} CPU s", flush=True)
+    return [row for row in read(path) if int(row["seed"]) < trials]
+
+
+def append(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Append rows to a CSV file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, [*COLUMNS, "c2st"])
+        if new:
+            writer.writeheader()
+        writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+
+
+def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
+    """Return the table's row of a method."""
+    last = NUM_ROUNDS
+    medians = [np.median(column(rows, "log_prob_true", r + 1)) for r in range(last)]
+    gap = column(rows, "gap", last)
+    regret = [column(rows, "regret", r + 1).mean() for r in range(last)]
+    cpu = sum(
+        column(rows, f"cpu_{stage}").mean()
+        for stage in ("simulation", "training", "design", "update")
+    )
+    return [
+        f"{name} ({len(gap)})",
+        " / ".join(f"{m:.2f}" for m in medians),
+        *[
+            f"{error.mean():.3g} +- {error.std():.2g}"
+            for error in (column(rows, f"rep_err_{a:g}", last) for a in REPORTED)
+        ],
+        f"{np.median(gap):.2f} {gap.mean():.2f}",
+        " / ".join(f"{r:.2f}" for r in regret),
+        f"{np.median(column(rows, 'c2st', last)):.2f}",
+        f"{column(rows, 'num_simulations').mean():.0f}",
+        f"{cpu:.1f}",
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Table 1 of the paper.")
+    parser.add_argument("--methods", nargs="*", default=[*METHODS], choices=[*METHODS])
+    parser.add_argument("--setting", choices=["faithful", "default"], default="default")
+    parser.add_argument("--trials", type=int, default=10)
+    arguments = parser.parse_args()
+    warnings.filterwarnings("ignore")
+    torch.set_num_threads(1)
+    table = [
+        summary(method, run_method(arguments.setting, method, arguments.trials))
+        for method in arguments.methods
+    ]
+    table += [[k, *v, *[""] * 5] for k, v in (PUBLISHED | PAPER).items()]
+    header = [f"{arguments.setting} (trials)", "median log p(truth), round 1 / 2 / .."]
+    header += [f"RepErr({a:g})" for a in REPORTED]
+    header += ["gap: median mean", "mean regret, round 1 / 2 / ..", "C2ST"]
+    header += ["simulations a round", "CPU s a round"]
+    print(as_table(table, header))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""The methods of a campaign by name: what learns, and whether actions are designed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torch.distributions import Distribution
+
+from sbi_active.campaign.state import CampaignOptions
+from sbi_active.inference import (
+    ALHI,
+    ASBI,
+    LFIRE,
+    ActiveInference,
+    MixtureDensity,
+    RatioClassifier,
+    SeqBED,
+    SeqBED_C,
+)
+
+__all__ = ["METHODS", "Method", "faithful_options", "find_method"]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of active inference.
+
+    Attributes:
+        designs: Whether actions are chosen for information, or drawn at random.
+        build: Makes the trainer of a prior and a campaign's options.
+        estimator: What is trained by default.
+        faithful: Options of the setting of the method's authors that differ from those
+            of :meth:`~sbi_active.CampaignOptions.faithful`.
+    """
+
+    designs: bool
+    build: Callable[[Distribution, CampaignOptions], ActiveInference]
+    estimator: Any
+    faithful: dict[str, Any]
+
+
+def _asbi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
+    if options.posterior != "importance":
+        raise ValueError(
+            "expected posterior 'importance' for ASBI, whose network is a density and "
+            f"needs no sampler; got {options.posterior!r}; do leave it out"
+        )
+    return ASBI(prior, options.density_estimator, show_progress_bars=False)
+
+
+def _alhi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
+    return ALHI(
+        prior,
+        options.density_estimator,
+        show_progress_bars=False,
+        posterior=options.posterior,
+        bandwidth=options.bandwidth,
+    )
+
+
+def _seqbed(prior: Distribution, options: CampaignOptions) -> ActiveInference:
+    if isinstance(options.density_estimator, LFIRE):
+        return SeqBED(prior, options.density_estimator, bandwidth=options.bandwidth)
+    return SeqBED_C(
+        prior,
+        options.density_estimator,
+        show_progress_bars=False,
+        posterior=options.posterior,
+        bandwidth=options.bandwidth,
+    )
+
+
+_ALHI = {"estimator": "likelihood", "posterior": "kde"}
+#: Of 52,000 simulations a round, as the others: LFIRE needs those to learn from.
+_SEQBED = {
+    "estimator": "ratio",
+    "density_estimator": LFIRE(),
+    "num_simulations": 41_500,
+    "num_samples": 500,
+}
+
+#: Name of a method: what it is.
+METHODS = {
+    "asbi": Method(True, _asbi, MixtureDensity(), {}),
+    "nsbi": Method(False, _asbi, MixtureDensity(), {}),
+    "alhi": Method(True, _alhi, MixtureDensity(), _ALHI),
+    "nlhi": Method(False, _alhi, MixtureDensity(), _ALHI),
+    "seqbed": Method(True, _seqbed, RatioClassifier(), _SEQBED),
+}
+
+
+def find_method(name: str) -> Method:
+    """Return a method by name.
+
+    Raises:
+        ValueError: If the name is unknown; it lists the valid ones.
+    """
+    if name not in METHODS:
+        raise ValueError(
+            f"expected method to be one of {', '.join(map(repr, METHODS))}; got "
+            f"{name!r}; do choose one of these"
+        )
+    return METHODS[name]
+
+
+def faithful_options(name: str) -> CampaignOptions:
+    """Return the setting of a method's authors, for the numerical experiment.
+
+    That is :meth:`~sbi_active.CampaignOptions.faithful` for ASBI and NSBI; ALHI and
+    NLHI have the same network on x given (theta, action), beliefs by kernel density
+    estimation and nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total
+    of simulations.
+
+    Args:
+        name: Of the method.
+    """
+    return replace(CampaignOptions.faithful(), **find_method(name).faithful)

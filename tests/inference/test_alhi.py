@@ -1,0 +1,333 @@
+"""ALHI: a surrogate likelihood, and the product of it over the trials."""
+
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+from sbi.inference.potentials import likelihood_estimator_based_potential
+from sbi.utils import BoxUniform
+
+from sbi_active import ALHI, MixtureDensity, Refinement
+from sbi_active.inference import KernelBelief
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.product import Product, TrainedRegion, widened
+from sbi_active.inference.rounds import Observation
+from tests.linear_gaussian import DIM, PRIOR, simulator
+
+SETTINGS = MixtureDensity(hidden_features=(16,), num_iterations=100)
+TRIALS = [([1.0], [0.7, -0.4]), ([3.0], [1.5, -2.0])]
+
+
+def rows(n=1_500):
+    theta, action = PRIOR.sample((n,)), 0.5 + 3 * torch.rand(n, 1)
+    return theta, simulator(theta, action), action
+
+
+def trained(seed=0, **options):
+    torch.manual_seed(seed)
+    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False, **options)
+    theta, x, action = rows()
+    inference.append_simulations(theta, x, action=action).train()
+    return inference
+
+
+def exact(trials=TRIALS):
+    """Posterior mean and standard deviation of the conjugate product."""
+    action = torch.tensor([a for a, _ in trials])
+    x = torch.tensor([x for _, x in trials])
+    precision = 1 + action.square().sum()
+    return (action * x).sum(0) / precision, precision**-0.5
+
+
+def divergence(belief, trials=TRIALS, n=4_000):
+    """KL(exact || belief) in nats; its standard error is about .02."""
+    mean, sd = exact(trials)
+    posterior = torch.distributions.Independent(
+        torch.distributions.Normal(mean, sd.expand(DIM)), 1
+    )
+    torch.manual_seed(0)
+    theta = posterior.sample((n,))
+    return float((posterior.log_prob(theta) - belief.log_prob(theta)).mean())
+
+
+def observe(inference, trials=TRIALS, **options):
+    for index, (action, x) in enumerate(trials):
+        if index and inference._trained_round is None and "simulator" not in options:
+            theta = inference.belief.sample((1_500,))
+            action_rows = 0.5 + 3 * torch.rand(1_500, 1)
+            inference.append_simulations(
+                theta, simulator(theta, action_rows), action=action_rows
+            ).train()
+        belief = inference.update(
+            torch.tensor(x), action=torch.tensor(action), seed=index, **options
+        )
+    return belief
+
+
+def test_the_belief_is_the_product_over_the_history():
+    belief = observe(trained())
+    # 1,350 rows fix a coefficient of f to .03 noise deviations; twice two trials.
+    assert abs(divergence(belief)) < 0.05
+    mean, sd = exact()
+    assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.15 * float(sd))
+    # A belief of the last trial alone is far from it.
+    assert divergence(belief, TRIALS[:1]) > 0.5
+
+
+def test_a_simulator_refines_and_is_counted():
+    torch.manual_seed(0)
+    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
+    settings = Refinement(num_histories=1_000)
+    belief = observe(inference, simulator=simulator, refinement=settings)
+    # 500 rows an action or more in the last stage: .08 noise deviations of f, twice.
+    assert abs(divergence(belief)) < 0.1
+    assert belief.diagnostics["num_simulations"] == 2_000  # two actions each
+    trials = inference.trials
+    again = inference.update_all(trials, simulator, refinement=settings, seed=3)
+    assert abs(divergence(again)) < 0.1
+    assert inference.trials == trials
+
+
+def test_the_product_is_sbi_s_condition_on_theta():
+    inference = trained()
+    model = inference.build_posterior()
+    action = torch.tensor([a for a, _ in TRIALS])
+    x = torch.tensor([x for _, x in TRIALS])
+    trials = [Observation(*pair) for pair in zip(action, x, strict=True)]
+    coordinates = PriorCoordinates(PRIOR, np.random.default_rng(0))
+    ours = Product(coordinates, model, trials)
+    potential, _ = likelihood_estimator_based_potential(model.estimator, PRIOR, x)
+    theirs = potential.condition_on_theta(action, dims_global_theta=[0, 1])
+    theta = PRIOR.sample((20,))
+    with torch.no_grad():
+        expected = theirs(theta, x_o=x).double()
+        assert ours.log_factors(theta).tolist() == pytest.approx(
+            expected.tolist(), rel=1e-4, abs=1e-3
+        )
+        table = model.log_likelihood_table(x, theta, action[0])
+        row = model.log_likelihood(x[:1].expand(20, -1), theta, action[:1])
+    assert table[0].tolist() == pytest.approx(row.tolist(), abs=1e-4)
+
+
+@pytest.mark.parametrize("posterior", ["importance", "kde"])
+def test_a_belief_is_a_normalized_distribution_that_pickles(posterior):
+    box = BoxUniform(-torch.ones(1), torch.ones(1))
+    torch.manual_seed(0)
+    inference = ALHI(box, SETTINGS, show_progress_bars=False, posterior=posterior)
+    theta, action = box.sample((1_000,)), torch.rand(1_000, 1)
+    x = theta * action + 0.1 * torch.randn(1_000, 1)
+    inference.append_simulations(theta, x, action=action).train()
+    belief = inference.update(torch.tensor([0.9]), action=torch.ones(1), seed=0)
+    grid = torch.linspace(-1, 1, 4_001)[:, None]
+    total = float(belief.log_prob(grid).exp().double().mean()) * 2
+    # The normalizer rests on thousands of draws, .01 in its logarithm.
+    assert total == pytest.approx(1, abs=0.05)
+    assert belief.log_prob(torch.tensor([[1.01]])).item() == -torch.inf
+    draws = belief.sample((2_000,))
+    assert draws.dtype == torch.float32
+    assert bool((draws.abs() <= 1).all())
+    assert float(draws.mean()) == pytest.approx(float(belief.mean), abs=0.02)
+    again = pickle.loads(pickle.dumps(belief))
+    assert torch.equal(again.log_prob(grid), belief.log_prob(grid))
+
+
+def test_kernels_have_the_stated_bandwidth():
+    torch.manual_seed(0)
+    draws = PRIOR.sample((1_000,))
+    belief = KernelBelief(PRIOR, draws)
+    assert belief.diagnostics["bandwidth"] == pytest.approx(1_000 ** (-1 / 6))
+    widened = KernelBelief(PRIOR, draws, bandwidth=2.0).sample((4_000,))
+    # 1 + h^2 times the variance of the draws, to a few per cent.
+    ratio = float(widened.var() / draws.var())
+    assert ratio == pytest.approx(5, rel=0.15)
+    with pytest.raises(ValueError, match="expected bandwidth 'scott', 'silverman'"):
+        KernelBelief(PRIOR, draws, bandwidth=-1.0)
+
+
+def test_beliefs_by_kernels_are_wider_by_the_bandwidth():
+    """h = 1 doubles the variance; that of 2,000 draws is known to 3 %."""
+    sharp = observe(trained(), TRIALS[:1])
+    wide = observe(trained(posterior="kde", bandwidth=1.0), TRIALS[:1])
+    ratio = wide.variance / sharp.variance
+    assert ratio.tolist() == pytest.approx([2, 2], abs=4 * 2 * 0.03)
+    assert wide.label == "kernel density estimate"
+
+
+@pytest.mark.slow
+def test_beliefs_by_kernels_are_chained():
+    assert divergence(observe(trained(posterior="kde"))) < 0.3
+
+
+@pytest.mark.slow
+def test_markov_chains_of_sbi():
+    belief = observe(trained(posterior="slice_np_vectorized"), TRIALS[:1])
+    torch.manual_seed(0)
+    draws = belief.sample((200,))
+    mean, sd = exact(TRIALS[:1])
+    # 20 chains of 10 correlated draws: some 50 effective ones.
+    assert draws.mean(0).tolist() == pytest.approx(
+        mean.tolist(), abs=4 * float(sd) / 50**0.5
+    )
+    assert belief.label == "product over trials, by slice_np_vectorized"
+
+
+@pytest.mark.slow
+def test_nuts():
+    pytest.importorskip("pyro")
+    belief = observe(trained(posterior="nuts_pyro"), TRIALS[:1])
+    torch.manual_seed(0)
+    draws = belief.sample((200,))
+    mean, sd = exact(TRIALS[:1])
+    assert draws.mean(0).tolist() == pytest.approx(mean.tolist(), abs=0.3 * float(sd))
+    assert draws.std(0).tolist() == pytest.approx([float(sd)] * 2, rel=0.3)
+
+
+def falls(theta, action):
+    """No measurement where theta exceeds a half."""
+    x = theta + 0.1 * torch.randn_like(theta)
+    return torch.where(theta > 0.5, torch.nan, x)
+
+
+def test_no_measurement_is_information():
+    box = BoxUniform(-torch.ones(1), torch.ones(1))
+    torch.manual_seed(0)
+    inference = ALHI(box, SETTINGS, show_progress_bars=False)
+    theta, action = box.sample((1_500,)), torch.rand(1_500, 1)
+    x = falls(theta, action)
+    inference.append_simulations(theta, x, action=action).train()
+    model = inference.build_posterior()
+    drawn = model.sample(torch.tensor([[0.9]]).expand(500, 1), torch.zeros(1))
+    assert float(drawn.isnan().double().mean()) > 0.95
+    belief = inference.update(torch.tensor([torch.nan]), action=torch.ones(1), seed=0)
+    share = float((belief.sample((2_000,)) > 0.5).double().mean())
+    assert share > 0.9
+    # The same outcome where none was ever missing tells nothing.
+    inference = ALHI(box, SETTINGS, show_progress_bars=False)
+    theta = box.sample((500,))
+    inference.append_simulations(theta, theta + 0.1, action=torch.ones(1)).train()
+    belief = inference.update(torch.tensor([torch.nan]), action=torch.ones(1), seed=0)
+    assert abs(float(belief.mean)) < 0.1
+    assert float(belief.variance) == pytest.approx(1 / 3, rel=0.1)
+
+
+@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
+def test_a_network_of_sbi():
+    torch.manual_seed(0)
+    inference = ALHI(PRIOR, "mdn", show_progress_bars=False)
+    theta, x, action = rows(400)
+    inference.append_simulations(theta, x, action=action).train(max_num_epochs=3)
+    model = inference.build_posterior()
+    assert model.log_likelihood(x, theta, action).shape == (400,)
+    belief = inference.update(x[0], action=action[0], seed=0)
+    assert belief.sample((3,)).shape == (3, DIM)
+
+
+def test_heavy_tails_are_the_mixture_s():
+    torch.manual_seed(0)
+    theta, action = PRIOR.sample((3_000,)), torch.rand(3_000, 1)
+    noise = torch.where(torch.rand(3_000, 1) < 0.1, 5.0, 0.2) * torch.randn(3_000, 2)
+    inference = ALHI(PRIOR, MixtureDensity(hidden_features=(32,)))
+    inference.append_simulations(theta, theta + noise, action=action)
+    assert not bool(inference.train().is_gaussian)
+    gaussian = trained().train()
+    assert bool(gaussian.is_gaussian)
+
+
+def raises(text, error=ValueError):
+    return pytest.raises(error, match=re.escape(text))
+
+
+def test_errors():
+    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
+    with raises("expected a network trained under the current belief", RuntimeError):
+        inference.update(torch.zeros(2), action=torch.ones(1))
+    theta, x, action = rows(200)
+    inference.append_simulations(theta, x, action=action)
+    with raises("do call train() first", RuntimeError):
+        inference.build_posterior()
+    with raises("expected action=, since earlier rounds of this trainer have actions"):
+        inference.append_simulations(theta, x)
+    with raises("expected posterior among 'importance', 'kde'"):
+        ALHI(PRIOR, posterior="nuts")
+    inference = ALHI(PRIOR, "mdn", show_progress_bars=False)
+    inference.append_simulations(theta, x)
+    with raises("do start a new ALHI(prior) for rounds with actions"):
+        inference.append_simulations(theta, x, action=action)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
+def test_the_numerical_task_after_four_rounds(variant):
+    """The default conditioning is within half a nat of exact, refined or not."""
+    from sbi_active.tasks import get_task
+
+    task = get_task("numerical", variant=variant)
+    for refined in (True, False):
+        gaps = []
+        for seed in range(3):
+            torch.manual_seed(seed)
+            inference = ALHI(task.prior, show_progress_bars=False)
+            actions = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
+            outcomes = []
+            for index, action in enumerate(actions):
+                theta = inference.belief.sample((5_000,))
+                rows = task.actions.sample((5_000,))
+                x = task.simulator(theta, rows)
+                inference.append_simulations(theta, x, action=rows).train()
+                outcomes.append(task.real_system(action, seed=10 * seed + index))
+                belief = inference.update(
+                    outcomes[-1],
+                    action=action,
+                    simulator=task.simulator if refined else None,
+                    refinement=Refinement(num_histories=600),
+                    seed=index,
+                )
+            exact = task.reference(actions, torch.stack(outcomes))
+            draws = exact.sample(2_000, seed=0)
+            gap = exact.log_prob(draws) - belief.log_prob(draws.float())
+            gaps.append(float(gap.mean()))
+        assert float(np.median(gaps)) < 0.5
+
+
+def test_a_failed_update_leaves_the_trainer_as_it_was():
+    inference = trained()
+    num, network = len(inference._theta_roundwise), inference._neural_net
+
+    def broken(theta, action):
+        raise OSError("no license")
+
+    with pytest.raises(Exception, match="no license"):
+        inference.update(torch.zeros(2), action=torch.ones(1), simulator=broken, seed=0)
+    assert inference.trials == []
+    assert inference.belief is PRIOR
+    assert len(inference._theta_roundwise) == num
+    assert inference._neural_net is network
+    inference.update(torch.zeros(2), action=torch.ones(1), seed=0)
+
+
+def test_outcomes_measured_in_part_are_refused():
+    theta, x, action = rows(50)
+    x[3, 1] = torch.nan
+    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
+    with raises("got 1 of 50 measured in part, the first in row 3; do leave out"):
+        inference.append_simulations(theta, x, action=action)
+    with raises("expected outcomes that are measured or NaN throughout"):
+        trained().update(torch.tensor([0.0, torch.nan]), action=torch.ones(1))
+
+
+def test_where_a_network_is_trained_and_trusted():
+    box = BoxUniform(-torch.ones(2), torch.ones(2))
+    rng = np.random.default_rng(0)
+    coordinates = PriorCoordinates(box, rng)
+    z = 0.1 * rng.standard_normal((2_000, 2)) + [0.9, 0.0]
+    z = z[coordinates.inside(z)]
+    wide = widened(z, 3_000, coordinates, rng)
+    assert wide.shape == (3_000, 2)
+    assert bool(coordinates.inside(wide).all())
+    # Twice as wide, less where several components share the belief between them.
+    assert 1.4 < wide[:, 1].std() / z[:, 1].std() < 2.1
+    region = TrainedRegion.of(wide, rng)
+    assert region.contains(wide).mean() > 0.99
+    assert not region.contains(np.array([[-0.9, 0.0], [0.9, -0.99]])).any()

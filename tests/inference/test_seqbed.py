@@ -1,0 +1,209 @@
+"""SeqBED: a logistic regression a parameter, and ratios that all parameters share."""
+
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import Refinement, SeqBED, SeqBED_B, SeqBED_C
+from sbi_active.inference import LFIRE, RatioClassifier
+from tests.linear_gaussian import DIM, PRIOR, moments, simulator
+
+ACTIONS = torch.tensor([[0.5], [2.0]])
+NORMAL = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
+
+
+def drawn(inference, n, prior=PRIOR):
+    theta = prior.sample((n,))
+    action = ACTIONS[torch.randint(2, (n,))]
+    theta, action = inference.arrange(theta, action)
+    return theta, simulator(theta, action), action
+
+
+def log_ratio(theta, x, action):
+    """Exact log p(x | theta, action) / p(x | action)."""
+    scale = (1 + action**2).sqrt()
+    own = torch.distributions.Normal(action * theta, 1.0).log_prob(x)
+    return (own - torch.distributions.Normal(0.0, scale).log_prob(x)).sum(-1)
+
+
+def test_lfire_meets_the_closed_form():
+    """The log ratio of two Gaussians is quadratic in x, as the summaries are."""
+    rng = np.random.default_rng(0)
+    theta, n = 0.8, 4_000
+    own = torch.from_numpy(theta + rng.standard_normal((n, 1)))
+    marginal = torch.from_numpy(2**0.5 * rng.standard_normal((n, 1)))
+    settings = LFIRE()
+    scaling = torch.zeros(1), torch.ones(1)
+    psi = [settings.summaries(x, *scaling).numpy() for x in (own, marginal)]
+    ratio = settings.fit(*psi, seed=0)
+    x = torch.linspace(-1.5, 2.5, 9)[:, None]
+    found = ratio(settings.summaries(x, *scaling).numpy())
+    exact = log_ratio(torch.tensor([[theta]]), x, torch.ones(1, 1))
+    # A coefficient of 8,000 rows is known to about .05.
+    assert np.abs(found - exact.numpy()).max() < 0.2
+    assert np.abs(found).max() > 0.5
+
+
+def test_arrange_repeats_particles_at_every_action():
+    theta, action = SeqBED(NORMAL, num_particles=5).arrange(
+        NORMAL.sample((400,)), ACTIONS.repeat(200, 1)
+    )
+    assert theta.shape == action.shape == (400, 1)
+    pairs, count = torch.cat([theta, action], 1).unique(dim=0, return_counts=True)
+    assert len(pairs) == 10
+    assert count.tolist() == [40] * 10
+
+
+def test_seqbed_weighs_particles():
+    torch.manual_seed(0)
+    inference = SeqBED(NORMAL, num_particles=40)
+    theta, x, action = drawn(inference, 4_000, NORMAL)
+    model = inference.append_simulations(theta, x, action=action).train()
+    own = model.belief.sample((2_000,))
+    rows = simulator(own, ACTIONS[1:].expand(2_000, 1))
+    found = model.log_ratio(own, rows, ACTIONS[1:].expand(2_000, 1))
+    exact = log_ratio(own, rows, ACTIONS[1:])
+    # 50 rows a particle: a third of a nat apart, .1 on average over 40 particles.
+    assert float(found.mean()) == pytest.approx(float(exact.mean()), abs=0.3)
+    x_o = torch.tensor([1.6])
+    belief = inference.update(x_o, action=ACTIONS[1])
+    mean, variance = moments(x_o, ACTIONS[1])
+    # Of 40 particles a dozen count.
+    sd = float(variance.sqrt())
+    assert float(belief.mean) == pytest.approx(float(mean), abs=3 * sd / 12**0.5)
+    effective = belief.diagnostics["effective_sample_size"]
+    assert 3 < effective < 30
+    # The kernels add h^2 of the particles' own variance.
+    assert 0.7 * sd < float(belief.variance.sqrt()) < 2 * sd
+    assert len(inference.trials) == 1
+    again = pickle.loads(pickle.dumps(belief))
+    assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
+
+
+@pytest.mark.slow
+def test_seqbed_with_a_simulator():
+    inference = SeqBED(NORMAL)
+    x_o, settings = torch.tensor([1.6]), Refinement(num_histories=1_600)
+    torch.manual_seed(0)
+    belief = inference.update(
+        x_o, action=ACTIONS[1], simulator=simulator, refinement=settings, seed=0
+    )
+    mean, variance = moments(x_o, ACTIONS[1])
+    assert float(belief.mean) == pytest.approx(
+        float(mean), abs=3 * float(variance.sqrt()) / 12**0.5
+    )
+    assert belief.diagnostics["num_simulations"] == 1_600
+    assert belief.diagnostics["num_particles"] == 40
+    trials = [*inference.trials, *inference.trials]
+    both = inference.update_all(trials, simulator, refinement=settings, seed=1)
+    assert both.diagnostics["num_simulations"] == 3_200
+    assert float(both.variance) < float(belief.variance)
+
+
+@pytest.mark.parametrize(
+    "trainer", [pytest.param(SeqBED_B, marks=pytest.mark.slow), SeqBED_C]
+)
+def test_amortized_ratios_meet_the_closed_form(trainer):
+    torch.manual_seed(0)
+    inference = trainer(PRIOR, show_progress_bars=False)
+    n = 3_000
+    theta, action = PRIOR.sample((n,)), 0.5 + 2 * torch.rand(n, 1)
+    x = simulator(theta, action)
+    inference.append_simulations(theta, x, action=action).train()
+    model = inference.build_posterior()
+    with torch.no_grad():
+        error = model.log_ratio(theta, x, action) - log_ratio(theta, x, action)
+        shift = model.log_ratio(theta.roll(1, 0), x, action)
+    if trainer is SeqBED_B:  # right but for a function of (x, action)
+        other = log_ratio(theta.roll(1, 0), x, action)
+        error = error - (shift - other)
+        assert float(error.abs().median()) < 0.25
+    else:
+        assert abs(float(error.mean())) < 0.15
+        assert float(error.abs().median()) < 0.25
+    trials = [([1.0], [0.7, -0.4]), ([2.0], [1.5, -2.0])]
+    belief = inference.update(
+        torch.tensor(trials[0][1]), action=torch.tensor(trials[0][0]), seed=0
+    )
+    mean, variance = moments(torch.tensor(trials[0][1]), torch.ones(1))
+    sd = float(variance[0].sqrt())
+    assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.25 * sd)
+    assert belief.variance.sqrt().tolist() == pytest.approx([sd] * DIM, rel=0.2)
+    settings = Refinement(num_histories=1_000)
+    belief = inference.update(
+        torch.tensor(trials[1][1]),
+        action=torch.tensor(trials[1][0]),
+        simulator=simulator,
+        refinement=settings,
+        seed=0,
+    )
+    mean = (torch.tensor([0.7, -0.4]) + 2 * torch.tensor([1.5, -2.0])) / 6
+    sd = 6**-0.5
+    assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.35 * sd)
+    assert belief.variance.sqrt().tolist() == pytest.approx([sd] * DIM, rel=0.25)
+    assert belief.diagnostics["num_simulations"] == 2_000
+
+
+def test_no_measurement_is_information():
+    box = BoxUniform(-torch.ones(1), torch.ones(1))
+
+    def falls(theta, action):
+        x = theta + 0.1 * torch.randn_like(theta)
+        return torch.where(theta > 0.5, torch.nan, x)
+
+    torch.manual_seed(0)
+    nothing, action = torch.tensor([torch.nan]), torch.ones(1)
+    for inference in (SeqBED(box), SeqBED_C(box, show_progress_bars=False)):
+        theta, rows = inference.arrange(box.sample((1_600,)), torch.ones(1_600, 1))
+        x = falls(theta, rows)
+        inference.append_simulations(theta, x, action=rows).train()
+        belief = inference.update(nothing, action=action, seed=0)
+        # Kernels of a fifth of the belief's width reach over the edge.
+        assert float((belief.sample((2_000,)) > 0.4).double().mean()) > 0.75
+
+
+@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
+def test_a_classifier_of_sbi():
+    torch.manual_seed(0)
+    inference = SeqBED_C(PRIOR, "mlp", show_progress_bars=False)
+    theta, action = PRIOR.sample((300,)), torch.rand(300, 1)
+    x = simulator(theta, action)
+    inference.append_simulations(theta, x, action=action)
+    inference.train(max_num_epochs=2)
+    belief = inference.update(x[0], action=action[0], seed=0)
+    assert belief.sample((3,)).shape == (3, DIM)
+
+
+def raises(text, error=ValueError):
+    return pytest.raises(error, match=re.escape(text))
+
+
+def test_errors():
+    inference = SeqBED(NORMAL)
+    with raises("expected at least 6 simulations of each particle at each action"):
+        inference.arrange(NORMAL.sample((50,)), torch.rand(50, 1))
+    with raises("expected simulations of this round", RuntimeError):
+        inference.train()
+    with raises("do call train() first", RuntimeError):
+        inference.update(torch.zeros(1), action=torch.ones(1))
+    theta, x, action = drawn(inference, 800, NORMAL)
+    with raises("expected action=, since ratios belong to an action"):
+        inference.append_simulations(theta, x)
+    model = inference.append_simulations(theta, x, action=action).train()
+    with raises("expected theta among the 20 particles of this round; got [9.0]"):
+        model.log_ratio(torch.tensor([[9.0]]), x[:1], action[:1])
+    with pytest.warns(UserWarning, match=r"the ratios are those at \[2.0\]"):
+        inference.update(torch.zeros(1), action=torch.tensor([1.8]))
+    inference = SeqBED(NORMAL)
+    theta = NORMAL.sample((100,))
+    inference.append_simulations(theta, theta, action=torch.ones(1))
+    with raises("do simulate each parameter set several times"):
+        inference.train()
+    with raises("expected num_iterations >= 1; got 0"):
+        RatioClassifier(num_iterations=0)
+    with raises("expected num_folds >= 2; got 1"):
+        LFIRE(num_folds=1)
