@@ -1,0 +1,166 @@
+"""Source location finding: information gained in T trials, by policy.
+
+    python -m benchmarks.location_finding.run --policy random --rollouts 64 --trials 30
+    python -m benchmarks.location_finding.run --policy fixed myopic_particles
+    python -m benchmarks.location_finding.run --policy myopic --rollouts 64
+
+Resumable: a roll-out that stands in the CSV is not run again. One row a roll-out, one
+file a policy and number of trials, in benchmarks/location_finding/results; the table of
+all of them is printed at the end. Roll-out i has the same truth, noise and contrastive
+draws under every policy, so that policies are compared on paired roll-outs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.location_finding.bounds import (
+    contrastive_bounds,
+    history_log_likelihood,
+    posterior_bounds,
+)
+from benchmarks.location_finding.particles import ParticleBelief
+from benchmarks.location_finding.policies import POLICIES, Myopic
+from benchmarks.location_finding.summary import RESULTS, table
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import get_task
+
+__all__ = ["CONTRASTIVE", "roll_out"]
+
+CONTRASTIVE = 500_000  # L, as in Foster et al. (2021)
+PARTICLES = 2_000  # of the posterior behind the proposal
+COLUMNS = [
+    *["rollout", "theta_true", "spce", "snmc", "lower", "upper"],
+    *["effective", "belief_gain", "num_simulations"],
+    *["cpu_design", "cpu_belief", "cpu_bounds", "places", "outcomes"],
+]
+
+
+def roll_out(
+    policy: str, rollout: int, num_trials: int, num_contrastive: int
+) -> dict[str, Any]:
+    """Return the row of one roll-out.
+
+    ``spce`` and ``snmc`` contrast with draws of the prior, ``lower`` and ``upper`` with
+    draws of a proposal fitted to the posterior, of which ``effective`` count.
+    ``belief_gain`` is what the policy's own belief says, log b - log p at the truth.
+
+    Args:
+        policy: One of ``POLICIES``.
+        rollout: Its number, which gives truth, noise and contrastive draws.
+        num_trials: T.
+        num_contrastive: L.
+    """
+    task = get_task("location_finding")
+    with forked_generators(derive_seed(rollout, "truth")):
+        task = task.with_truth(task.prior.sample())
+    player = POLICIES[policy](task, derive_seed(rollout, "policy"))
+    seconds = {"design": 0.0, "belief": 0.0}
+    for t in range(num_trials):
+        start = time.process_time()
+        action = player.choose()
+        chosen = time.process_time()
+        x = task.real_system(action, seed=derive_seed(rollout, "noise", t))
+        player.tell(action, x)
+        seconds["design"] += chosen - start
+        seconds["belief"] += time.process_time() - chosen
+
+    start = time.process_time()
+    truth, action, x = task.theta_true, player.action, player.x
+    with forked_generators(derive_seed(rollout, "contrastive")):
+        contrastive = task.prior.sample(torch.Size([num_contrastive]))
+    log_p_true = history_log_likelihood(truth[None], action, x)
+    log_p = history_log_likelihood(contrastive, action, x)
+    spce, snmc = contrastive_bounds(log_p_true, log_p[None])
+    particles = ParticleBelief(
+        task, num_particles=PARTICLES, seed=derive_seed(rollout, "particles")
+    )
+    for place, value in zip(action, x, strict=True):
+        particles.update(place, value)
+    lower, upper, effective = posterior_bounds(
+        particles.theta, action, x, truth, seed=derive_seed(rollout, "proposal")
+    )
+    row: dict[str, Any] = {
+        "rollout": rollout,
+        "theta_true": " ".join(f"{v:.6g}" for v in truth.tolist()),
+        "spce": float(spce),
+        "snmc": float(snmc),
+        "lower": lower,
+        "upper": upper,
+        "effective": effective,
+        "cpu_bounds": time.process_time() - start,
+        "places": " ".join(f"{v:.6g}" for v in action.flatten().tolist()),
+        "outcomes": " ".join(f"{v:.6g}" for v in x.flatten().tolist()),
+    }
+    row |= {f"cpu_{stage}": spent for stage, spent in seconds.items()}
+    if isinstance(player, Myopic):
+        gain = player.belief.log_prob(truth) - task.prior.log_prob(truth)
+        row |= {
+            "belief_gain": float(gain),
+            "num_simulations": player.num_simulations,
+        }
+    return row
+
+
+def run(policy: str, arguments: argparse.Namespace) -> None:
+    """Run the roll-outs that are not in the file yet."""
+    name = f"{policy}_{arguments.trials}"
+    if arguments.contrastive != CONTRASTIVE:
+        name += f"_L{arguments.contrastive}"
+    path: Path = arguments.out / f"{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done: set[int] = set()
+    if path.exists():
+        with path.open(newline="") as file:
+            done = {int(row["rollout"]) for row in csv.DictReader(file)}
+    for rollout in range(arguments.first, arguments.first + arguments.rollouts):
+        if rollout in done:
+            continue
+        row = roll_out(policy, rollout, arguments.trials, arguments.contrastive)
+        new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            if new:
+                writer.writeheader()
+            writer.writerow({key: _short(value) for key, value in row.items()})
+        print(
+            f"{name} {rollout}: information in [{row['lower']:.2f}, "
+            f"{row['upper']:.2f}] nats, sPCE {row['spce']:.2f}, sNMC "
+            f"{row['snmc']:.2f}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Source location finding.")
+    parser.add_argument("--policy", nargs="+", choices=[*POLICIES], default=[*POLICIES])
+    parser.add_argument("--rollouts", type=int, default=64)
+    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--trials", type=int, default=30)
+    parser.add_argument("--contrastive", type=int, default=CONTRASTIVE, help="L")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    # A belief that rests on few draws says so; its bounds do not rest on it.
+    warnings.filterwarnings("ignore", module="sbi_active")
+    for policy in arguments.policy:
+        run(policy, arguments)
+    cap = math.log(arguments.contrastive + 1)
+    print(table(arguments.out, arguments.trials, arguments.contrastive))
+    print(f"sPCE cannot exceed log(L + 1) = {cap:.2f} nats.")
+
+
+def _short(value: object) -> object:
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""Location finding: the model and the task."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Normal
+
+from sbi_active.tasks import get_task  # pyright: ignore
+from sbi_active.tasks.location_finding.model import (  # pyright: ignore
+    BACKGROUND,
+    NOISE_SD,
+    SOFTENING,
+    mean,
+)
+
+
+def normal(*shape: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+def test_mean_is_the_formula_row_by_row():
+    theta, action = normal(20, 4, seed=0), normal(20, 2, seed=1)
+    for row, xi, value in zip(theta, action, mean(theta, action), strict=True):
+        first, second = (float((row[k : k + 2] - xi).norm()) for k in (0, 2))
+        signal = BACKGROUND + 1 / (SOFTENING + first**2) + 1 / (SOFTENING + second**2)
+        assert float(value) == pytest.approx(math.log(signal), rel=1e-12)
+    assert (BACKGROUND, SOFTENING, NOISE_SD) == (0.1, 1e-4, 0.5)
+
+
+def test_sources_can_be_exchanged():
+    theta, action = normal(50, 4, seed=0), normal(50, 2, seed=1)
+    exchanged = theta[:, [2, 3, 0, 1]]
+    torch.testing.assert_close(mean(theta, action), mean(exchanged, action))
+    other = theta[:, [2, 1, 0, 3]]  # mixes the sources' coordinates: another model
+    assert (mean(theta, action) - mean(other, action)).abs().max() > 0.1
+
+
+def test_mean_is_differentiable_and_keeps_dtype_and_leading_dimensions():
+    theta = normal(5, 4, seed=0).requires_grad_()
+    action = normal(5, 2, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(mean, (theta, action))
+    pairs = mean(theta[:, None], action[:3])
+    assert pairs.shape == (5, 3, 1)
+    torch.testing.assert_close(pairs[:, 1], mean(theta, action[1:2].expand(5, 2)))
+    assert mean(theta.detach().float(), action.detach().float()).dtype == torch.float32
+
+
+def test_log_likelihood_is_a_normal_s():
+    task = get_task("location_finding")
+    theta, action, x = (
+        normal(30, 4, seed=0),
+        normal(30, 2, seed=1),
+        normal(30, 1, seed=2),
+    )
+    expected = Normal(mean(theta, action), NOISE_SD).log_prob(x)[:, 0]
+    torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
+    torch.testing.assert_close(task.simulator.log_prob(x, theta, action), expected)
+    assert task.exact_likelihood
+
+
+def test_task_offers_prior_names_and_another_truth():
+    task = get_task("location_finding", num_sources=3)
+    assert task.prior.sample((2,)).shape == (2, 6)
+    assert task.parameter_names[-1] == "source_3_y"
+    assert task.actions.values.shape == (625, 2)
+    other = task.with_truth([0.0] * 6)
+    assert other.num_sources == 3
+    assert other.theta_true.tolist() == [0.0] * 6
+
+
+def test_real_system_is_the_model_at_the_truth():
+    task = get_task("location_finding")
+    action = torch.tensor([0.3, -0.2])
+    x = torch.stack([task.real_system(action, seed=s) for s in range(200)])
+    expected = mean(task.theta_true[None], action[None])
+    assert abs(float(x.mean() - expected)) < 4 * NOISE_SD / 200**0.5
+    # The standard error of a standard deviation is sd / sqrt(2 n).
+    assert float(x.std()) == pytest.approx(NOISE_SD, abs=4 * NOISE_SD / 400**0.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"num_sources": 0}, "expected num_sources >= 1; got 0"),
+        ({"theta_true": [1.0, 2.0]}, "expected theta_true of 4 finite numbers"),
+        ({"theta_true": [1.0, 2.0, 3.0, math.nan]}, "expected theta_true of 4 finite"),
+    ],
+)
+def test_bad_options(options, text):
+    with pytest.raises(ValueError, match=text):
+        get_task("location_finding", **options)
+
+
+@pytest.mark.parametrize("shapes", [((3, 3), (3, 2)), ((4,), (1, 2)), ((3, 4), (3, 3))])
+def test_mean_rejects_wrong_shapes(shapes):
+    theta, action = (torch.zeros(shape) for shape in shapes)
+    with pytest.raises(ValueError, match=r"expected theta \(n, 2 K\)"):
+        mean(theta, action)
