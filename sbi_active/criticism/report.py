@@ -31,8 +31,6 @@ from sbi_active.simulation import SimulatorModel
 
 __all__ = ["Report", "build_report"]
 
-GUESS = 3.0  # nats above "unexplained", from which a formula is printed
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Report:
@@ -112,8 +110,7 @@ class Report:
         """A formula that explains what no declared effect does: not declared."""
         if self.verdict != UNEXPLAINED or not self.tracing.guesses:
             return None
-        formula, nats = self.tracing.guesses[0]
-        return formula if nats > GUESS else None
+        return self.tracing.guesses[0][0]
 
     @property
     def before_after(self) -> pd.DataFrame:

@@ -35,7 +35,7 @@ Array = NDArray[Any]
 
 PROBABILITY_OF_NONE = 0.5
 #: That what is missing, if anything is, is each of the catch-alls.
-PROBABILITY_OF_CATCH_ALL = 0.05
+PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
@@ -44,7 +44,7 @@ RESCALED = (1 / 3, 3.0)
 def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
     """Return log prior probabilities of none, each effect and the catch-alls.
 
-    Half is "none". Of the rest "unexplained" and "scatter" have a twentieth each, and
+    Half is "none". Of the rest "unexplained" and "scatter" have a tenth each, and
     the families share what is left equally.
     """
     members: dict[str, list[str]] = {}
