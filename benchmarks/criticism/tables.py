@@ -162,12 +162,14 @@ def _outside(world: World, rows: Sequence[Row]) -> list[str]:
 def _pair(world: World, rows: Sequence[Row]) -> list[str]:
     supported = [r for r in rows if float(r["support"]) > SUPPORTED]
     exact = [_right(world, r) for r in supported]
-    extra = [
-        bool(_names(world, r["verdict"]) - _names(world, r["effects"])) for r in rows
-    ]
+
+    def names_more(row: Row) -> bool:
+        return bool(_names(world, row["verdict"]) - _names(world, row["effects"]))
+
     lines = [
         f"exact, both supported (lambda without either > 25) {rate(exact)}",
-        f"false inclusion {rate(extra)}",
+        f"false inclusion, both supported {rate([*map(names_more, supported)])}",
+        f"false inclusion, all {rate([*map(names_more, rows)])}",
     ]
     return lines + [
         f"  case {r['case']} (support {float(r['support']):.0f}): {r['effects']} "

@@ -117,7 +117,7 @@ def test_a_pair_is_exact_or_not():
     ]
     text = table("pairs", {"pair": rows}, "B")
     assert "> 25) 0.500 (1/2)" in text
-    assert "false inclusion 0.333 (1/3)" in text
+    assert "false inclusion, all 0.333 (1/3)" in text
 
 
 @pytest.mark.parametrize("kind", ["clean", "library"])
