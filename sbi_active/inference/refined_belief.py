@@ -18,8 +18,13 @@ from sbi_active.seeding import forked_generators
 
 __all__ = ["LearnedLikelihood", "RefinedBelief"]
 
+Array = NDArray[Any]
+
 #: Least share of draws that sampling keeps.
 MIN_ACCEPTANCE = 0.03
+#: Times as many draws as that needs, from which they are resampled instead: the
+#: normalizer then rests on weights that fresh draws do not have.
+PATIENCE = 3
 
 
 class LearnedLikelihood(Protocol):
@@ -30,11 +35,11 @@ class LearnedLikelihood(Protocol):
         """Of the prior."""
         ...
 
-    def log_likelihood(self, z: NDArray[Any]) -> NDArray[Any]:
+    def log_likelihood(self, z: Array) -> Array:
         """Return the log likelihood, (n, d) -> (n,)."""
         ...
 
-    def log_joint(self, z: NDArray[Any]) -> NDArray[Any]:
+    def log_joint(self, z: Array) -> Array:
         """Return the log of prior times likelihood, -inf outside the support."""
         ...
 
@@ -100,11 +105,27 @@ class RefinedBelief(Belief):
         kept = [coordinates.sample_prior(num_prior, rng)]
         missing = num_samples - num_prior
         acceptance = np.exp(self._log_normalizer - self._log_bound)
-        while missing > 0:
+        seen: list[tuple[Array, Array]] = []
+        left = PATIENCE * (int(1.1 * missing / acceptance) + 20)
+        while missing > 0 and left > 0:
             z = self._proposal.sample(int(1.1 * missing / acceptance) + 20, rng)
+            left -= len(z)
             log_weight = self._surrogate.log_joint(z) - self._proposal.log_prob(z)
             accepted = np.log(rng.random(len(z))) < log_weight - self._log_bound
             kept.append(z[accepted][:missing])
             missing -= len(kept[-1])
+            seen.append((z, log_weight))
+        if missing > 0:
+            z, log_weight = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+            kept.append(z[_resampled(log_weight, missing, rng)])
         z = rng.permutation(np.concatenate(kept))
         return coordinates.to_theta(z)
+
+
+def _resampled(log_weight: Array, num: int, rng: np.random.Generator) -> NDArray[Any]:
+    """Return indices in proportion to the weights, shape (num,)."""
+    top = log_weight.max()
+    if not np.isfinite(top):
+        return rng.integers(len(log_weight), size=num)
+    weight = np.exp(log_weight - top)
+    return rng.choice(len(weight), size=num, p=weight / weight.sum())

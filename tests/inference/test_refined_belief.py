@@ -1,0 +1,38 @@
+"""Draws from a refined belief."""
+
+import numpy as np
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.population import Particles
+from sbi_active.inference.refined_belief import RefinedBelief
+from sbi_active.inference.regions import PriorProposal
+
+
+def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():
+    prior = BoxUniform(-4 * torch.ones(1), 4 * torch.ones(1))
+    coordinates = PriorCoordinates(prior, np.random.default_rng(0))
+
+    class Normal:
+        def __init__(self):
+            self.coordinates = coordinates
+
+        def log_likelihood(self, z):
+            return -0.5 * (coordinates.to_theta(z).double().numpy()[:, 0] / 0.3) ** 2
+
+        def log_joint(self, z):
+            return coordinates.log_prior(z) + self.log_likelihood(z)
+
+    rng = np.random.default_rng(0)
+    base = PriorProposal(coordinates)
+    z = base.sample(500, rng)
+    log_weight = Normal().log_joint(z) - base.log_prob(z)
+    log_weight[0] += 30.0  # one draw that no other resembles
+    particles = Particles(z, log_weight, base)
+    belief = RefinedBelief(prior, Normal(), particles, defensive=0.01)
+    draws = belief.sample((2_000,))[:, 0]
+    assert len(draws) == 2_000
+    # 1 % are of the prior, whose standard deviation is 2.3.
+    spread = (0.99 * 0.3**2 + 0.01 * 64 / 12) ** 0.5
+    assert abs(float(draws.std()) - spread) < 0.1
