@@ -20,6 +20,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
+from sbi_active.criticism.rival_set import FEW_TRIALS
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import forked_generators
 
@@ -27,7 +28,6 @@ __all__ = ["find_warnings"]
 
 Array = NDArray[Any]
 
-FEW_TRIALS = 5
 ALIASED = 0.9  # |rank correlation| of an action with the order of the trials
 #: Quantile of an effect's prior beyond which an estimate lies at its edge.
 EDGE = 0.99

@@ -40,6 +40,8 @@ __all__ = ["RivalSet"]
 Array = NDArray[Any]
 
 NUM_DRAWS = 400
+#: Trials from which their order may be what residuals follow.
+FEW_TRIALS = 5
 #: Below this effective sample size importance sampling is not trusted.
 TOO_FEW = 20.0
 #: Nats by which a largest likelihood stays below another model's evidence, so that its
@@ -189,6 +191,8 @@ class RivalSet:
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
         """Return the order of trials in the span of the fit; None where it has none.
 
+        Among a few trials it is no structure: any differences of theirs follow it.
+
         Args:
             trials: Further trials.
         """
@@ -196,7 +200,9 @@ class RivalSet:
         if trials is not None:
             index = np.concatenate([own, trials.index.double().numpy()])
         span = np.ptp(own)
-        return (index - own.min()) / span if span > 0 else None
+        if span == 0 or len(own) < FEW_TRIALS:
+            return None
+        return (index - own.min()) / span
 
     def evidence(
         self, names: Sequence[str] = (), *, error: str | None = None

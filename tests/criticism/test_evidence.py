@@ -308,3 +308,13 @@ def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size)
     sets = combinations("abcd", size)
     total = sum(np.exp(log_prior(names, log_p)) for names in sets)
     assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
+
+
+def test_the_order_of_a_few_trials_is_no_structure():
+    def order(num):
+        line = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.5))
+        prior = BoxUniform(-torch.ones(1), torch.ones(1))
+        return RivalSet(line, prior, Trials(ACTION[:num], X[:num]), []).scaled_order()
+
+    assert order(4) is None
+    np.testing.assert_allclose(order(5), [0, 0.25, 0.5, 0.75, 1])
