@@ -115,6 +115,7 @@ METHODS: dict[str, tuple[str, Method]] = {
     "designer, plain function": ("simulator", ours(1_500, declared=False)),
     "designer, plain function, 6,000": ("simulator", ours(6_000, declared=False)),
     "designer, plain function, 15,000": ("simulator", ours(15_000, declared=False)),
+    "designer, plain function, 20,000": ("simulator", ours(20_000, declared=False)),
     "designer, noise declared": ("noise", ours(1_500, declared=True)),
     "posterior_eig, Gaussian, 1,000 steps": (
         "simulator",

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from scipy.stats import multivariate_normal
 from torch.distributions import Independent, Normal, Uniform
 
