@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
+from scipy.stats import chi2, rankdata
 
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.outcomes import surprising_outcomes
@@ -34,6 +34,8 @@ EDGE = 0.99
 #: Effective samples below which, and standard error in nats above which, an evidence
 #: is called uncertain; models below the probability are left out.
 FEW_SAMPLES, UNCERTAIN, NEGLIGIBLE = 50, 0.5, 0.01
+#: Tail probability of what a verdict leaves over, below which it is not all.
+REFUTED = 0.001
 #: Nats by which two estimates of the bare model's evidence may differ.
 DISAGREEMENT = 1.0
 #: Entries a trial from which x may be a trajectory, and the correlation of neighboring
@@ -154,6 +156,11 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
             "the alarm rests on the chi-square alone: no alternative has a Bayes "
             "factor of 20, so that what is lacking is a suggestion"
         )
+    if detection is not None and _is_refuted(tracing, detection):
+        yield (
+            f"{tracing.verdict} explains the most, and not all: the chi-square of the "
+            f"trials with it has p < {REFUTED:g}, so that something else is missing too"
+        )
     if tracing.coarsening < 1:
         yield (
             "every model misses the trials by more than the error of measurement: "
@@ -169,6 +176,17 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
                 f"{abs(difference):.1f} nats: its posterior has parts that one of them "
                 "missed"
             )
+
+
+def _is_refuted(tracing: Tracing, detection: Detection) -> bool:
+    """Return whether known noise leaves no room for what the verdict leaves over.
+
+    Degrees of freedom are those of the bare model, a few too many.
+    """
+    if not tracing.chosen or detection.level == 0:
+        return False
+    left = tracing.evidences[tracing.verdict].best_chi_square
+    return bool(chi2.sf(left, detection.degrees_of_freedom) < REFUTED)
 
 
 def _of_verdict(

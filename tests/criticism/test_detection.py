@@ -1,6 +1,7 @@
 """When the bare model raises an alarm: by its Bayes factor, or by its chi-square."""
 
 import numpy as np
+import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import kstest
@@ -81,3 +82,11 @@ def test_a_parameter_that_changes_nothing_takes_up_no_residual():
     assert np.isclose(num_determined(both.rivals), 2.0, atol=0.05)
     # The variance of 400 draws of the idle one has a relative error of about .07.
     assert np.isclose(num_determined(idle.rivals), 1.0, atol=0.25)
+
+
+@pytest.mark.parametrize(("size", "refuted"), [(2.2, True), (0.0, False)])
+def test_a_verdict_that_its_chi_square_refutes_says_so(size, refuted):
+    x, action = zigzag(size)
+    made = criticism(x + 3.0 * action**3, action).report(evaluate=False)
+    assert made.verdict == "cubic"
+    assert ("something else is missing" in " ".join(made.warnings)) is refuted
