@@ -79,6 +79,7 @@ def _library(world: World, rows: Sequence[Row]) -> list[str]:
     lines += [
         f"top-1 {rate([k == 1 for k in ranks])}",
         f"top-2 {rate([k <= 2 for k in ranks])}",
+        f"mean of the largest stated probability {_mean_largest(world, seen):.3f}",
         f"verdict right {rate([_right(world, r) for r in seen])}",
         "of noise inflation, called scatter "
         + rate([r["verdict"] == "scatter" for r in scattered if _detected(r)])
@@ -263,6 +264,14 @@ def _aliased(world: World, row: Row) -> bool:
 
 def _names(world: World, text: str) -> set[str]:
     return {_key(world, name) for name in text.split(" + ")}
+
+
+def _mean_largest(world: World, rows: Sequence[Row]) -> float:
+    """Return what top-1 would be on average if the stated probabilities are right."""
+    if not rows:
+        return float("nan")
+    stated = [merged(world, json.loads(r["probabilities"])) for r in rows]
+    return float(np.mean([max(row.values()) for row in stated]))
 
 
 def _right(world: World, row: Row) -> bool:
