@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import torch
-from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor
-from torch.distributions import Distribution
 
+from sbi_active.inference.action_factor import ActionFactor
 from sbi_active.inference.condition import action_rows, outcome_rows
 
 __all__ = ["ActionLikelihood"]
 
 
-class ActionLikelihood:
+class ActionLikelihood(ActionFactor):
     r"""Surrogate likelihood :math:`q(x | \theta, \xi)`.
 
     Args:
@@ -24,23 +23,6 @@ class ActionLikelihood:
     Attributes:
         belief: As given.
     """
-
-    def __init__(
-        self,
-        estimator: ConditionalDensityEstimator,
-        belief: Distribution | None,
-        x_shape: torch.Size,
-        action_dim: int,
-    ) -> None:
-        self.estimator = estimator.eval()
-        self.belief = belief
-        self.x_shape, self.action_dim = torch.Size(x_shape), action_dim
-
-    def __repr__(self) -> str:
-        return (
-            f"ActionLikelihood(x {tuple(self.x_shape)}, action ({self.action_dim},), "
-            f"{type(self.estimator).__name__})"
-        )
 
     def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\log q(x_i | \theta_i, \xi_i)` row by row.

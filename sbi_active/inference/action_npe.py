@@ -33,7 +33,7 @@ from sbi_active.inference.train_arguments import (
     action_arguments,
     given_arguments,
 )
-from sbi_active.inference.training import TrainingBudget, train_mixture_density
+from sbi_active.inference.training import train_mixture_density
 from sbi_active.threads import single_thread
 
 __all__ = ["ActionNPE"]
@@ -227,10 +227,6 @@ class ActionNPE(ActionRounds, NPE_C):
                 network.parameters(), lr=train_config.learning_rate, fused=True
             )
         theta, condition, _ = self.get_simulations(self._round)
-        num_iterations = settings.num_iterations
-        if self._epoch_limit is not None:
-            steps = max(len(self.train_indices) // train_config.training_batch_size, 1)
-            num_iterations = min(num_iterations, steps * self._epoch_limit)
         record = train_mixture_density(
             network,
             self.optimizer,
@@ -238,24 +234,12 @@ class ActionNPE(ActionRounds, NPE_C):
             condition.to(self._device),
             train_rows=self.train_indices,
             held_out_rows=self.val_indices,
-            budget=TrainingBudget(
-                num_iterations=num_iterations,
-                batch_size=train_config.training_batch_size,
-                clip_max_norm=train_config.clip_max_norm,
-                anneal=settings.anneal,
-                patience=self._patience,
+            budget=self._training_budget(
+                settings, train_config, len(self.train_indices)
             ),
             calibration_kernel=self._kernel,
         )
-        self._best_val_loss = min(record.validation_loss)
-        self._summary["training_loss"] += record.training_loss
-        self._summary["validation_loss"] += record.validation_loss
-        self._summary["epoch_durations_sec"] += record.seconds
-        self._summary["epochs_trained"].append(len(record.seconds))
-        self._summary["best_validation_loss"].append(self._best_val_loss)
-        self._summarize(round_=self._round)
-        if train_config.show_train_summary:
-            print(self._describe_round(self._round, self._summary))
+        self._summarize_training(record, train_config)
         return network
 
     def build_posterior(

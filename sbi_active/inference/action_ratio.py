@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import torch
-from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor
-from torch.distributions import Distribution
 
+from sbi_active.inference.action_factor import ActionFactor
 from sbi_active.inference.condition import action_rows, outcome_rows, pack
 
 __all__ = ["ActionRatio"]
 
 
-class ActionRatio:
+class ActionRatio(ActionFactor):
     r"""Learned log ratio :math:`\log p(x | \theta, \xi) / p(x | \xi)`.
 
     Args:
@@ -25,23 +23,6 @@ class ActionRatio:
     Attributes:
         belief: As given.
     """
-
-    def __init__(
-        self,
-        estimator: RatioEstimator,
-        belief: Distribution | None,
-        x_shape: torch.Size,
-        action_dim: int,
-    ) -> None:
-        self.estimator = estimator.eval()
-        self.belief = belief
-        self.x_shape, self.action_dim = torch.Size(x_shape), action_dim
-
-    def __repr__(self) -> str:
-        return (
-            f"ActionRatio(x {tuple(self.x_shape)}, action ({self.action_dim},), "
-            f"{type(self.estimator).__name__})"
-        )
 
     def log_ratio(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\log r(\theta_i; x_i, \xi_i)` row by row.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from sbi.inference.trainers._contracts import StartIndexContext
+from sbi.inference.trainers._contracts import StartIndexContext, TrainConfig
 from sbi.sbi_types import Tracker
 from sbi.utils.sbiutils import mask_sims_from_prior
 from torch import Tensor
@@ -14,6 +14,7 @@ from typing_extensions import Self
 
 from sbi_active.inference.belief import require_support
 from sbi_active.inference.condition import action_rows, outcome_rows, pack
+from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.rounds import (
     Observation,
     RoundRows,
@@ -21,6 +22,7 @@ from sbi_active.inference.rounds import (
     round_rows,
 )
 from sbi_active.inference.tracking import SilentTracker
+from sbi_active.inference.training import TrainingBudget, TrainingRecord
 
 __all__ = ["ActionRounds"]
 
@@ -57,6 +59,8 @@ class ActionRounds:
         self._action_dim: int | None = None
         self._outcome_shape: torch.Size | None = None
         self._trained_round: int | None = None
+        self._epoch_limit: int | None = None
+        self._patience: int | None = None
         self.trials: list[Observation] = []
 
     @property
@@ -165,6 +169,46 @@ class ActionRounds:
                 "expected a network trained on this round's simulations; got new rows "
                 "since the last train(); do call train() first"
             )
+
+    def _require_belief_network(self) -> None:
+        if self._trained_round is None:
+            raise RuntimeError(
+                "expected a network trained under the current belief; got none since "
+                "the last update() or append_simulations(); do append simulations of "
+                "the belief with action= and train() first"
+            )
+
+    def _training_budget(
+        self, settings: MixtureDensity, train_config: TrainConfig, num_rows: int
+    ) -> TrainingBudget:
+        """Return the budget of this library's own training on so many rows."""
+        num_iterations = settings.num_iterations
+        if self._epoch_limit is not None:
+            steps = max(num_rows // train_config.training_batch_size, 1)
+            num_iterations = min(num_iterations, steps * self._epoch_limit)
+        return TrainingBudget(
+            num_iterations=num_iterations,
+            batch_size=train_config.training_batch_size,
+            clip_max_norm=train_config.clip_max_norm,
+            anneal=settings.anneal,
+            patience=self._patience,
+        )
+
+    def _summarize_training(
+        self, record: TrainingRecord, train_config: TrainConfig
+    ) -> None:
+        """Write what sbi's own training loop would write."""
+        trainer: Any = self
+        trainer._best_val_loss = best = min(record.validation_loss)
+        summary = trainer._summary
+        summary["training_loss"] += record.training_loss
+        summary["validation_loss"] += record.validation_loss
+        summary["epoch_durations_sec"] += record.seconds
+        summary["epochs_trained"].append(len(record.seconds))
+        summary["best_validation_loss"].append(best)
+        trainer._summarize(round_=self._round)
+        if train_config.show_train_summary:
+            print(trainer._describe_round(self._round, summary))
 
     def _require_same_rows(self, resume_training: bool) -> None:
         if resume_training and self._trained_round != max(self._data_round_index):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from copy import deepcopy
 from typing import Any, Literal
 
 import torch
@@ -25,7 +24,7 @@ from sbi_active.inference.likelihood_network import LikelihoodNetwork
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.product_rounds import ProductRounds
 from sbi_active.inference.rounds import RoundRows
-from sbi_active.inference.training import TrainingBudget, train_mixture_density
+from sbi_active.inference.training import train_mixture_density
 from sbi_active.threads import single_thread
 
 __all__ = ["ALHI"]
@@ -80,6 +79,8 @@ class ALHI(ProductRounds, NLE_A):
         >>> bool((belief.mean - 0.5).abs() < 0.1)
         True
     """
+
+    _factor = ActionLikelihood
 
     def __init__(
         self,
@@ -261,10 +262,6 @@ class ALHI(ProductRounds, NLE_A):
         ]
         residual, seen = (torch.cat(parts) for parts in zip(*rows, strict=True))
         order, num_train = torch.arange(len(residual)), len(rows[0][0])
-        num_iterations = settings.num_iterations
-        if self._epoch_limit is not None:
-            steps = max(num_train // train_config.training_batch_size, 1)
-            num_iterations = min(num_iterations, steps * self._epoch_limit)
         record = train_mixture_density(
             network.mixture,
             self.optimizer,
@@ -272,25 +269,11 @@ class ALHI(ProductRounds, NLE_A):
             seen,
             train_rows=order[:num_train],
             held_out_rows=order[num_train:],
-            budget=TrainingBudget(
-                num_iterations=num_iterations,
-                batch_size=train_config.training_batch_size,
-                clip_max_norm=train_config.clip_max_norm,
-                anneal=settings.anneal,
-                patience=self._patience,
-            ),
+            budget=self._training_budget(settings, train_config, num_train),
         )
         network.choose(*rows[1])
         network.eval()
-        self._best_val_loss = min(record.validation_loss)
-        self._summary["training_loss"] += record.training_loss
-        self._summary["validation_loss"] += record.validation_loss
-        self._summary["epoch_durations_sec"] += record.seconds
-        self._summary["epochs_trained"].append(len(record.seconds))
-        self._summary["best_validation_loss"].append(self._best_val_loss)
-        self._summarize(round_=self._round)
-        if train_config.show_train_summary:
-            print(self._describe_round(self._round, self._summary))
+        self._summarize_training(record, train_config)
         return network
 
     def build_posterior(
@@ -332,18 +315,4 @@ class ALHI(ProductRounds, NLE_A):
         }
         if not self.has_actions:
             return super().build_posterior(**arguments)
-        if density_estimator is None:
-            self._require_trained()
-            return self._model()
-        return self._with(density_estimator)
-
-    def _model(self) -> ActionLikelihood:
-        assert self._neural_net is not None
-        return self._with(deepcopy(self._neural_net))
-
-    def _with(self, estimator: ConditionalDensityEstimator) -> ActionLikelihood:
-        assert self._outcome_shape is not None
-        assert self._action_dim is not None
-        return ActionLikelihood(
-            estimator, self._round_belief, self._outcome_shape, self._action_dim
-        )
+        return self._learned(density_estimator)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from contextlib import nullcontext
-from copy import deepcopy
 from typing import Any, Literal
 
 from sbi.inference import NRE_B, NRE_C
@@ -55,6 +54,8 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
             :class:`~sbi_active.inference.product_rounds.ProductRounds`.
         bandwidth: Of "kde".
     """
+
+    _factor = ActionRatio
 
     def __init__(
         self,
@@ -220,21 +221,7 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
         }
         if not self.has_actions:
             return super().build_posterior(**arguments)  # pyright: ignore
-        if density_estimator is None:
-            self._require_trained()
-            return self._model()
-        return self._with(density_estimator)
-
-    def _model(self) -> ActionRatio:
-        assert self._neural_net is not None
-        return self._with(deepcopy(self._neural_net))
-
-    def _with(self, estimator: RatioEstimator) -> ActionRatio:
-        assert self._outcome_shape is not None
-        assert self._action_dim is not None
-        return ActionRatio(
-            estimator, self._round_belief, self._outcome_shape, self._action_dim
-        )
+        return self._learned(density_estimator)
 
 
 class SeqBED_B(AmortizedRounds, NRE_B):  # noqa: N801 - as NRE_B

@@ -157,14 +157,10 @@ class ASBI(ActionNPE):
         a belief is required, the first is an error and the second the belief before.
         """
         network, previous = self._neural_net, self.belief
+        if required:
+            self._require_belief_network()
         if self._trained_round is None or network is None or previous is None:
-            if not required:
-                return None
-            raise RuntimeError(
-                "expected a network trained under the current belief; got none since "
-                "the last update() or append_simulations(); do append simulations of "
-                "the belief with action= and train() first"
-            )
+            return None
         condition = pack(trial.x[None], trial.action[None]).to(self._device)
         prior = require_support(self._prior)
         if not _knows(network, condition):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.inference.action_factor import ActionFactor
 from sbi_active.inference.action_rounds import ActionRounds
 from sbi_active.inference.belief import Belief, require_support
 from sbi_active.inference.chain_belief import MARKOV_CHAINS, ChainBelief
@@ -22,7 +23,6 @@ from sbi_active.inference.kernel_belief import Bandwidth, KernelBelief
 from sbi_active.inference.product import (
     Product,
     TrainedRegion,
-    TrialModel,
     widened,
 )
 from sbi_active.inference.product_belief import sample_product
@@ -69,6 +69,9 @@ class ProductRounds(ActionRounds):
     # Of the trainer that this is mixed into.
     append_simulations: Callable[..., Any]
     train: Callable[..., Any]
+    _neural_net: Any
+    #: What its network is, set by each method.
+    _factor: type[ActionFactor]
 
     def __init__(
         self,
@@ -102,9 +105,16 @@ class ProductRounds(ActionRounds):
             theta, x, action, belief, exclude_invalid_x, data_device, proposal
         )
 
-    @abstractmethod
-    def _model(self) -> TrialModel:
-        """Return what was learned in this round, apart from later training."""
+    def _learned(self, estimator: Any = None) -> ActionFactor:
+        """Return what was learned; None is this round's, apart from later training."""
+        if estimator is None:
+            self._require_trained()
+            estimator = deepcopy(self._neural_net)
+        assert self._outcome_shape is not None
+        assert self._action_dim is not None
+        return self._factor(
+            estimator, self._round_belief, self._outcome_shape, self._action_dim
+        )
 
     def update(
         self,
@@ -145,12 +155,8 @@ class ProductRounds(ActionRounds):
         settings = Refinement() if refinement is None else refinement
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         trials = [*self.trials, trial]
-        if self._trained_round is None and simulator is None:
-            raise RuntimeError(
-                "expected a network trained under the current belief; got none since "
-                "the last update() or append_simulations(); do append simulations of "
-                "the belief with action= and train() first"
-            )
+        if simulator is None:
+            self._require_belief_network()
         belief: Belief | None = None
         if self._trained_round is not None:
             belief = self._product(trials, settings, seed)
@@ -279,7 +285,7 @@ class ProductRounds(ActionRounds):
         chained = self._sampler == "kde"
         product = Product(
             coordinates,
-            self._model(),
+            self._learned(),
             trials[-1:] if chained else trials,
             region,
             previous if chained and previous is not prior else None,
