@@ -1,196 +1,26 @@
 """The report from its parts: what is printed when, and what the page contains."""
 
 import pickle
-import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, joint_prior
+from sbi_active.criticism import joint_prior
 from sbi_active.criticism.cautions import find_warnings
 from sbi_active.criticism.headline import with_error
-from sbi_active.criticism.psis_loo import LeaveOneOut
-from sbi_active.criticism.report import build_report
-from sbi_active.criticism.results import (
-    Detection,
-    Estimate,
-    Evaluation,
-    Evidence,
-    NextAction,
-    Residuals,
-    Tracing,
+from tests.criticism.reports import (
+    DRAG,
+    evaluation,
+    flat,
+    left_out,
+    report,
+    residuals,
+    tracing,
+    trials,
 )
-from sbi_active.criticism.trials import Trials
-
-DRAG = Effect(
-    "drag",
-    hook="observation",
-    prior=Normal(0.0, 1.0),
-    null=0.0,
-    apply=lambda x, phi, action, context: x - phi,
-)
-NAMES = ["drag", "tilt", "bias"]
-SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
-
-
-def evidence(name: str, log_evidence: float) -> Evidence:
-    rng = np.random.default_rng(0)
-    names = ("mu_1", "mu_2") if name == "none" else ("mu_1", "mu_2", name)
-    return Evidence(
-        name=name,
-        log_evidence=log_evidence,
-        standard_error=0.05,
-        effective_sample_size=312.0,
-        engine="least squares",
-        num_simulations=7_000,
-        names=names,
-        draws=0.3 + 0.01 * rng.normal(size=(400, len(names))),
-        best_chi_square=40.0,
-    )
-
-
-def estimate(name: str, probability: float, **changes) -> Estimate:
-    made = Estimate(
-        name=name,
-        family="dynamics",
-        units="1/m",
-        describe="a force against the speed" if name == "drag" else "",
-        probability=probability,
-        log_bayes_factor=9.4,
-        mean=np.array([0.123]),
-        sd=np.array([0.011]),
-        effective_sample_size=312.0,
-        engine="least squares",
-    )
-    return replace(made, **changes)
-
-
-def tracing(verdict: str = "drag", **changes) -> Tracing:
-    probabilities = {"none": 0.004, "unexplained": 0.01, "scatter": 0.001}
-    probabilities |= {"drag": 0.81, "tilt": 0.125, "bias": 0.05}
-    chosen = (verdict,) if verdict in NAMES else ()
-    made = Tracing(
-        verdict=verdict,
-        chosen=chosen,
-        probabilities=probabilities,
-        inclusion={"drag": 0.81, "tilt": 0.125, "bias": 0.05},
-        credible_set=("drag", "tilt"),
-        equivalent=(),
-        near=(),
-        aliases=(),
-        estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
-        evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
-        robust=True,
-    )
-    return replace(made, **changes)
-
-
-def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Residuals:
-    rng = np.random.default_rng(1)
-    z = size * rng.normal(size=(num, *shape))
-    return Residuals(
-        action=np.array(SHUFFLED[:num])[:, None],
-        index=np.arange(num, dtype=float),
-        times=times,
-        x=z + 2,
-        mean=np.full_like(z, 2.0),
-        sd=np.ones_like(z),
-        refitted=z,
-        prequential=1.5 * z,
-        correlation=0.8 if times is not None else 0.0,
-        noise="declared",
-    )
-
-
-def evaluation(num: int = 8) -> Evaluation:
-    rng = np.random.default_rng(2)
-    before = {
-        "rmse": 0.05 + 0.02 * rng.random(num),
-        "energy score": 0.03 + 0.01 * rng.random(num),
-        "log predictive density": -20 - 5 * rng.random(num),
-        "coverage": np.round(rng.random(num) * 6) / 6,
-    }
-    after = {
-        "rmse": before["rmse"] / 5,
-        "energy score": before["energy score"] / 4,
-        "log predictive density": before["log predictive density"] + 35,
-        "coverage": np.full(num, 5 / 6),
-    }
-    enough = num >= 8
-    rows = []
-    for name in before:
-        b, a = before[name].mean(), after[name].mean()
-        ratio = a - b if name in ("log predictive density", "coverage") else a / b
-        ends = (0.9 * ratio, 1.1 * ratio) if enough else (np.nan, np.nan)
-        rows.append((name, b, a, ratio, *ends))
-    columns = pd.Index(["metric", "before", "after", "ratio", "low", "high"])
-    return Evaluation(
-        scheme="held out",
-        trials=np.arange(num, dtype=float),
-        before=before,
-        after=after,
-        table=pd.DataFrame(rows, columns=columns),
-    )
-
-
-def left_out(name: str, *, density: float, k: float = 0.2) -> LeaveOneOut:
-    pareto_k = np.full(8, 0.2)
-    pareto_k[[3, 5]] = k
-    each = density + 0.1 * np.arange(8)
-    return LeaveOneOut(name=name, density=each, pareto_k=pareto_k, num_draws=400)
-
-
-def flat(made) -> str:
-    """Return the text of a report as one line."""
-    return " ".join(str(made).split())
-
-
-def trials(action=SHUFFLED[:8]) -> Trials:
-    return Trials(torch.tensor(action), torch.randn(len(action), 6))
-
-
-def report(**changes):
-    noise = GaussianNoise(0.005)
-    parts = {
-        "trials": trials(),
-        "residuals": residuals(size=6.0),
-        "residuals_after": residuals(),
-        "detection": Detection(
-            log_bayes_factor=8.2,
-            standard_error=0.1,
-            lower=8.0,
-            threshold=float(np.log(20)),
-            chi_square=180.4,
-            degrees_of_freedom=46,
-            p_value=1e-16,
-            level=0.01,
-            null_log_evidence=-3.0,
-            null_cross_check=-3.1,
-        ),
-        "tracing": tracing(),
-        "evaluation": evaluation(),
-        "next_action": NextAction(
-            action=np.array([3.0]),
-            candidates=np.array([[1.0], [3.0]]),
-            information_gain=np.array([0.1, 0.41]),
-            separates=("drag", "tilt"),
-        ),
-        "simulator": SimulatorModel(
-            lambda theta, action: theta[:, :1] * torch.ones(1, 6), noise=noise
-        ),
-        "prior": BoxUniform(torch.zeros(3), torch.ones(3)),
-        "actions": DiscreteActions([1.0, 3.0], names=["speed"], units=["m/s"]),
-        "digest": "0123456789abcdef",
-        "leave_one_out": (left_out("none", density=-20), left_out("drag", density=2)),
-    }
-    return build_report(**(parts | changes))
 
 
 def test_the_verdict_is_in_the_first_line():
@@ -373,76 +203,3 @@ def test_a_report_of_a_right_model_has_no_warnings():
     arguments = {"trials": trials(), "residuals": residuals(), "tracing": tracing()}
     assert find_warnings(**arguments) == ()
     assert "Warnings" not in str(report())
-
-
-class Page(HTMLParser):
-    """Collects what a page refers to and whether its elements are closed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.images: list[str] = []
-        self.open: list[str] = []
-
-    def handle_starttag(self, tag, attrs):
-        values = dict(attrs)
-        self.images += [values["src"]] if tag == "img" else []
-        assert "href" not in values
-        assert tag != "script"
-        if tag not in ("img", "meta"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
-def test_the_page_is_self_contained():
-    page = Page()
-    page.feed(report().to_html())
-    assert page.open == []
-    assert len(page.images) == 3
-    assert all(source.startswith("data:image/png;base64,") for source in page.images)
-
-
-def test_names_are_escaped_on_the_page():
-    formula = "c |xi|^1.5 <x>"
-    made = report(tracing=tracing("unexplained", guesses=((formula, 4.0),)))
-    page = made.to_html()
-    assert "&lt;x&gt;" in page
-    assert formula not in page
-
-
-def test_markdown_tables_have_as_many_cells_as_headings():
-    shares = {"a|b": 0.6, "drag": 0.4}
-    made = report(tracing=tracing(probabilities=shares, credible_set=(*shares,)))
-    text = re.sub(r"\\\|", "", made.to_markdown())
-    blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
-    assert len(blocks) == 5
-    for block in blocks:
-        assert len({line.count("|") for line in block.splitlines()}) == 1
-
-
-def test_save_writes_the_page_and_every_figure(tmp_path):
-    made = report()
-    page = made.save(tmp_path / "out")
-    names = {path.name for path in page.parent.iterdir()}
-    pictures = {"residuals.png", "probabilities.png", "before_after.png"}
-    assert names == {"report.txt", "report.md", "report.html"} | pictures
-    linked = re.findall(r"\]\((.+?)\)", (page.parent / "report.md").read_text())
-    assert {*linked} == pictures
-
-
-@pytest.mark.parametrize("shape", [(1,), (6,), (50,), (20, 2)])
-def test_residual_panels_by_kind_of_observation(shape):
-    times = np.linspace(0, 2, shape[0]) if shape[0] > 6 else None
-    made = report(
-        residuals=residuals(shape, size=40.0, times=times),
-        residuals_after=residuals(shape, times=times),
-    )
-    from sbi_active.criticism.figures import plot_residuals
-
-    figure = plot_residuals(made.residuals, made.residuals_after)
-    labels = [ax.get_xlabel() for ax in figure.axes]
-    last = {(1,): [], (6,): ["channel"]}.get(shape, ["time [s]"])
-    assert labels == 2 * ["action 1", "trial", *last]
-    largest = np.abs(made.residuals.refitted).max()
-    assert figure.axes[0].get_ylim()[1] > largest

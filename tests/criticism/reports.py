@@ -1,0 +1,187 @@
+"""Reports with figures that are made up, to test how they are told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect
+from sbi_active.criticism.psis_loo import LeaveOneOut
+from sbi_active.criticism.report import build_report
+from sbi_active.criticism.results import (
+    Detection,
+    Estimate,
+    Evaluation,
+    Evidence,
+    NextAction,
+    Residuals,
+    Tracing,
+)
+from sbi_active.criticism.trials import Trials
+
+DRAG = Effect(
+    "drag",
+    hook="observation",
+    prior=Normal(0.0, 1.0),
+    null=0.0,
+    apply=lambda x, phi, action, context: x - phi,
+)
+NAMES = ["drag", "tilt", "bias"]
+SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
+
+
+def evidence(name: str, log_evidence: float) -> Evidence:
+    rng = np.random.default_rng(0)
+    names = ("mu_1", "mu_2") if name == "none" else ("mu_1", "mu_2", name)
+    return Evidence(
+        name=name,
+        log_evidence=log_evidence,
+        standard_error=0.05,
+        effective_sample_size=312.0,
+        engine="least squares",
+        num_simulations=7_000,
+        names=names,
+        draws=0.3 + 0.01 * rng.normal(size=(400, len(names))),
+        best_chi_square=40.0,
+    )
+
+
+def estimate(name: str, probability: float, **changes) -> Estimate:
+    made = Estimate(
+        name=name,
+        family="dynamics",
+        units="1/m",
+        describe="a force against the speed" if name == "drag" else "",
+        probability=probability,
+        log_bayes_factor=9.4,
+        mean=np.array([0.123]),
+        sd=np.array([0.011]),
+        effective_sample_size=312.0,
+        engine="least squares",
+    )
+    return replace(made, **changes)
+
+
+def tracing(verdict: str = "drag", **changes) -> Tracing:
+    probabilities = {"none": 0.004, "unexplained": 0.01, "scatter": 0.001}
+    probabilities |= {"drag": 0.81, "tilt": 0.125, "bias": 0.05}
+    chosen = (verdict,) if verdict in NAMES else ()
+    made = Tracing(
+        verdict=verdict,
+        chosen=chosen,
+        probabilities=probabilities,
+        inclusion={"drag": 0.81, "tilt": 0.125, "bias": 0.05},
+        credible_set=("drag", "tilt"),
+        equivalent=(),
+        near=(),
+        aliases=(),
+        estimates=tuple(estimate(n, probabilities[n]) for n in NAMES),
+        evidences={n: evidence(n, -3.0) for n in ["none", *NAMES, "unexplained"]},
+        robust=True,
+    )
+    return replace(made, **changes)
+
+
+def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Residuals:
+    rng = np.random.default_rng(1)
+    z = size * rng.normal(size=(num, *shape))
+    return Residuals(
+        action=np.array(SHUFFLED[:num])[:, None],
+        index=np.arange(num, dtype=float),
+        times=times,
+        x=z + 2,
+        mean=np.full_like(z, 2.0),
+        sd=np.ones_like(z),
+        refitted=z,
+        prequential=1.5 * z,
+        correlation=0.8 if times is not None else 0.0,
+        noise="declared",
+    )
+
+
+def evaluation(num: int = 8) -> Evaluation:
+    rng = np.random.default_rng(2)
+    before = {
+        "rmse": 0.05 + 0.02 * rng.random(num),
+        "energy score": 0.03 + 0.01 * rng.random(num),
+        "log predictive density": -20 - 5 * rng.random(num),
+        "coverage": np.round(rng.random(num) * 6) / 6,
+    }
+    after = {
+        "rmse": before["rmse"] / 5,
+        "energy score": before["energy score"] / 4,
+        "log predictive density": before["log predictive density"] + 35,
+        "coverage": np.full(num, 5 / 6),
+    }
+    enough = num >= 8
+    rows = []
+    for name in before:
+        b, a = before[name].mean(), after[name].mean()
+        ratio = a - b if name in ("log predictive density", "coverage") else a / b
+        ends = (0.9 * ratio, 1.1 * ratio) if enough else (np.nan, np.nan)
+        rows.append((name, b, a, ratio, *ends))
+    columns = pd.Index(["metric", "before", "after", "ratio", "low", "high"])
+    return Evaluation(
+        scheme="held out",
+        trials=np.arange(num, dtype=float),
+        before=before,
+        after=after,
+        table=pd.DataFrame(rows, columns=columns),
+    )
+
+
+def left_out(name: str, *, density: float, k: float = 0.2) -> LeaveOneOut:
+    pareto_k = np.full(8, 0.2)
+    pareto_k[[3, 5]] = k
+    each = density + 0.1 * np.arange(8)
+    return LeaveOneOut(name=name, density=each, pareto_k=pareto_k, num_draws=400)
+
+
+def flat(made) -> str:
+    """Return the text of a report as one line."""
+    return " ".join(str(made).split())
+
+
+def trials(action=SHUFFLED[:8]) -> Trials:
+    return Trials(torch.tensor(action), torch.randn(len(action), 6))
+
+
+def report(**changes):
+    noise = GaussianNoise(0.005)
+    parts = {
+        "trials": trials(),
+        "residuals": residuals(size=6.0),
+        "residuals_after": residuals(),
+        "detection": Detection(
+            log_bayes_factor=8.2,
+            standard_error=0.1,
+            lower=8.0,
+            threshold=float(np.log(20)),
+            chi_square=180.4,
+            degrees_of_freedom=46,
+            p_value=1e-16,
+            level=0.01,
+            null_log_evidence=-3.0,
+            null_cross_check=-3.1,
+        ),
+        "tracing": tracing(),
+        "evaluation": evaluation(),
+        "next_action": NextAction(
+            action=np.array([3.0]),
+            candidates=np.array([[1.0], [3.0]]),
+            information_gain=np.array([0.1, 0.41]),
+            separates=("drag", "tilt"),
+        ),
+        "simulator": SimulatorModel(
+            lambda theta, action: theta[:, :1] * torch.ones(1, 6), noise=noise
+        ),
+        "prior": BoxUniform(torch.zeros(3), torch.ones(3)),
+        "actions": DiscreteActions([1.0, 3.0], names=["speed"], units=["m/s"]),
+        "digest": "0123456789abcdef",
+        "leave_one_out": (left_out("none", density=-20), left_out("drag", density=2)),
+    }
+    return build_report(**(parts | changes))

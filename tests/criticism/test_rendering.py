@@ -1,0 +1,82 @@
+"""The page, its tables and figures."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from tests.criticism.reports import report, residuals, tracing
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to and whether its elements are closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.images: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.images += [values["src"]] if tag == "img" else []
+        assert "href" not in values
+        assert tag != "script"
+        if tag not in ("img", "meta"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_self_contained():
+    page = Page()
+    page.feed(report().to_html())
+    assert page.open == []
+    assert len(page.images) == 3
+    assert all(source.startswith("data:image/png;base64,") for source in page.images)
+
+
+def test_names_are_escaped_on_the_page():
+    formula = "c |xi|^1.5 <x>"
+    made = report(tracing=tracing("unexplained", guesses=((formula, 4.0),)))
+    page = made.to_html()
+    assert "&lt;x&gt;" in page
+    assert formula not in page
+
+
+def test_markdown_tables_have_as_many_cells_as_headings():
+    shares = {"a|b": 0.6, "drag": 0.4}
+    made = report(tracing=tracing(probabilities=shares, credible_set=(*shares,)))
+    text = re.sub(r"\\\|", "", made.to_markdown())
+    blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
+    assert len(blocks) == 5
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+
+
+def test_save_writes_the_page_and_every_figure(tmp_path):
+    made = report()
+    page = made.save(tmp_path / "out")
+    names = {path.name for path in page.parent.iterdir()}
+    pictures = {"residuals.png", "probabilities.png", "before_after.png"}
+    assert names == {"report.txt", "report.md", "report.html"} | pictures
+    linked = re.findall(r"\]\((.+?)\)", (page.parent / "report.md").read_text())
+    assert {*linked} == pictures
+
+
+@pytest.mark.parametrize("shape", [(1,), (6,), (50,), (20, 2)])
+def test_residual_panels_by_kind_of_observation(shape):
+    times = np.linspace(0, 2, shape[0]) if shape[0] > 6 else None
+    made = report(
+        residuals=residuals(shape, size=40.0, times=times),
+        residuals_after=residuals(shape, times=times),
+    )
+    from sbi_active.criticism.figures import plot_residuals
+
+    figure = plot_residuals(made.residuals, made.residuals_after)
+    labels = [ax.get_xlabel() for ax in figure.axes]
+    last = {(1,): [], (6,): ["channel"]}.get(shape, ["time [s]"])
+    assert labels == 2 * ["action 1", "trial", *last]
+    largest = np.abs(made.residuals.refitted).max()
+    assert figure.axes[0].get_ylim()[1] > largest
