@@ -3,7 +3,7 @@
     python -m benchmarks.box_collision.run                  # both targets, 10 trials
     python -m benchmarks.box_collision.run --trials 50      # the paper's number
     python -m benchmarks.box_collision.run --target 1 --setting paper --methods asbi
-    python -m benchmarks.box_collision.run --table coverage --rounds 4
+    python -m benchmarks.box_collision.run --table coverage --rounds 3 --reference none
     python -m benchmarks.box_collision.run --summary --figures FOLDER
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
@@ -121,7 +121,7 @@ def run_trial(
         row = round_row(task, campaign, is_last=is_last)
         if bank is not None:
             row["num_reused"] = bank.num_reused if index == 0 else 0
-        if task.noise > 0 and (is_last or arguments.reference == "all"):
+        if arguments.reference == "all" or (is_last and arguments.reference == "last"):
             start = time.process_time()
             past = exact_posterior(
                 task,
@@ -251,7 +251,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument(
         "--reference",
-        choices=["last", "all"],
+        choices=["last", "all", "none"],
         default="last",
         help="rounds after which to run importance sampling",
     )

@@ -190,7 +190,7 @@ def coverage_table(cells: Cells) -> str:
     """Return how often the truth is within regions of highest density."""
     table = []
     for (method, _), rows in cells.items():
-        for round_ in [r for r in (4, 6) if r <= num_rounds(rows)]:
+        for round_ in [r for r in (3, 4, 6) if r <= num_rounds(rows)]:
             hpd = column(rows, "hpd", round_)
             entry = [method.upper(), str(round_), str(len(hpd))]
             for level in (0.5, 0.9):
@@ -203,7 +203,7 @@ def coverage_table(cells: Cells) -> str:
             entry.append(gap(rows, round_))
             table.append(entry)
     if not table:
-        return "no trials of four rounds yet"
+        return "no trials of three rounds yet"
     header = ["", "round", "trials", "in 50 % region", "in 90 % region", "gap"]
     return as_table(table, header)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain, combinations
 from typing import Literal, get_args
 
 import torch
@@ -112,6 +113,11 @@ class Truth:
     def support(self) -> float:
         """What is left without the less needed of two effects, the other refitted."""
         return min(self._left_by((effect,)) for effect in self.effects)
+
+    def left_by_any(self, declared: Sequence[Effect]) -> float:
+        """Return what is left by the best one or two of the declared effects."""
+        sets = chain(combinations(declared, 1), combinations(declared, 2))
+        return min(self._left_by(effects) for effects in sets)
 
     def residual(
         self, parameters: Tensor, effects: Sequence[Effect], target: Tensor

@@ -58,7 +58,7 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
         "theta": " ".join(f"{v:.6g}" for v in truth.theta[0].tolist()),
         "correlation": truth.correlation,
         "lambda": truth.non_centrality,
-        "support": truth.support if len(truth.effects) > 1 else "",
+        "support": _support(case),
     }
     model, count = counted(problem.model)
     start = time.process_time()
@@ -81,6 +81,15 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
     if oracle and problem.trials.held_out is not None:
         row["rmse_oracle"] = oracle_rmse(case)
     return row | read_report(report)
+
+
+def _support(case: Case) -> float | str:
+    """Return what data say against less than both effects, or against the declared."""
+    if len(case.truth.effects) > 1:
+        return case.truth.support
+    if case.truth.kind == "removed":
+        return case.truth.left_by_any(case.problem.effects)
+    return ""
 
 
 def read_report(report: Report) -> dict[str, object]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, rankdata
+from scipy.stats import rankdata
 
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.outcomes import surprising_outcomes
@@ -156,7 +156,11 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
             "the alarm rests on the chi-square alone: no alternative has a Bayes "
             "factor of 20, so that what is lacking is a suggestion"
         )
-    if detection is not None and _is_refuted(tracing, detection):
+    if (
+        detection is not None
+        and tracing.chosen
+        and detection.refutes(tracing.evidences[tracing.verdict], REFUTED)
+    ):
         yield (
             f"{tracing.verdict} explains the most, and not all: the chi-square of the "
             f"trials with it has p < {REFUTED:g}, so that something else is missing too"
@@ -176,17 +180,6 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
                 f"{abs(difference):.1f} nats: its posterior has parts that one of them "
                 "missed"
             )
-
-
-def _is_refuted(tracing: Tracing, detection: Detection) -> bool:
-    """Return whether known noise leaves no room for what the verdict leaves over.
-
-    Degrees of freedom are those of the bare model, a few too many.
-    """
-    if not tracing.chosen or detection.level == 0:
-        return False
-    left = tracing.evidences[tracing.verdict].best_chi_square
-    return bool(chi2.sf(left, detection.degrees_of_freedom) < REFUTED)
 
 
 def _of_verdict(
@@ -216,9 +209,12 @@ def _of_verdict(
             "give another verdict"
         )
     if tracing.verdict == UNEXPLAINED:
+        place = (
+            f"beside {' + '.join(tracing.beside)}" if tracing.beside else "in its place"
+        )
         yield (
-            "no declared effect explains the data: the residual process in its place "
-            "does not extrapolate"
+            f"no declared effect explains the data: the residual process {place} does "
+            "not extrapolate"
         )
     if tracing.verdict == SCATTER:
         yield "scatter is larger than the declared noise, which is no cause"

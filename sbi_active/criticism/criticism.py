@@ -260,7 +260,8 @@ class Criticism:
         after = None
         if tracing.verdict != NONE:
             error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
-            after = find_residuals(self.rivals, names=tracing.chosen, error=error)
+            names = tracing.chosen or tracing.beside
+            after = find_residuals(self.rivals, names=names, error=error)
         return build_report(
             trials=self.trials,
             residuals=self.residuals(),

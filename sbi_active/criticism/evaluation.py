@@ -79,7 +79,8 @@ def _predictions(
     if tracing.verdict == NONE:
         return before, before
     error = tracing.verdict if tracing.verdict in (UNEXPLAINED, SCATTER) else None
-    return before, predict(rivals, trials, names=tracing.chosen, error=error)
+    names = tracing.chosen or tracing.beside
+    return before, predict(rivals, trials, names=names, error=error)
 
 
 def _scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:

@@ -27,6 +27,8 @@ def verdict_line(report: Report) -> str:
     tracing, verdict = report.tracing, report.verdict
     p = tracing.probabilities.get(verdict)
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
+    if tracing.beside:
+        line += f", beside {' + '.join(tracing.beside)}"
     if report.guess is not None:
         line += f", a guess, not declared: {report.guess}"
     if not tracing.robust:
@@ -41,9 +43,10 @@ def verdict_line(report: Report) -> str:
 
 def added(report: Report) -> str:
     """Return what was added to the bare model, in words."""
+    beside = " + ".join(report.tracing.beside)
     words = {
         NONE: "nothing",
-        UNEXPLAINED: "a residual process",
+        UNEXPLAINED: (beside and f"{beside} and ") + "a residual process",
         SCATTER: "larger noise",
     }
     return words.get(report.verdict, report.verdict)
@@ -61,7 +64,10 @@ def summary_sentence(report: Report) -> str:
     if report.verdict == NONE:
         return f"The bare model explains the {trials} ({against})."
     found = [f"The bare model misses the {trials} ({against})."]
-    if report.verdict == UNEXPLAINED:
+    if report.tracing.beside:
+        most = " + ".join(report.tracing.beside)
+        found.append(f"{most} explains most of what it misses, and not all.")
+    elif report.verdict == UNEXPLAINED:
         found.append("No declared effect explains what it misses.")
     elif report.verdict == SCATTER:
         found.append(

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 __all__ = [
     "Detection",
@@ -131,6 +132,18 @@ class Detection:
         """Whether the chi-square raises the alarm."""
         return self.p_value < self.level
 
+    def refutes(self, evidence: Evidence, level: float) -> bool:
+        """Return whether known noise leaves no room for what a model leaves over.
+
+        Degrees of freedom are those of the bare model, a few too many.
+
+        Args:
+            evidence: Of the model.
+            level: Tail probability below which there is none.
+        """
+        left = chi2.sf(evidence.best_chi_square, self.degrees_of_freedom)
+        return self.level > 0 and bool(left < level)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
@@ -187,6 +200,8 @@ class Tracing:
             known to miss by more than the error of measurement.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
+        beside: Effects that explain most of what is "unexplained", the residual process
+            taking the rest; empty where it takes all, and for any other verdict.
     """
 
     verdict: str
@@ -202,6 +217,7 @@ class Tracing:
     robust: bool
     coarsening: float = 1.0
     guesses: tuple[tuple[str, float], ...] = ()
+    beside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

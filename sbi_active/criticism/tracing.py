@@ -73,7 +73,9 @@ def trace(
     the error of measurement, evidence is coarsened
     (:mod:`~sbi_active.criticism.coarsening`). After an alarm the verdict is first
     one of: declared effects, "unexplained", "scatter", each with all of its
-    probability; then, of the effects, the most probable.
+    probability; then, of the effects, the most probable. Where known noise refutes
+    that (its chi-square would be an alarm), the residual process is tried beside it:
+    then "unexplained" is the process alone or with these effects, half and half.
 
     Args:
         rivals: The models.
@@ -99,6 +101,18 @@ def trace(
     log_p = {name: log_prior[name] + share * log_z[name] for name in log_z}
     probabilities = _normalized(log_p)
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
+    beside = _effects_of(verdict)
+    if beside and detection.refutes(rivals.evidences[verdict], detection.level):
+        # What takes up most of the misfit need not take up all of it.
+        rest = rivals.evidence(beside, error=UNEXPLAINED).log_evidence
+        alone = log_z[UNEXPLAINED]
+        log_z[UNEXPLAINED] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
+        log_p[UNEXPLAINED] = log_prior[UNEXPLAINED] + share * log_z[UNEXPLAINED]
+        probabilities = _normalized(log_p)
+        verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
+        beside = beside if verdict == UNEXPLAINED and rest > alone else ()
+    else:
+        beside = ()
     near = equivalent_effects(rivals, None) if compare else ()
     aliases = ()
     if compare and detection.alarm:
@@ -123,6 +137,7 @@ def trace(
             rivals, detection, log_prior, log_z, share, equivalent, verdict
         ),
         coarsening=share,
+        beside=beside,
     )
 
 

@@ -84,9 +84,21 @@ def test_a_parameter_that_changes_nothing_takes_up_no_residual():
     assert np.isclose(num_determined(idle.rivals), 1.0, atol=0.25)
 
 
-@pytest.mark.parametrize(("size", "refuted"), [(2.2, True), (0.0, False)])
-def test_a_verdict_that_its_chi_square_refutes_says_so(size, refuted):
-    x, action = zigzag(size)
+def test_what_an_effect_leaves_over_is_unexplained_beside_it():
+    x, action = zigzag(2.2)
+    made = criticism(x + 3.0 * action**3, action).report(evaluate=False)
+    assert made.verdict == "unexplained"
+    assert made.tracing.beside == ("cubic",)
+    assert made.tracing.chosen == ()
+    assert "beside cubic" in str(made).splitlines()[0]
+    assert "cubic explains most" in " ".join(str(made).split())
+    after = made.residuals_after.refitted
+    assert np.nanstd(after) < np.nanstd(made.residuals.refitted)
+
+
+def test_nothing_is_unexplained_beside_an_effect_that_explains_all():
+    x, action = zigzag(0.0)
     made = criticism(x + 3.0 * action**3, action).report(evaluate=False)
     assert made.verdict == "cubic"
-    assert ("something else is missing" in " ".join(made.warnings)) is refuted
+    assert made.tracing.beside == ()
+    assert "something else is missing" not in " ".join(made.warnings)
