@@ -1,7 +1,6 @@
 """When the bare model raises an alarm: by its Bayes factor, or by its chi-square."""
 
 import numpy as np
-import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import kstest
