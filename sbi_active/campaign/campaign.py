@@ -15,6 +15,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.health import Health, assess
 from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.limits import Limits
 from sbi_active.campaign.methods import METHODS, find_method
 from sbi_active.campaign.planner import Planner
 from sbi_active.campaign.revision import criticize, revise
@@ -44,12 +45,16 @@ class Campaign:
             actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
         effects: What the simulator may lack, see :class:`~sbi_active.criticism.Effect`.
             With them, actions are also chosen to tell whether it does.
+        cost: Of actions (n, action_dim), shape (n,), positive; or one number an action
+            of a list. Actions are then chosen for their information by cost.
+        constraint: Which of actions (n, action_dim) the robot may execute now, shape
+            (n,), bool. The network learns about the others as well.
         seed: Of everything random; the same seed and outcomes give the same campaign.
         options: Sizes and estimators.
 
     Raises:
-        ValueError: If the method is unknown, the prior has no support, or the
-            simulator is deterministic.
+        ValueError: If the method is unknown, the prior has no support, the simulator
+            is deterministic, or the cost or the constraint has another shape.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -77,6 +82,8 @@ class Campaign:
         *,
         method: str = "asbi",
         effects: Sequence[Effect] = (),
+        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        constraint: Callable[[Tensor], Tensor] | None = None,
         seed: int = 0,
         options: CampaignOptions | None = None,
     ) -> None:
@@ -85,7 +92,8 @@ class Campaign:
         options = CampaignOptions() if options is None else options
         self.state = CampaignState(method=method, seed=seed, options=options)
         self._learner = Learner(simulator, prior, actions, self.state)
-        self._planner = Planner(actions, self.state, effects)
+        limits = Limits(actions, constraint, cost)
+        self._planner = Planner(limits, self.state, effects)
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None

@@ -19,7 +19,7 @@ from sbi_active.inference import information_gained
 from sbi_active.inference.belief import require_support
 from sbi_active.inference.rounds import Observation
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import simulate
+from sbi_active.simulation import Simulations, simulate
 
 __all__ = ["Learner"]
 
@@ -36,6 +36,7 @@ class Learner:
 
     Attributes:
         x_shape: Of an outcome.
+        simulations: Those that the last training was on; None before any.
 
     Raises:
         ValueError: If the prior has no support, or the simulator is deterministic.
@@ -55,6 +56,7 @@ class Learner:
         seed = derive_seed(state.seed, "index")
         self._has_index = depends_on_index(simulator, prior, actions, seed=seed)
         self._round_ready = False
+        self.simulations: Simulations | None = None
 
     @property
     def belief(self) -> Distribution:
@@ -172,6 +174,7 @@ class Learner:
                     **options.engine,
                 )
                 known = rows.without_missing()
+                self.simulations = known
             with state.stage(index, "training"):
                 self._inference.append_simulations(
                     known.theta, known.x, action=known.action, belief=self.belief

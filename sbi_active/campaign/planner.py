@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
-from sbi_active.actions import ActionSpace
 from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.limits import Limits
 from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.revision import compare
 from sbi_active.campaign.state import CampaignState
@@ -29,7 +30,7 @@ class Planner:
     """Designs the trials of a campaign.
 
     Args:
-        actions: The permitted ones.
+        limits: The action space, what of it is permitted, and its cost.
         state: Of the campaign.
         effects: What its simulator may lack.
 
@@ -38,10 +39,10 @@ class Planner:
     """
 
     def __init__(
-        self, actions: ActionSpace, state: CampaignState, effects: Sequence[Effect]
+        self, limits: Limits, state: CampaignState, effects: Sequence[Effect]
     ) -> None:
-        self._actions, self._state, self.effects = actions, state, (*effects,)
-        options = state.options
+        self._limits, self._state, self.effects = limits, state, (*effects,)
+        options, actions = state.options, limits.actions
         self._designs = find_method(state.method).designs
         self._designer = (
             InformationGainDesigner(
@@ -49,6 +50,7 @@ class Planner:
                 num_samples=options.num_samples,
                 estimator=options.estimator,
                 eliminate=options.eliminate,
+                exponent=options.exponent,
                 **options.engine,
             )
             if self._designs
@@ -87,7 +89,7 @@ class Planner:
             self._state,
             learner.simulator,
             learner.prior,
-            self._actions,
+            self._limits.permitted(),
             effects=self.effects if effects is None else effects,
         )
 
@@ -108,27 +110,41 @@ class Planner:
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.
         """
+        options = self._state.options
+        told = [t for t in self._state.trials if t.status in ("ok", "invalid")]
+        executed = torch.stack([t.action for t in told]) if told else torch.empty(0)
+        exclude = None if options.repeat or not told else executed
+        limits = self._limits.options(exclude)
+        limits["min_probability_valid"] = options.min_probability_valid
         if not self._designs:
-            return self._select(index, learner, self._designer), "random"
+            return self._select(index, learner, self._designer, **limits), "random"
         if target == "auto" and self._checks(index):
-            told = [t for t in self._state.trials if t.status in ("ok", "invalid")]
-            executed = [t.action for t in told]
-            places = most_unlike(
-                self._actions, torch.stack(executed) if executed else torch.empty(0)
-            )
-            designer = RandomDesigner(places, **self._state.options.engine)
+            places = most_unlike(self._limits.permitted(exclude), executed)
+            designer = RandomDesigner(places, **options.engine)
             return self._select(index, learner, designer), "check"
         about_model = None
         can_compare = self.effects and len(self._state.measured) >= FEWEST_TRIALS
         if target == "model" or (target == "auto" and can_compare):
             with self._state.stage(index, "criticism"):
-                about_model = _model_design(self.compare(learner), self._actions)
+                about_model = _model_design(
+                    self.compare(learner), self._limits, exclude
+                )
         if about_model is not None and (target == "model" or alarmed):
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
         model = learner.trained(index)
-        design = self._select(index, learner, self._designer, model, target=own)
-        if about_model is not None and _gain(about_model) > _gain(design):
+        rows = learner.simulations if options.design_on == "training" else None
+        design = self._select(
+            index,
+            learner,
+            self._designer,
+            model,
+            target=own,
+            cost=self._limits.cost,
+            simulations=rows,
+            **limits,
+        )
+        if about_model is not None and _utility(about_model) > _utility(design):
             return about_model, "model"
         return design, own if isinstance(own, str) else ", ".join(own)
 
@@ -156,42 +172,50 @@ class Planner:
         return every is not None and (index + 1) % every == 0
 
 
-def _model_design(criticism: Criticism, actions: ActionSpace) -> Design | None:
+def _model_design(
+    criticism: Criticism, limits: Limits, exclude: Tensor | None
+) -> Design | None:
     """Return the design that tells most about which rival is right.
 
     Args:
         criticism: Of all trials so far.
-        actions: The permitted ones.
+        limits: What is permitted, and its cost.
+        exclude: Actions not to repeat, shape (t, action_dim).
 
     Returns:
         None where no permitted action tells anything: one rival is left, or those left
         predict the same.
     """
     spent = criticism.rivals.simulator.num_simulations
-    found = criticism.next_action(actions, beyond=False)
+    found = criticism.next_action(limits.permitted(exclude), beyond=False)
     if found.action is None:
         return None
     candidates = torch.as_tensor(found.candidates).float()
+    gain, cost = torch.as_tensor(found.information_gain), limits.price(candidates)
+    # Without a cost the choice was made on other simulations than these estimates.
     action = torch.as_tensor(found.action).float()
+    index = int((candidates == action).all(1).int().argmax())
+    index = index if cost is None else int((gain / cost).argmax())
     unknown = torch.full((len(candidates),), torch.nan, dtype=torch.float64)
     return Design(
-        action=action,
+        action=candidates[index],
         candidates=candidates,
-        expected_information_gain=torch.as_tensor(found.information_gain),
+        expected_information_gain=gain,
         standard_error=unknown,
         difference_standard_error=unknown,
         probability_best=unknown,
         probability_valid=unknown,
         bound="lower",
-        index=int((candidates == action).all(1).int().argmax()),
+        index=index,
         num_simulations=criticism.rivals.simulator.num_simulations - spent,
-        name=action_name(actions),
+        name=action_name(limits.actions),
         estimator="ModelIndexGain",
         stopped="budget spent",
         notes=(f"about which is right: {', '.join(found.separates)}",),
+        cost=cost,
     )
 
 
-def _gain(design: Design) -> float:
-    """Return the chosen action's information, nats."""
-    return float(design.expected_information_gain[design.index])
+def _utility(design: Design) -> float:
+    """Return the chosen action's information by cost, nats a unit of cost."""
+    return float(design.utility[design.index])

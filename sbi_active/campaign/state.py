@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,13 @@ class CampaignOptions:
         estimator: Of the expected information gain, as in
             :class:`~sbi_active.InformationGainDesigner`; "posterior" is the paper's.
         eliminate: Whether candidates far behind the leader get no further samples.
+        exponent: Of the choice, as in :class:`~sbi_active.InformationGainDesigner`; inf
+            takes the best.
+        design_on: "fresh" simulations, or those of the "training", which costs none
+            further; the estimates are then too high, the more so the fewer rows.
+        min_probability_valid: Actions that give a measurement less often are chosen
+            neither for the parameters nor at random.
+        repeat: Whether an action may be chosen again.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
         refinement: Settings of the refinement; those of its simulations are taken from
@@ -63,6 +71,10 @@ class CampaignOptions:
     bandwidth: Bandwidth = "scott"
     estimator: Any = "auto"
     eliminate: bool = True
+    exponent: float = math.inf
+    design_on: Literal["fresh", "training"] = "fresh"
+    min_probability_valid: float = 0.0
+    repeat: bool = True
     refine: bool = True
     refinement: Refinement = Refinement()
     num_scored: int = 2_000
@@ -103,6 +115,11 @@ class CampaignOptions:
             raise ValueError(
                 f"expected num_simulations >= 100; got {self.num_simulations}; do use "
                 "about 5000 a round"
+            )
+        if self.design_on not in ("fresh", "training"):
+            raise ValueError(
+                "expected design_on 'fresh' or 'training'; got "
+                f"{self.design_on!r}; do choose one of these"
             )
         if self.num_scored < 100:
             raise ValueError(
