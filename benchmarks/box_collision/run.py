@@ -63,9 +63,10 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
         ),
         {"left_table": "paper"},
     ),
-    # The paper's simulations with this library's estimators.
+    # The paper's simulations with this library's inference; as in the paper, those of
+    # the training give the information as well.
     "paper_size": (
-        CampaignOptions(num_simulations=41 * 500, num_samples=250),
+        CampaignOptions(num_simulations=41 * 500, num_scored=500, design_on="training"),
         {},
     ),
     "default": (CampaignOptions(num_samples=250, num_scored=500), {}),

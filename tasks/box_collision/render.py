@@ -59,7 +59,7 @@ def render(
         )
     parameters = torch.as_tensor(theta).double().reshape(3).tolist()
     speed = float(torch.as_tensor(action).reshape(()))
-    scene = Scene(offset=offset, at_rest=False)
+    scene = Scene(offset=offset, early_exit=False)
     scene.prepare(parameters, speed, surroundings or Surroundings())
     pictures = _pictures(scene)
     if path.suffix.lower() == ".png":

@@ -19,7 +19,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -51,11 +51,14 @@ CUBE_KG = 1000.0 * (2 * CUBE_HALF) ** 3  # at a density of 1000 kg/m^3
 TIME_CONSTANT = 0.02  # s, of every contact
 PUSHER_FRICTION = 0.5
 
-STEPS_PER_LOOK = 40  # between two looks at whether the outcome is settled
+STEPS_PER_LOOK = 20  # between two looks at whether the cube leaves the table
+STEPS_PER_REST = 40  # between two looks at whether nothing moves
 REST = 1e-2  # m/s and rad/s, below which a body counts as resting
 GROWTH = 1e-3  # m/s between two looks, above which it is being set in motion
 FALLEN = -0.2  # m, from where the pusher cannot touch the cube again
 CLEAR = 0.14  # m beyond the edge, from where the cube cannot touch the table again
+HALF_DIAGONAL = CUBE_HALF * math.sqrt(3)
+SPARE = 1.0  # m/s, of vertical speed that a tumbling cube may gain on its way
 SMALLEST_DENSITY = 1e-3  # of 1000 kg/m^3
 SMALLEST_FRICTION = 1e-5  # MuJoCo's own limit
 SMALLEST_DAMPING = 0.05  # of an impact, over the critical
@@ -100,7 +103,8 @@ class Scene:
     Args:
         offset: Of the cube from the pusher's path, m along y.
         edge: Where the table ends, m along x.
-        at_rest: Stop a run when nothing can move the cube any more.
+        early_exit: Stop a run when its outcome is settled: the cube leaves the table,
+            or nothing can move it any more.
 
     Raises:
         ImportError: If MuJoCo is not installed.
@@ -112,12 +116,12 @@ class Scene:
     """
 
     def __init__(
-        self, *, offset: float = 0.0, edge: float = EDGE, at_rest: bool = True
+        self, *, offset: float = 0.0, edge: float = EDGE, early_exit: bool = True
     ) -> None:
         self.mujoco = mujoco = load_mujoco()
         self.model = model = mujoco.MjModel.from_xml_string(scene_xml(offset, edge))
         self.data = data = mujoco.MjData(model)
-        self.edge, self._stops_at_rest = edge, at_rest
+        self.edge, self._exits_early = edge, early_exit
         self.steps = 0  # of the last run
         cube = model.body("cube").id
         # MuJoCo takes the center of mass for the origin of a body whose frames agree.
@@ -176,6 +180,9 @@ class Scene:
         self._velocity[0] = speed
         self._position[1] = surroundings.aim
         self._force[0] = surroundings.force
+        self._friction = float(self._frictions[0][0])
+        pulls = (options.viscosity, options.density, tilt, surroundings.force)
+        self._only_rubs = not any(pulls)
 
     def run(
         self,
@@ -196,16 +203,16 @@ class Scene:
         self.prepare(theta, speed, surroundings)
         exact = max(FRAMES * STEPS_PER_FRAME + surroundings.delay / DT, 0.0)
         total = math.floor(exact + 1e-9)
-        is_settled = self._advance(total)
-        position = self._position[7:10].copy()
-        if self._is_clear(self._position[7], self._velocity[6]):
+        end = self._advance(total)
+        if end == "left":
             return None
-        if not is_settled:  # part of a step, so that x is smooth in the time stamp
+        position = self._position[7:10].copy()
+        if end == "moving":  # part of a step, so that x is smooth in the time stamp
             position += (exact - total) * DT * self._velocity[6:9]
         return position if self._is_on_table(position) else None
 
-    def _advance(self, total: int) -> bool:
-        """Run, and return whether the outcome was settled before the end."""
+    def _advance(self, total: int) -> Literal["left", "resting", "moving"]:
+        """Run until the outcome is settled, and return what the cube did."""
         step, model, data = self.mujoco.mj_step, self.model, self.data
         position, velocity, last = self._position, self._velocity, math.inf
         self.steps = 0
@@ -213,19 +220,51 @@ class Scene:
             num = min(STEPS_PER_LOOK, total - self.steps)
             step(model, data, num)
             self.steps += num
-            if position[9] < 0 or self._is_clear(position[7], velocity[6]):
-                return True
+            if not self._exits_early:
+                continue
+            if (
+                position[9] < 0
+                or self._is_clear(position[7], velocity[6])
+                or self._will_leave((total - self.steps) * DT)
+            ):
+                return "left"
+            if self.steps % STEPS_PER_REST:
+                continue
             # The pusher comes first in the state; what fell cannot come back.
             moving = velocity[6:] if position[2] < FALLEN else velocity
             fastest = max(moving.max(), -moving.min())
-            if (
-                self._stops_at_rest
-                and fastest < REST
-                and fastest < min(last, REST) + GROWTH
-            ):
-                return True
+            if fastest < REST and fastest < min(last, REST) + GROWTH:
+                return "resting"
             last = fastest
-        return False
+        return "moving"
+
+    def _will_leave(self, seconds: float) -> bool:
+        r"""Return whether the cube is too fast for friction to keep it on the table.
+
+        Friction takes at most :math:`\mu` times the table's vertical impulse, which is
+        :math:`m (g t + \Delta v_z)` however the cube tumbles:
+
+        .. math::
+            \Delta x \ge (u - \mu v)\, t - \tfrac12 \mu g t^2, \qquad
+            v = |v_z| + |\omega| r + 1\,\mathrm{m/s},
+
+        with u its speed along x and r half of its diagonal. The pusher, behind it, can
+        only add to u, its friction on the cube included.
+
+        Args:
+            seconds: Until it is observed.
+        """
+        if not self._only_rubs:
+            return False
+        u, _, upward, *spin = self._velocity[6:].tolist()
+        gained = abs(upward) + HALF_DIAGONAL * math.hypot(*spin) + SPARE
+        slowed = u - self._friction * gained
+        if slowed <= 0:
+            return False
+        deceleration = self._friction * GRAVITY
+        t = min(seconds, slowed / deceleration)
+        reach = slowed * t - 0.5 * deceleration * t**2
+        return bool(self._position[7] + reach > self.edge)
 
     def _is_clear(self, x: float, velocity: float) -> bool:
         return bool(x > self.edge + CLEAR and velocity > 0 and not self._force[0])

@@ -102,13 +102,22 @@ def test_a_central_push_shows_one_number_and_an_off_center_one_more(task):
 def test_early_exit_keeps_the_outcome():
     from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
 
-    early, full = Scene(), Scene(at_rest=False)
-    theta, action = rows(60)
-    for parameters, speed in zip(theta.tolist(), action[:, 0].tolist(), strict=True):
+    early, full = Scene(), Scene(early_exit=False)
+    theta, action = rows(150)
+    slippery = [[0.05, 0.1, 0.3]] * 20  # fast ones leave, slow ones just stay
+    theta, speeds = theta.tolist() + slippery, action[:, 0].tolist()
+    speeds += [1.0 + 0.1 * i for i in range(20)]
+    num_left = steps = 0
+    for parameters, speed in zip(theta, speeds, strict=True):
         x, exact = early.run(parameters, speed), full.run(parameters, speed)
+        steps += early.steps
+        num_left += exact is None
         assert (x is None) == (exact is None)
         if x is not None:
             assert abs(x - exact).max() < 5e-4  # a tenth of the noise
+    assert full.steps == 400
+    assert steps < 0.5 * 400 * len(speeds)
+    assert 50 < num_left < 140
 
 
 def test_observations_are_bit_identical(task):
