@@ -70,7 +70,12 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
         {},
     ),
     "default": (CampaignOptions(num_samples=250, num_scored=500), {}),
+    # Beliefs and information by the networks alone, which is where the methods differ:
+    # by default the declared noise gives both, whatever was learned.
+    "learned": (CampaignOptions(num_samples=250, num_scored=500, refine=False), {}),
 }
+#: Of the information in the setting "learned", by method.
+GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 COLUMNS = [
     *["seed", "theta_true", "round", "speed", "is_valid", "x", "y", "z", "eig"],
     *["log_prob_true", "log_p_exact", "log_p_exact_se", "gap", "hpd"],
@@ -99,6 +104,8 @@ def run_trial(
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
     options = SETTINGS[arguments.setting][0]
+    if arguments.setting == "learned" and method in GAINS:
+        options = replace(options, estimator=GAINS[method])
     bank = PriorBank(arguments.bank, task) if arguments.bank else None
     campaign = Campaign(
         task.simulator if bank is None else bank.simulator,

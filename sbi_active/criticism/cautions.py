@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from sbi_active.criticism.detection import REFUTED
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.outcomes import surprising_outcomes
 from sbi_active.criticism.results import (
@@ -34,8 +35,6 @@ EDGE = 0.99
 #: Effective samples below which, and standard error in nats above which, an evidence
 #: is called uncertain; models below the probability are left out.
 FEW_SAMPLES, UNCERTAIN, NEGLIGIBLE = 50, 0.5, 0.01
-#: Tail probability of what a verdict leaves over, below which it is not all.
-REFUTED = 0.001
 #: Nats by which two estimates of the bare model's evidence may differ.
 DISAGREEMENT = 1.0
 #: Entries a trial from which x may be a trajectory, and the correlation of neighboring

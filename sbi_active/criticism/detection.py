@@ -12,7 +12,7 @@ from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection
 from sbi_active.criticism.rival_set import RivalSet
 from sbi_active.criticism.unknown_scale import log_evidence
 
-__all__ = ["THRESHOLD", "alternatives", "detect"]
+__all__ = ["REFUTED", "THRESHOLD", "alternatives", "detect"]
 
 #: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
 #: at any stopping time, with a probability of at most 1/20.
@@ -21,6 +21,8 @@ THRESHOLD = float(np.log(20.0))
 MARGIN = 2.0
 #: Tail probability of the refitted chi-square that is an alarm by itself.
 LEVEL = 0.01
+#: That of what a verdict leaves over, below which it is not all that is missing.
+REFUTED = 0.001
 
 
 def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detection:

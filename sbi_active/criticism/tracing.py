@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.coarsening import coarsening
 from sbi_active.criticism.combinations import grow
-from sbi_active.criticism.detection import THRESHOLD, alternatives
+from sbi_active.criticism.detection import REFUTED, THRESHOLD, alternatives
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.equivalence import equivalent_effects
 from sbi_active.criticism.errors import log_sum_exp
@@ -74,8 +74,8 @@ def trace(
     (:mod:`~sbi_active.criticism.coarsening`). After an alarm the verdict is first
     one of: declared effects, "unexplained", "scatter", each with all of its
     probability; then, of the effects, the most probable. Where known noise refutes
-    that (its chi-square would be an alarm), the residual process is tried beside it:
-    then "unexplained" is the process alone or with these effects, half and half.
+    that (its chi-square has p < .001), the residual process is tried beside it: then
+    "unexplained" is the process alone or with these effects, half and half.
 
     Args:
         rivals: The models.
@@ -102,7 +102,7 @@ def trace(
     probabilities = _normalized(log_p)
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
     beside = _effects_of(verdict)
-    if beside and detection.refutes(rivals.evidences[verdict], detection.level):
+    if beside and detection.refutes(rivals.evidences[verdict], REFUTED):
         # What takes up most of the misfit need not take up all of it.
         rest = rivals.evidence(beside, error=UNEXPLAINED).log_evidence
         alone = log_z[UNEXPLAINED]
