@@ -39,7 +39,7 @@ from benchmarks.box_collision.summary import (
     summarize,
 )
 from sbi_active import Campaign, CampaignOptions, MixtureDensity
-from sbi_active.campaign.campaign import METHODS
+from sbi_active.campaign.methods import METHODS, find_method
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 from sbi_active.tasks.box_collision import (  # pyright: ignore
@@ -74,8 +74,6 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
     # by default the declared noise gives both, whatever was learned.
     "learned": (CampaignOptions(num_samples=250, num_scored=500, refine=False), {}),
 }
-#: Of the information in the setting "learned", by method.
-GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 COLUMNS = [
     *["seed", "theta_true", "round", "speed", "is_valid", "x", "y", "z", "eig"],
     *["log_prob_true", "log_p_exact", "log_p_exact_se", "gap", "hpd"],
@@ -103,9 +101,7 @@ def run_trial(
     task: Any, method: str, seed: int, arguments: argparse.Namespace
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
-    options = SETTINGS[arguments.setting][0]
-    if arguments.setting == "learned" and method in GAINS:
-        options = replace(options, estimator=GAINS[method])
+    options = options_of(method, arguments.setting)
     bank = PriorBank(arguments.bank, task) if arguments.bank else None
     campaign = Campaign(
         task.simulator if bank is None else bank.simulator,
@@ -145,6 +141,16 @@ def run_trial(
                 row |= errors(task, Resampled(past), "exact_rep_err")
         rows.append({"seed": seed, "round": index + 1} | row)
     return rows
+
+
+def options_of(method: str, setting: str) -> CampaignOptions:
+    """Return a setting's options, with what is the method's own in them."""
+    options, own = SETTINGS[setting][0], find_method(method).faithful
+    if setting == "paper":
+        return replace(options, **own)
+    if setting == "learned":
+        return replace(options, estimator=own.get("estimator", "posterior"))
+    return options
 
 
 def round_row(task: Any, campaign: Campaign, *, is_last: bool) -> dict[str, object]:
