@@ -176,6 +176,12 @@ def _cholesky(precision: Tensor) -> Tensor:
     factor, info = torch.linalg.cholesky_ex(precision)
     share = 1e-14
     while bool(info.any()):
+        if share > 1.0:  # which suffices for any finite one
+            raise ValueError(
+                "expected a regression of the outcomes with finite weights; got "
+                "infinite or undefined ones; do check the outcomes for numbers beyond "
+                "any use"
+            )
         largest = precision.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
         lifted = precision + torch.diag_embed(
             (share * largest).expand_as(factor[..., 0])

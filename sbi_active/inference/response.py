@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from sbi_active.inference.scaling import (
+    SMALLEST_SCALE,
     Polynomials,
     best_prefix,
     exponents_of,
@@ -88,7 +89,9 @@ class Response(nn.Module):
             log_scale=log_scale,
             num_iterations=3,
         )
-        log_sigma = noise @ gamma
+        # Between rows that lie apart a polynomial may dive to any depth.
+        floor = SMALLEST_SCALE * y.std(0, correction=0).clamp_min(SMALLEST_SCALE)
+        log_sigma = torch.maximum(noise @ gamma, floor.log())
         z = (y - (phi[:, k] * psi[:, j]) @ beta) / log_sigma.exp()
         z = z.clamp(-5.0, 5.0)  # few wild rows must not set the correlations
         correlation = torch.corrcoef(z.T).reshape(y.shape[1], -1).nan_to_num(0.0)

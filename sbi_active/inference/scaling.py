@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 from itertools import combinations_with_replacement
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 __all__ = [
+    "SMALLEST_SCALE",
     "ActionScaling",
     "Polynomials",
     "best_prefix",
@@ -275,7 +277,7 @@ class ActionScaling(nn.Module):
         beta, gamma = fit_location_and_scale(
             design, sizes, noise, sizes[:degrees], (y - mean) / scale, test
         )
-        log_scale = noise @ gamma
+        log_scale = (noise @ gamma).clamp_min(math.log(SMALLEST_SCALE))
         self.register_buffer("mean", mean)
         self.register_buffer("scale", scale)
         self.register_buffer("beta", beta)

@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 
+from sbi_active.inference.baseline import Baseline, _cholesky
+from sbi_active.inference.response import Response
 from sbi_active.inference.scaling import ActionScaling, Polynomials, exponents_of
 
 
@@ -91,3 +93,30 @@ def test_degrees_stop_where_actions_repeat():
     exponents, _ = exponents_of(rows, max_degree=9, max_terms=100)
     assert exponents.max(0).values.tolist() == [1, 2]
     assert len(exponents) == 6
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_isolated_actions_leave_a_finite_noise(seed):
+    g = torch.Generator().manual_seed(seed)
+    action = torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]).repeat(100)
+    # A few rows far from the others: between, the noise's polynomial is free to dive.
+    far = torch.tensor([3.5, 3.5, 3.5, 5.5, 10.0])
+    action = torch.cat([action, far])[:, None].double()
+    u = torch.randn(len(action), 3, generator=g, dtype=torch.float64)
+    e = torch.randn(len(action), 3, generator=g, dtype=torch.float64)
+    moved = (action - 1.5).clamp_min(0.0)  # slow ones move nothing
+    x = moved * (1 + 0.3 * u[:, :1] + 0.1 * u[:, 1:2] ** 2) + 0.005 * e[:, :1]
+    y = torch.cat([x, e[:, 1:]], 1)
+    y = (y - y.mean(0)) / y.std(0)
+    response = Response(u, y, action, kind="linear")
+    assert float(response.log_low.min()) > -20
+    everywhere = torch.linspace(0.0, 10.0, 101, dtype=torch.float64)[:, None]
+    assert all(part.isfinite().all() for part in response.weights(everywhere))
+    frames = Baseline(u, y, action, kind="linear")(y, action)
+    assert all(part.isfinite().all() for part in frames)
+
+
+def test_a_precision_that_is_not_finite_is_an_error():
+    precision = torch.tensor([[[[1.0, 0.0], [0.0, torch.nan]]]], dtype=torch.float64)
+    with pytest.raises(ValueError, match="expected a regression of the outcomes"):
+        _cholesky(precision)
