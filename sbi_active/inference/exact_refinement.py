@@ -30,6 +30,7 @@ Array = NDArray[Any]
 
 USABLE = 15.0  # effective draws, below which the learned likelihood is kept
 COARSE = 60.0  # effective draws, below which a warning is due
+ROUGH = 3  # times the budget: what jumps needs more simulations than a regression
 NUM_CHECKED = 200  # draws that tail probabilities rest on
 NUM_REPEATS = 50  # of the noise a draw
 
@@ -100,7 +101,7 @@ def refine_exactly(
         first: Numbers of draws and proposals to begin with, where there is no pool.
         histories: Simulated before, for the record.
         pool: Draws of the first of these trials.
-        num_histories: Simulations a trial to spend.
+        num_histories: A third of the simulations a trial to spend at most.
         defensive: Share of the prior in the belief.
         seed: Of everything random here.
     """
@@ -113,7 +114,7 @@ def refine_exactly(
         first=first,
         base=PriorProposal(coordinates),
         past=pool,
-        num_simulations=num_histories * len(likelihood),
+        num_simulations=ROUGH * num_histories * len(likelihood),
         num_draws=max(num_histories // 6, 100),
     )
     if pool.effective_sample_size < USABLE:

@@ -10,7 +10,9 @@ last proposals alone, each weighted under its own, fixed before it was drawn fro
     \hat Z = \frac1n \sum_i w_i, \qquad E \hat Z = Z,
 
 with L simulated and so exact. Nothing is smooth in it, and it takes a jump of the
-response as it is.
+response as it is. Half of every proposal is wide, around draws by a power of the whole
+likelihood: what lies between the peaks that were found counts, or shows as few
+effective draws, and does not just go missing.
 
 References:
     Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012 (adaptive multiple importance
@@ -30,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from sbi_active.inference.coordinates import PriorCoordinates
-from sbi_active.inference.kernels import KernelProposal
+from sbi_active.inference.kernels import EitherProposal, KernelProposal
 from sbi_active.inference.population import Proposal
 from sbi_active.inference.simulated_likelihood import SimulatedLikelihood
 
@@ -40,6 +42,7 @@ Array = NDArray[Any]
 
 NEGLIGIBLE = 25.0  # nats below the best draw, beyond which a draw is given up
 FEWEST = 60.0  # effective draws, below which the likelihood is tempered
+BROAD = 150.0  # effective draws that shape the wide half of a proposal
 ENOUGH = 200.0  # effective draws that end it
 MAX_STAGES = 40
 
@@ -221,7 +224,10 @@ def importance_sample(
             reached = power
         log_weight = pool.log_mixture_weight - (1 - power) * log_new
         weight = np.exp(log_weight - np.asarray(logsumexp(log_weight)))
-        kernels = KernelProposal.around(pool.z, weight, base, rng)
+        kernels = EitherProposal(
+            KernelProposal.around(pool.z, weight, base, rng),
+            KernelProposal.around(pool.z, _flattened(pool), base, rng),
+        )
         floor = float(pool.log_likelihood.max()) - NEGLIGIBLE / power
         size = len(pool.z)
         pool.add(kernels, num_draws, likelihood, coordinates, rng, floor)
@@ -231,9 +237,22 @@ def importance_sample(
     return pool
 
 
-def _largest_power(log_rest: Array, log_new: Array) -> float:
+def _flattened(pool: WeightedPool) -> Array:
+    """Return weights of a power of the whole likelihood that leaves many draws.
+
+    A rough likelihood has peaks between those that were found. Proposals around these
+    alone would be dense where draws are and nowhere else, and what they miss would
+    show in no effective sample size.
+    """
+    log_rest = pool.log_prior - pool.log_mixture
+    power = _largest_power(log_rest, pool.log_likelihood, needed=BROAD)
+    log_weight = log_rest + power * pool.log_likelihood
+    return np.exp(log_weight - np.asarray(logsumexp(log_weight)))
+
+
+def _largest_power(log_rest: Array, log_new: Array, needed: float = FEWEST) -> float:
     """Return the largest power of a likelihood that leaves enough draws effective."""
-    needed = min(FEWEST, 0.5 * _effective(log_rest))
+    needed = min(needed, 0.5 * _effective(log_rest))
 
     def suffices(power: float) -> bool:
         return _effective(log_rest + power * log_new) >= needed

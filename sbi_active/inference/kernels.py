@@ -11,7 +11,7 @@ from scipy.special import gammaln, logsumexp
 
 from sbi_active.inference.population import Proposal
 
-__all__ = ["KernelProposal"]
+__all__ = ["EitherProposal", "KernelProposal"]
 
 Array = NDArray[Any]
 
@@ -96,3 +96,25 @@ class KernelProposal:
         tail = 0.5 * (FREEDOM + d) * np.log1p((step**2).sum(-1) / FREEDOM)
         total = logsumexp(constant - log_volume - tail, axis=1)
         return np.asarray(total) - np.log(len(self.location))
+
+
+@dataclass(frozen=True)
+class EitherProposal:
+    """Two proposals, each as likely.
+
+    Attributes:
+        first: One of them.
+        second: The other.
+    """
+
+    first: Proposal
+    second: Proposal
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        num = int(rng.binomial(num_samples, 0.5))
+        parts = self.first.sample(num, rng), self.second.sample(num_samples - num, rng)
+        return np.concatenate(parts)
+
+    def log_prob(self, z: Array) -> Array:
+        both = np.logaddexp(self.first.log_prob(z), self.second.log_prob(z))
+        return both - np.log(2.0)

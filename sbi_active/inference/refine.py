@@ -63,6 +63,7 @@ class Refinement:
             a parameter set at which each executed action is simulated. Fewer are used
             where the surrogate is good sooner. A trial that had a measurement is
             simulated again, up to 16 times, where by chance simulations have none.
+            A simulated likelihood may take three times as many.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide

@@ -14,7 +14,7 @@ from torch import Tensor
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.exact_belief import ExactBelief
 from sbi_active.inference.importance import importance_sample
-from sbi_active.inference.kernels import KernelProposal
+from sbi_active.inference.kernels import EitherProposal, KernelProposal
 from sbi_active.inference.refine import Refinement, refine
 from sbi_active.inference.refined_belief import RefinedBelief
 from sbi_active.inference.regions import PriorProposal
@@ -93,11 +93,15 @@ def sampled(model: SimulatorModel, x: Tensor, count: int, seed: int = 0, past=No
     return likelihood, pool
 
 
-def test_kernels_are_normalized_and_match_their_draws():
+@pytest.mark.parametrize("either", [False, True])
+def test_kernels_are_normalized_and_match_their_draws(either):
     rng = np.random.default_rng(0)
     base = PriorProposal(PriorCoordinates(BOX, rng))
     z = 0.2 * rng.standard_normal((300, 2)) @ np.array([[1.0, 0.9], [0.0, 0.1]])
     kernels = KernelProposal.around(z, np.full(300, 1 / 300), base, rng)
+    if either:
+        wide = KernelProposal.around(4 * z, np.full(300, 1 / 300), base, rng)
+        kernels = EitherProposal(kernels, wide)
     draws = kernels.sample(10_000, rng)
     wide = rng.uniform(-3, 3, (40_000, 2))  # the Student tails reach beyond the box
     value = 36 * np.exp(kernels.log_prob(wide))
@@ -198,7 +202,11 @@ def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):
     second = refine(model, BOX, ACTION, x, past=first.histories, settings=FEW, seed=1)
     assert isinstance(second, ExactBelief)
     assert second.diagnostics["trustworthy"], second.diagnostics["warnings"]
-    assert second.diagnostics["num_stages"] > first.diagnostics["num_stages"]
+    assert isinstance(first, ExactBelief)
+    kept = first.histories.pool.proposals  # pyright: ignore
+    every = second.histories.pool.proposals  # pyright: ignore
+    assert all(a[1] is b[1] for a, b in zip(kept, every, strict=False))
+    assert len(every) >= len(kept) > 2
     exact = grid_evidence(model, ACTION, x)
     assert second.diagnostics["log_evidence"] == pytest.approx(exact, abs=0.5)
 
