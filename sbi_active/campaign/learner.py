@@ -36,7 +36,8 @@ class Learner:
 
     Attributes:
         x_shape: Of an outcome.
-        simulations: Those that the last training was on; None before any.
+        simulations: Those that the last training was on, where the design is to rest on
+            them; else None.
 
     Raises:
         ValueError: If the prior has no support, or the simulator is deterministic.
@@ -174,7 +175,8 @@ class Learner:
                     **options.engine,
                 )
                 known = rows.without_missing()
-                self.simulations = known
+                if options.design_on == "training":
+                    self.simulations = known
             with state.stage(index, "training"):
                 self._inference.append_simulations(
                     known.theta, known.x, action=known.action, belief=self.belief

@@ -133,7 +133,6 @@ class Planner:
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
         model = learner.trained(index)
-        rows = learner.simulations if options.design_on == "training" else None
         design = self._select(
             index,
             learner,
@@ -141,7 +140,7 @@ class Planner:
             model,
             target=own,
             cost=self._limits.cost,
-            simulations=rows,
+            simulations=learner.simulations,
             **limits,
         )
         if about_model is not None and _utility(about_model) > _utility(design):
