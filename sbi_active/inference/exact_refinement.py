@@ -28,7 +28,7 @@ __all__ = ["ExactRecord", "refine_exactly"]
 
 Array = NDArray[Any]
 
-USABLE = 15.0  # effective draws, below which the learned likelihood is kept
+USABLE = 5.0  # effective draws, below which the learned likelihood is kept
 COARSE = 60.0  # effective draws, below which a warning is due
 ROUGH = 3  # times the budget: what jumps needs more simulations than a regression
 NUM_CHECKED = 200  # draws that tail probabilities rest on

@@ -96,12 +96,13 @@ def test_calibration_needs_both_kinds():
 
 def test_the_right_formula_and_an_alias_are_told_apart():
     rows = [
-        row(0, "quadratic", "unexplained", 90.0, formula="xi^2"),
-        row(1, "quadratic", "unexplained", 90.0, formula="|xi|"),
-        row(2, "drift", "quadratic", 90.0),
+        row(0, "quadratic", "unexplained", 90.0, formula="xi^2", support="80"),
+        row(1, "quadratic", "unexplained", 90.0, formula="|xi|", support="80"),
+        row(2, "drift", "quadratic", 90.0, support="9"),
     ]
     text = table("open", {"removed": rows})
     assert "says so (lambda > 25) 0.667 (2/3)" in text
+    assert "of those declared leave lambda > 25 1.000 (2/2)" in text
     assert "names the formula (lambda > 25) 0.500 (1/2)" in text
     near = [row(0, "power", "quadratic", 30.0), row(1, "sine", "quadratic", 30.0)]
     text = table("open", {"outside": near})
