@@ -20,6 +20,7 @@ __all__ = [
     "warn_missing",
 ]
 
+MANY = 1_024  # draws of a space without end, of which the permitted are candidates
 SAME = 0.01  # of the width of a box, within which two actions are the same
 
 
@@ -78,6 +79,25 @@ class Permission:
         out = int((~inside).sum())
         note = f"{out} of {len(values)} candidates not permitted"
         return values[inside], (note,) if out else ()
+
+    def drawn(self, seed: int | None) -> Tensor:
+        """Return the permitted among draws of a space without end.
+
+        Args:
+            seed: Of the draws; None goes on with torch's global generator.
+
+        Raises:
+            ValueError: If none is.
+        """
+        drawn = self.actions.sample((MANY,), seed=seed)
+        drawn = drawn[self(drawn)]
+        if len(drawn) == 0:
+            raise ValueError(
+                f"expected a constraint that permits a part of {self.actions!r}; got "
+                f"none of {MANY} actions; do narrow the space to about what is "
+                "permitted"
+            )
+        return drawn
 
     def _tolerance(self) -> Tensor:
         parts = []

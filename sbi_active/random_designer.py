@@ -24,8 +24,7 @@ from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 
 __all__ = ["RandomDesigner"]
 
-MANY = 1_024  # draws of a space without end, of which the permitted are candidates
-FEW = 32  # of these that are simulated for their share of measurements
+FEW = 32  # draws that are simulated for their share of measurements
 
 
 class RandomDesigner:
@@ -99,7 +98,10 @@ class RandomDesigner:
         )
         candidates, notes = permission.listed()
         if candidates is None:
-            candidates = self._draw(permission, seed, few=min_probability_valid > 0)
+            own = None if seed is None else derive_seed(seed, "candidates")
+            candidates = permission.drawn(own)[
+                : FEW if min_probability_valid > 0 else 1
+            ]
         num = len(candidates)
         unknown = torch.full((num,), torch.nan, dtype=torch.float64)
         valid, num_simulations, num_missing = unknown, 0, 0
@@ -139,19 +141,6 @@ class RandomDesigner:
             num_missing=num_missing,
             notes=(*excluded_note(eligible, min_probability_valid), *notes),
         )
-
-    def _draw(self, permission: Permission, seed: int | None, *, few: bool) -> Tensor:
-        """Return permitted actions of a space without end, one or a few."""
-        own = None if seed is None else derive_seed(seed, "candidates")
-        drawn = self.actions.sample((MANY,), seed=own)
-        drawn = drawn[permission(drawn)]
-        if len(drawn) == 0:
-            raise ValueError(
-                f"expected a constraint that permits a part of {self.actions!r}; got "
-                f"none of {MANY} actions; do narrow the space to about what is "
-                "permitted"
-            )
-        return drawn[: FEW if few else 1]
 
     def _outcomes(
         self,

@@ -101,18 +101,18 @@ def trace(
     log_p = {name: log_prior[name] + share * log_z[name] for name in log_z}
     probabilities = _normalized(log_p)
     verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
-    beside = _effects_of(verdict)
-    if beside and detection.refutes(rivals.evidences[verdict], REFUTED):
+    beside: tuple[str, ...] = ()
+    found = _effects_of(verdict)
+    if found and detection.refutes(rivals.evidences[verdict], REFUTED):
         # What takes up most of the misfit need not take up all of it.
-        rest = rivals.evidence(beside, error=UNEXPLAINED).log_evidence
+        rest = rivals.evidence(found, error=UNEXPLAINED).log_evidence
         alone = log_z[UNEXPLAINED]
         log_z[UNEXPLAINED] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
         log_p[UNEXPLAINED] = log_prior[UNEXPLAINED] + share * log_z[UNEXPLAINED]
         probabilities = _normalized(log_p)
         verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
-        beside = beside if verdict == UNEXPLAINED and rest > alone else ()
-    else:
-        beside = ()
+        if verdict == UNEXPLAINED and rest > alone:
+            beside = found
     near = equivalent_effects(rivals, None) if compare else ()
     aliases = ()
     if compare and detection.alarm:
