@@ -25,10 +25,12 @@ from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_
 
 __all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]
 
-Kind = Literal["clean", "library", "outside", "removed", "pair"]
+Kind = Literal["clean", "library", "outside", "removed", "inexpressible", "pair"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 HELD_OUT = 8  # trials that no step may fit or choose by
 MISMATCH = 3.0  # residual of a number that is there in one outcome alone
+#: Lambda that a model must leave for data to tell that it lacks something.
+SUPPORTED = 25.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +121,21 @@ class Truth:
         sets = chain(combinations(declared, 1), combinations(declared, 2))
         return min(self._left_by(effects) for effects in sets)
 
+    def without_aliases(self, declared: Sequence[Effect]) -> list[Effect]:
+        """Return the declared effects less those that could stand in for the truth.
+
+        While one or two of them leave too little for data to tell, the one of these
+        that alone leaves less is taken out.
+        """
+        kept = [*declared]
+        alone = {effect.name: self._left_by((effect,)) for effect in declared}
+        kept = [effect for effect in declared if alone[effect.name] > SUPPORTED]
+        left = {pair: self._left_by(pair) for pair in combinations(kept, 2)}
+        for pair in sorted(left, key=left.__getitem__):
+            if left[pair] <= SUPPORTED and all(effect in kept for effect in pair):
+                kept.remove(min(pair, key=lambda effect: alone[effect.name]))
+        return kept
+
     def residual(
         self, parameters: Tensor, effects: Sequence[Effect], target: Tensor
     ) -> Tensor:
@@ -202,8 +219,9 @@ def draw_case(
     Args:
         world: Where.
         kind: "clean", "library", "outside", "removed" (of the library, and taken from
-            what is declared together with its equivalents) or "pair" (two of the
-            library that are not equivalent).
+            what is declared together with its equivalents), "inexpressible" (the same
+            case, where every near-alias is taken out as well, so that no one or two of
+            those declared fit) or "pair" (two of the library that are not equivalent).
         number: Of the case; the same number is the same truth for any number of trials.
         num_trials: Trials to fit.
         num_held_out: Further trials, held out.
@@ -217,10 +235,11 @@ def draw_case(
     """
     if kind not in KINDS:
         raise ValueError(f"expected a kind among {KINDS}; got {kind!r}; do choose one")
-    seed = derive_seed(number, "case", world.name, kind)
+    drawn = "removed" if kind == "inexpressible" else kind
+    seed = derive_seed(number, "case", world.name, drawn)
     with forked_generators(seed):
         theta = world.prior.sample((1,))
-        effects = _draw_effects(world, kind, number)
+        effects = _draw_effects(world, drawn, number)
         strengths = tuple(effect.prior.sample((1,)) for effect in effects)
         which = int(torch.randint(len(world.correlations), (1,)))
         action = world.actions.sample((64 + num_held_out,))
@@ -237,9 +256,11 @@ def draw_case(
         seed=derive_seed(seed, "noise"),
     )
     library = world.library(prior_scale)
-    if kind == "removed":
+    if drawn == "removed":
         gone = world.equivalent(effects[0].name)
         library = [effect for effect in library if effect.name not in gone]
+    if kind == "inexpressible" and truth.non_centrality > SUPPORTED:
+        library = truth.without_aliases(library)
     problem = Problem(
         model=world.model,
         prior=world.prior,

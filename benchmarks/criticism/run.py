@@ -11,7 +11,8 @@
     python -m benchmarks.criticism.run --table loop --world A --summary
 
 loop: false alarms, power, tracing, calibration, error before and after. open: the
-effect was removed from the library, or never stood in it. pairs: two effects. active:
+effect was removed from the library, or removed with all that could stand in for it, or
+never stood in it. pairs: two effects. active:
 actions chosen by the loop beside random ones. priors: the scales of the effects' priors
 are wrong by a factor. correlation: false alarms and power by the correlation of the
 errors, as the loop does by default and with the errors taken as independent.
@@ -38,7 +39,7 @@ RESULTS = Path(__file__).parent / "results"
 #: Which kinds of cases a table is made of.
 TABLES: dict[str, tuple[str, ...]] = {
     "loop": ("clean", "library"),
-    "open": ("removed", "outside"),
+    "open": ("removed", "inexpressible", "outside"),
     "pairs": ("pair",),
     "active": ("library",),
     "priors": ("clean", "library"),

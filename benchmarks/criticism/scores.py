@@ -87,7 +87,7 @@ def _support(case: Case) -> float | str:
     """Return what data say against less than both effects, or against the declared."""
     if len(case.truth.effects) > 1:
         return case.truth.support
-    if case.truth.kind == "removed":
+    if case.truth.kind in ("removed", "inexpressible") and case.problem.effects:
         return case.truth.left_by_any(case.problem.effects)
     return ""
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from benchmarks.criticism.active import DETECTABLE
+from benchmarks.criticism.cases import SUPPORTED
 from benchmarks.criticism.curves import SCORES, Curves
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.intervals import brier_score, rate, reliability
@@ -18,9 +19,6 @@ __all__ = ["summary"]
 Row = Mapping[str, str]
 #: Of lambda, residual sum of squares in units of the noise.
 BINS = ((0.0, 10.0), (10.0, 25.0), (25.0, np.inf))
-#: Lambda without either effect of a pair, and with the best that is left of a library
-#: of which the true one was removed, above which data can tell.
-SUPPORTED = 25.0
 
 
 def summary(
@@ -312,6 +310,7 @@ SUMMARIES: dict[tuple[str, str], Callable[[World, Sequence[Row]], list[str]]] = 
     **{(table, "clean"): _clean for table in ("loop", "priors", "correlation")},
     **{(table, "library"): _library for table in ("loop", "priors", "correlation")},
     ("open", "removed"): _removed,
+    ("open", "inexpressible"): _removed,
     ("open", "outside"): _outside,
     ("pairs", "pair"): _pair,
     ("active", "library"): _active,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.criticism.cases import Problem, draw_case, extend, respond
+from benchmarks.criticism.cases import SUPPORTED, Problem, draw_case, extend, respond
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.intervals import brier_score, reliability, wilson
 from benchmarks.criticism.worlds import get_world
@@ -185,6 +185,18 @@ def test_what_is_removed_is_gone_with_its_equivalents():
         assert left == {e.name for e in world.effects} - gone
     assert len(seen) > 3
     assert "gain" not in seen
+
+
+def test_what_cannot_be_expressed_has_no_stand_in_left():
+    world = get_world("B")
+    removed = draw_case(world, "removed", 6, num_trials=12)
+    case = draw_case(world, "inexpressible", 6, num_trials=12)
+    assert case.truth.names == removed.truth.names == ("viscous drag",)
+    assert torch.equal(case.problem.trials.x, removed.problem.trials.x)
+    left = {effect.name for effect in case.problem.effects}
+    assert "quadratic drag" in {e.name for e in removed.problem.effects} - left
+    assert removed.truth.left_by_any(removed.problem.effects) < SUPPORTED
+    assert case.truth.left_by_any(case.problem.effects) > SUPPORTED
 
 
 def test_a_case_is_its_number():
