@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, combinations
+from itertools import chain, combinations, count
 from typing import Literal, get_args
 
 import torch
@@ -28,6 +28,8 @@ __all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]
 Kind = Literal["clean", "library", "outside", "removed", "inexpressible", "pair"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 HELD_OUT = 8  # trials that no step may fit or choose by
+#: A truth is drawn again unless so many of its first actions have an outcome.
+NUM_LOOKED, FEWEST_OUTCOMES = 8, 4
 MISMATCH = 3.0  # residual of a number that is there in one outcome alone
 #: Lambda that a model must leave for data to tell that it lacks something.
 SUPPORTED = 25.0
@@ -237,27 +239,18 @@ def draw_case(
         raise ValueError(f"expected a kind among {KINDS}; got {kind!r}; do choose one")
     drawn = "removed" if kind == "inexpressible" else kind
     seed = derive_seed(number, "case", world.name, drawn)
-    with forked_generators(seed):
-        theta = world.prior.sample((1,))
-        effects = _draw_effects(world, drawn, number)
-        strengths = tuple(effect.prior.sample((1,)) for effect in effects)
-        which = int(torch.randint(len(world.correlations), (1,)))
-        action = world.actions.sample((64 + num_held_out,))
-    held_out, spare = action[64:], action[num_trials:64]
-    action = action[:num_trials]
-    truth = Truth(
-        world=world,
-        kind=kind,
-        theta=theta,
-        effects=effects,
-        strengths=strengths,
-        correlation=world.correlations[which],
-        action=action,
-        seed=derive_seed(seed, "noise"),
-    )
+    truth = _draw_truth(world, drawn, number, seed, 64 + num_held_out)
+    for again in count():
+        if len(_some_outcome(truth, truth.action[:NUM_LOOKED])) >= FEWEST_OUTCOMES:
+            break
+        other = derive_seed(seed, "again", again)
+        truth = _draw_truth(world, drawn, number, other, 64 + num_held_out)
+    held_out, spare = truth.action[64:], truth.action[num_trials:64]
+    action = truth.action[:num_trials]
+    truth = replace(truth, kind=kind, action=action)
     library = world.library(prior_scale)
     if drawn == "removed":
-        gone = world.equivalent(effects[0].name)
+        gone = world.equivalent(truth.names[0])
         library = [effect for effect in library if effect.name not in gone]
     if kind == "inexpressible" and truth.non_centrality > SUPPORTED:
         library = truth.without_aliases(library)
@@ -340,19 +333,41 @@ def whiten(error: Tensor, correlation: float) -> Tensor:
     return torch.cat([error[..., :1], fresh / (1 - correlation**2) ** 0.5], -1)
 
 
+def _draw_truth(
+    world: World, kind: Kind, number: int, seed: int, num_actions: int
+) -> Truth:
+    with forked_generators(seed):
+        theta = world.prior.sample((1,))
+        effects = _draw_effects(world, kind, number)
+        strengths = tuple(effect.prior.sample((1,)) for effect in effects)
+        which = int(torch.randint(len(world.correlations), (1,)))
+        action = world.actions.sample((num_actions,))
+    return Truth(
+        world=world,
+        kind=kind,
+        theta=theta,
+        effects=effects,
+        strengths=strengths,
+        correlation=world.correlations[which],
+        action=action,
+        seed=derive_seed(seed, "noise"),
+    )
+
+
 def _with_outcome(truth: Truth, action: Tensor, spare: Tensor) -> Tensor:
     """Return the actions, those without an outcome replaced by spare ones with one."""
-
-    def some(among: Tensor) -> Tensor:
-        index = torch.zeros(len(among), dtype=torch.long)
-        theta = truth.theta.expand(len(among), -1)
-        x, _ = respond(truth.world, theta, among, index, truth.effects, truth.strengths)
-        return among[x.isfinite().flatten(1).all(1)]
-
-    kept = some(action)
+    kept = _some_outcome(truth, action)
     if len(kept) == len(action):
         return action
-    return torch.cat([kept, some(spare)])[: len(action)]
+    return torch.cat([kept, _some_outcome(truth, spare)])[: len(action)]
+
+
+def _some_outcome(truth: Truth, among: Tensor) -> Tensor:
+    """Return the actions that have an outcome."""
+    index = torch.zeros(len(among), dtype=torch.long)
+    theta = truth.theta.expand(len(among), -1)
+    x, _ = respond(truth.world, theta, among, index, truth.effects, truth.strengths)
+    return among[x.isfinite().flatten(1).all(1)]
 
 
 def _draw_effects(world: World, kind: Kind, number: int) -> tuple[Effect, ...]:

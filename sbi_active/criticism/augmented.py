@@ -104,6 +104,7 @@ class AugmentedSimulator(SimulatorModel):
         index: Tensor | None = None,
         times: Tensor | None = None,
         seeds: Tensor | None = None,
+        merge: bool = False,
     ) -> Tensor:
         """Return the output of the simulator's function with some effects switched on.
 
@@ -117,15 +118,17 @@ class AugmentedSimulator(SimulatorModel):
             times: Sample times, shape (k,) or (n, k); None takes the model's.
             seeds: One a row, for a simulator that takes them; None gives each row 0
                 where the noise is declared.
+            merge: Simulate rows once that the simulator would be asked for twice, as
+                where an action was repeated.
 
         Returns:
             Shape (n, *x_shape).
         """
         if self._unchecked and len(theta):
             self._check_null(theta[:NUM_CHECKED], action[:NUM_CHECKED])
-        return self._evaluate(
-            theta, phi, action, self._row_context(action, index, times), seeds
-        )
+        context = self._row_context(action, index, times)
+        merge = merge and self.noise is not None  # a draw is another at each call
+        return self._evaluate(theta, phi, action, context, seeds, merge=merge)
 
     def noise_scale(
         self,
@@ -236,6 +239,8 @@ class AugmentedSimulator(SimulatorModel):
         context: Context,
         seeds: Tensor | None,
         keywords: Mapping[str, Any] | None = None,
+        *,
+        merge: bool = False,
     ) -> Tensor:
         if seeds is None and self.noise is not None:
             seeds = torch.zeros(len(theta), dtype=torch.int64)
@@ -250,10 +255,35 @@ class AugmentedSimulator(SimulatorModel):
             changed.setdefault("times", context.times.expand(len(theta), -1))
         for effect in self._active("dynamics", phi):
             changed = effect.apply(changed, phi[effect.name], commanded, context)
-        x = self.base._run(theta, action, seeds, changed)
+        run = self._run_merged if merge else self.base._run
+        x = run(theta, action, seeds, changed)
         for effect in self._active("observation", phi):
             x = effect.apply(x, phi[effect.name], commanded, context)
         return x
+
+    def _run_merged(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor | None,
+        keywords: dict[str, Any],
+    ) -> Tensor:
+        """Run each distinct row once."""
+        by_row = {
+            k: v
+            for k, v in keywords.items()
+            if torch.is_tensor(v) and v.shape[:1] == theta.shape[:1]
+        }
+        columns = [theta, action, *([] if seeds is None else [seeds]), *by_row.values()]
+        rows = torch.cat([c.reshape(len(theta), -1).double() for c in columns], 1)
+        _, place = torch.unique(rows, dim=0, return_inverse=True)
+        first = torch.full((int(place.max()) + 1,), len(theta), dtype=torch.int64)
+        first = first.scatter_reduce(0, place, torch.arange(len(theta)), "amin")
+        some = {k: v[first] if k in by_row else v for k, v in keywords.items()}
+        x = self.base._run(
+            theta[first], action[first], None if seeds is None else seeds[first], some
+        )
+        return x[place]
 
     def _check_null(self, theta: Tensor, action: Tensor) -> None:
         """Raise where an effect at its null changes x."""

@@ -119,6 +119,14 @@ def _of_errors(
                 if which
             )
         )
+    if own.roughness is not None:
+        rough = own.roughness[own.roughness > 0]
+        yield (
+            "the simulator jumps: where parameters change within their posterior, x "
+            f"strays by {rough.min():.2g} to {rough.max():.2g} from a smooth function "
+            "of them, which counts as an error of its own beside the noise, so that "
+            "less is concluded than the trials may hold"
+        )
     assumed_independent = own.times is None or own.correlation == 0.0
     if assumed_independent and own.x.shape[1] >= LONG:
         correlation, num = _neighbors(own.refitted)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -168,6 +168,11 @@ class NoiseGrid(ErrorModel):
         product = np.multiply.outer(self.scales, scales).ravel()
         weight = np.add.outer(self.log_scale_prior, log_weights).ravel()
         return NoiseGrid(self.cells, scales=product, log_weights=weight)
+
+    def with_extra(self, sd: Array) -> NoiseGrid:
+        """Return this noise with an independent error of deviation sd, shape (N,)."""
+        cells = [replace(cell, sd=np.hypot(cell.sd, sd)) for cell in self.cells]
+        return NoiseGrid(cells, scales=self.scales, log_weights=self.log_scale_prior)
 
     def _typical(self) -> tuple[NoiseCell, float]:
         middle = np.argsort(self.scales)[len(self.scales) // 2]

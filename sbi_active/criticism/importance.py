@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +20,9 @@ Array = NDArray[Any]
 DEGREES_OF_FREEDOM = 5
 #: Particles a round, rounds at most, and the effective number that ends them.
 ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 100.0
-#: Effective particles below which a round missed the shape, rounds after which that is
-#: looked at, and points from which the shape is looked for again.
-MISSED, LOOKS, NUM_AGAIN = 15.0, (0, 7), 48
+#: Effective particles below which a round missed the shape, and rounds after which that
+#: is looked at.
+MISSED, LOOKS = 15.0, (0, 7)
 #: Share of the particles that a later round spreads over all of its components, and
 #: the weight of the component that has the sample's own moments.
 DEFENSIVE, OVERALL = 0.5, 0.3
@@ -105,23 +105,26 @@ def importance_sample(
     proposal: TMixture,
     *,
     rng: np.random.Generator,
-    local: Callable[[Array | None], TMixture] | None = None,
+    local: Callable[[ImportanceSample, int], TMixture] | None = None,
+    looks: Container[int] = LOOKS,
+    missed: float = MISSED,
     enough: float = ENOUGH,
 ) -> ImportanceSample:
     r"""Return the evidence :math:`Z = E_q[p(x | z) p(z) / q(z)]`.
 
-    Where the first round leaves few effective particles, the next proposes from
-    ``local``, and where these stay few, so does a later one; further ones propose from
-    the same with the weights of its components adapted, and with a component of the
-    sample's own moments. All rounds count, each particle weighted by the mixture of all
-    their proposals.
+    Where a round that is looked at leaves few effective particles, the next proposes
+    from ``local``; others propose from the same as before with the weights of its
+    components adapted, and with a component of the sample's own moments. All rounds
+    count, each particle weighted by the mixture of all their proposals.
 
     Args:
         rival: The model.
         proposal: The first round's.
         rng: Source of the draws.
-        local: Returns such a round's, given points of the posterior so far, shape
-            (k, dim), or None before there are any; None repeats the first, adapted.
+        local: Returns such a round's proposal, given the sample so far and the round's
+            number; None adapts the first.
+        looks: Rounds after which the effective particles are looked at.
+        missed: Number of them below which the proposal missed the shape.
         enough: Effective sample size that ends the rounds.
 
     References:
@@ -146,10 +149,9 @@ def importance_sample(
         sample = _weighted(particles, targets, log_q - np.log(len(proposals)))
         if sample.effective_sample_size >= enough:
             break
-        missed = sample.effective_sample_size < MISSED
-        if local is not None and missed and i in LOOKS:
-            points = None if i == 0 else np.unique(sample.draws(NUM_AGAIN, rng), axis=0)
-            proposal = basis = local(points)
+        few = sample.effective_sample_size < missed
+        if local is not None and few and i in looks:
+            proposal = basis = local(sample, i)
         else:
             proposal = _adapted(sample, basis)
     return sample

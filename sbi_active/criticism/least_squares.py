@@ -13,7 +13,7 @@ from sbi_active.criticism.importance import INFLATION, TMixture
 from sbi_active.criticism.rival import Rival
 from sbi_active.seeding import derive_seed
 
-__all__ = ["Modes", "along_ridges", "find_modes", "probe_step"]
+__all__ = ["Modes", "along_ridges", "find_modes", "local_proposal", "probe_step"]
 
 Array = NDArray[Any]
 
@@ -182,6 +182,11 @@ def along_ridges(
     num_open = max(int(rival.searched.sum() - known.sum()), 1)
     width = min(RANGE * NUM_POINTS ** (-1 / num_open), 1.0)
     return TMixture(u, _factors(rival, u, modes.whiten, step, width))
+
+
+def local_proposal(rival: Rival, u: Array, whiten: Whitener, step: float) -> TMixture:
+    """Return t distributions at points, shape (k, dim), as narrow as the data say."""
+    return TMixture(u, _factors(rival, u, whiten, step, 1.0))
 
 
 def _floor(rival: Rival) -> Array:

@@ -16,7 +16,8 @@ __all__ = ["find_residuals"]
 
 Array = NDArray[Any]
 
-NUM_PRIOR = 2_000
+#: Draws of the prior, and of the posterior; a simulator that jumps is seldom cheap.
+NUM_PRIOR, NUM_ROUGH = 2_000, 500
 
 
 def find_residuals(
@@ -55,6 +56,11 @@ def find_residuals(
         correlation=_correlation(rivals, prediction),
         noise=kind,
         probability_valid=prediction.probability_valid.mean(0),
+        roughness=(
+            _filled(rivals.roughness, m.position, x.shape)
+            if rivals.roughness.any()
+            else None
+        ),
     )
 
 
@@ -81,8 +87,9 @@ def _prequential(
     rival = rivals.rivals[rivals.evidence(names, error=error).name]
     evidence = rivals.evidences[rival.name]
     rng = np.random.default_rng(rivals.seed)
-    prior = rival.coordinates.sample(NUM_PRIOR, seed=rivals.seed)
-    u = np.concatenate([prior, rivals.samples[rival.name].draws(NUM_PRIOR, rng)])
+    num = NUM_PRIOR if rivals.is_smooth else NUM_ROUGH
+    prior = rival.coordinates.sample(num, seed=rivals.seed)
+    u = np.concatenate([prior, rivals.samples[rival.name].draws(num, rng)])
     residual, log_scale, _ = rival.residual(u, penalized=False)
     # The process is left out: what is asked is how the simulator predicts.
     noise = rivals.noise

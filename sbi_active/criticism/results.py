@@ -45,6 +45,9 @@ class Residuals:
             "stochastic" (the simulator is the draw).
         probability_valid: That each trial has a measurement, shape (t,); None where it
             was not computed.
+        roughness: Deviation of the simulator, which jumps, from any smooth function of
+            its parameters, shape of x; it counts as noise here. None where it is
+            smooth.
     """
 
     action: Array
@@ -58,6 +61,7 @@ class Residuals:
     correlation: float
     noise: Literal["declared", "estimated", "stochastic"]
     probability_valid: Array | None = None
+    roughness: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

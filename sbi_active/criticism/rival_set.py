@@ -15,10 +15,15 @@ from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.errors import ErrorModel
 from sbi_active.criticism.importance import (
     ENOUGH,
+    LOOKS,
+    MAX_ROUNDS,
+    MISSED,
     ImportanceSample,
+    TMixture,
     importance_sample,
 )
 from sbi_active.criticism.least_squares import (
+    Modes,
     along_ridges,
     find_modes,
     probe_step,
@@ -28,6 +33,7 @@ from sbi_active.criticism.outcomes import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
 from sbi_active.criticism.rival import Rival
+from sbi_active.criticism.roughness import by_regression, local_roughness
 from sbi_active.criticism.scales import SearchCoordinates
 from sbi_active.criticism.tempering import temper
 from sbi_active.criticism.trial_simulator import TrialSimulator
@@ -52,8 +58,11 @@ UNLIKELY = 10.0
 #: Particles and moves of the first cross-check by tempering, and the standard errors
 #: by which it may exceed the evidence before the full number runs.
 FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
-#: Factor on the covariance at a mode of a simulator that jumps.
-ROUGH = 4.0
+#: Points of a sample near which the shape of a posterior is looked for again.
+NUM_AGAIN = 48
+#: Factor on the covariance at a mode of a simulator that jumps, and the effective
+#: sample size that is enough there.
+ROUGH, ENOUGH_ROUGH = 4.0, 50.0
 NUM_SPREAD = 200
 #: Draws of largest weight, among which the best fit is sought.
 NUM_TOP = 20
@@ -82,6 +91,8 @@ class RivalSet:
         can_fail: Whether a trial, or one of the prior predictive, has no outcome.
         step: Of finite differences.
         is_smooth: Whether derivatives mean anything.
+        roughness: Deviation of what no smooth function of the parameters follows, which
+            ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         evidences: Of the rivals that were asked for, by name.
         samples: Weighted samples behind them.
     """
@@ -118,6 +129,15 @@ class RivalSet:
         self.step, self.is_smooth = probe_step(
             self.rival(()), seed=derive_seed(seed, "probe")
         )
+        self.roughness = np.zeros(len(self.measurements))
+        if not self.is_smooth and not self.simulator.is_stochastic:
+            self.roughness = local_roughness(
+                self.rival(()),
+                self.noise,
+                step=self.step,
+                seed=derive_seed(seed, "roughness"),
+            )
+            self.noise = self.noise.with_extra(self.roughness)
         self.evidences: dict[str, Evidence] = {}
         self.samples: dict[str, ImportanceSample] = {}
         self.rivals: dict[str, Rival] = {}
@@ -249,15 +269,13 @@ class RivalSet:
         modes = find_modes(rival, step=self.step, seed=seed, near=near, widened=widened)
         rng = np.random.default_rng(seed)
         behind = self._behind(rival, modes.u)
-        hopeless = behind > HOPELESS
+        enough = ENOUGH if self.is_smooth else ENOUGH_ROUGH
         sample = importance_sample(
             rival,
             modes.proposal,
             rng=rng,
-            local=lambda points: along_ridges(
-                rival, modes, step=self.step, rng=rng, points=points
-            ),
-            enough=1.0 if hopeless else ENOUGH,
+            enough=1.0 if behind > HOPELESS else enough,
+            **self._local(rival, modes, rng),
         )
         enough = TOO_FEW if behind < UNLIKELY else 0.0
         if sample.effective_sample_size >= enough:
@@ -268,6 +286,27 @@ class RivalSet:
             # Particles that lost a ridge do not find it again.
             return sample, "least squares"
         return other, "tempering"
+
+    def _local(
+        self, rival: Rival, modes: Modes, rng: np.random.Generator
+    ) -> dict[str, Any]:
+        """Return how importance sampling finds a better proposal, and when."""
+
+        def ridges(sample: ImportanceSample, number: int) -> TMixture:
+            points = None
+            if number > 0:
+                points = np.unique(sample.draws(NUM_AGAIN, rng), axis=0)
+            return along_ridges(rival, modes, step=self.step, rng=rng, points=points)
+
+        def regression(sample: ImportanceSample, number: int) -> TMixture:
+            # No quadratic function follows a ridge that bends.
+            if number == LOOKS[-1] and sample.effective_sample_size < MISSED:
+                return ridges(sample, number)
+            return by_regression(rival, sample, rng)
+
+        if self.is_smooth:
+            return {"local": ridges}
+        return {"local": regression, "looks": range(MAX_ROUNDS), "missed": np.inf}
 
     def _behind(self, rival: Rival, modes: Array) -> float:
         """Return how far even the largest likelihood is below a known evidence, nats.

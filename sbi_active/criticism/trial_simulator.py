@@ -42,7 +42,8 @@ class TrialSimulator:
 
     Attributes:
         measurements: What is predicted.
-        num_simulations: Trials simulated so far.
+        num_simulations: Trials predicted so far; a deterministic simulator runs once
+            for those with the same inputs.
         failed: Whether any of them had no outcome.
         is_stochastic: Whether the simulator is the draw.
 
@@ -66,6 +67,7 @@ class TrialSimulator:
         self.num_simulations, self.failed = 0, False
         self._dtype = torch.float64
         self._known = SimulatedRows(KEPT)
+        self._has_repeats = len(torch.unique(trials.action, dim=0)) < len(trials)
         # The scale of a declared noise is no part of the mean.
         self._of_noise = {
             e.name
@@ -167,6 +169,7 @@ class TrialSimulator:
                 index=index,
                 times=times,
                 seeds=seeds,
+                merge=self._has_repeats,
             )
 
         if self._dtype == torch.float64:

@@ -37,6 +37,13 @@ def test_most_trials_stay_on_the_table(world):
     assert 0.6 < valid.double().mean() < 1.0
 
 
+def test_a_case_whose_cube_is_lost_at_most_speeds_is_drawn_again(world):
+    case = draw_case(world, "library", 1)  # of the first draw one trial is valid
+    assert int(case.problem.trials.fit.valid.sum()) >= 4
+    longer = draw_case(world, "library", 1, num_trials=12)
+    assert torch.equal(longer.truth.theta, case.truth.theta)
+
+
 def test_a_missing_outcome_has_a_finite_residual(world):
     truth = draw_case(world, "clean", 0).truth
     light = torch.tensor([[0.0, 0.0, 0.05]]).double()

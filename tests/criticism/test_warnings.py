@@ -30,6 +30,12 @@ def staircase(theta, action):
     return torch.round(3e3 * curve(theta, action)) / 3e3
 
 
+def rattle(theta, action, cubic=0.0):
+    """What a change of theta by a millionth changes by more than the noise."""
+    phase = 1e6 * theta.sum(1)[:, None] * (action + 3)
+    return curve(theta, action, cubic) + 0.3 * torch.sin(phase)
+
+
 def both(action):
     return 0.8 - 0.4 * action**3
 
@@ -202,6 +208,10 @@ CASES: dict[str, tuple[Callable[[], Report], Callable[[], Report]]] = {
     ),
     "two estimates of the bare model's evidence differ": (
         replace(usual, fn=staircase, noise=1e-3, effects=(bias(),)).report,
+        usual.report,
+    ),
+    "the simulator jumps": (
+        replace(usual, fn=rattle).report,
         usual.report,
     ),
     "does not extrapolate": (

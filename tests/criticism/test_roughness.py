@@ -1,0 +1,124 @@
+"""A simulator that jumps: what its jumps count as, and evidence beside them."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import AugmentedSimulator, Effect, Trials
+from sbi_active.criticism.errors import log_sum_exp
+from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.trial_simulator import TrialSimulator
+
+NOISE, JUMP = 0.1, 0.2
+PRIOR = BoxUniform(-2 * torch.ones(2), 2 * torch.ones(2))
+ACTION = torch.tensor([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])[:, None]
+BIAS = Effect(
+    "bias",
+    hook="observation",
+    prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi,
+)
+DRIFT = Effect(
+    "drift",
+    hook="action",
+    prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+    null=0.0,
+    apply=lambda xi, phi, action, context: xi + phi * context.index[:, None],
+)
+
+
+def smooth(theta, action):
+    return theta[:, :1] * action + theta[:, 1:] * action**2
+
+
+def jumping(theta, action):
+    phase = 1e6 * theta.sum(1, keepdim=True) * (action + 3.1)
+    return smooth(theta, action) + JUMP * torch.sin(phase)
+
+
+def rivals(fn, *, seed=0, missing=0.0):
+    theta = torch.tensor([[0.7, -0.4]], dtype=torch.float64)
+    gen = torch.Generator().manual_seed(3)
+    noise = torch.randn(8, 1, generator=gen, dtype=torch.float64)
+    x = fn(theta, ACTION.double()) + missing + NOISE * noise
+    model = SimulatorModel(fn, noise=GaussianNoise(NOISE))
+    return RivalSet(model, PRIOR, Trials(ACTION, x), [BIAS], seed=seed)
+
+
+def test_a_smooth_simulator_has_none():
+    found = rivals(smooth)
+    assert found.is_smooth
+    assert not found.roughness.any()
+    assert found.noise.cells[0].sd == pytest.approx(NOISE)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_jumps_have_their_size_and_count_as_noise(seed):
+    found = rivals(jumping, seed=seed)
+    assert not found.is_smooth
+    # The median of |sin| over that of |normal|, by its error from 64 draws.
+    assert np.median(found.roughness) == pytest.approx(
+        JUMP * np.sqrt(0.5) / 0.6745, rel=0.2
+    )
+    assert found.noise.cells[0].sd == pytest.approx(np.hypot(NOISE, found.roughness))
+
+
+@pytest.mark.parametrize("names", [(), ("bias",)])
+def test_its_evidence_is_that_of_draws_from_the_prior(names):
+    found = rivals(jumping, missing=0.5)
+    evidence = found.evidence(names)
+    rival = found.rival(names)
+    parts = [
+        rival.log_likelihood(rival.coordinates.sample(100_000, seed=k)) for k in (1, 2)
+    ]
+    log_l = np.concatenate(parts)
+    expected = log_sum_exp(log_l) - np.log(len(log_l))
+    effective = np.exp(2 * log_sum_exp(log_l) - log_sum_exp(2 * log_l))
+    error = np.hypot(evidence.standard_error, effective**-0.5)
+    assert effective > 30
+    assert abs(evidence.log_evidence - expected) < 4 * error
+    assert evidence.effective_sample_size > 20
+
+
+def test_repeated_actions_are_simulated_once_and_predict_the_same():
+    seen = []
+
+    def counting(theta, action):
+        seen.append(len(theta))
+        return jumping(theta, action)
+
+    action = ACTION[[0, 3, 3, 5, 0, 7]]
+    trials = Trials(action, torch.zeros(6, 1))
+    model = SimulatorModel(counting, noise=GaussianNoise(NOISE))
+    simulator = TrialSimulator(AugmentedSimulator(model, [BIAS, DRIFT]), trials)
+    theta = PRIOR.sample((5,)).double()
+    phi = {"bias": torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]}
+    simulator.predict(theta[:1], {})  # effects are held to their nulls before
+    seen.clear()
+    mean, _, _ = simulator.predict(theta, phi)
+    assert seen == [5 * 4]
+    expected = (
+        jumping(theta.repeat_interleave(6, 0), action.double().repeat(5, 1)).reshape(
+            5, 6
+        )
+        + phi["bias"]
+    )
+    assert np.array_equal(mean, expected.numpy())
+    # What depends on the trial's place is no repetition.
+    seen.clear()
+    simulator.predict(theta, {"drift": phi["bias"] + 3.14159})
+    assert seen == [5 * 6]
+
+
+def test_a_random_simulator_is_not_merged():
+    def draw(theta, action):
+        return smooth(theta, action) + torch.randn(len(theta), 1)
+
+    model = AugmentedSimulator(SimulatorModel(draw), [BIAS])
+    theta = torch.zeros(64, 2)
+    x = model.evaluate(theta, {}, torch.ones(64, 1), merge=True)
+    assert len(x.unique()) > 32
