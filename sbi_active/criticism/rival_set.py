@@ -15,25 +15,18 @@ from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.errors import ErrorModel
 from sbi_active.criticism.importance import (
     ENOUGH,
-    LOOKS,
     MAX_ROUNDS,
-    MISSED,
     ImportanceSample,
-    TMixture,
     importance_sample,
 )
-from sbi_active.criticism.least_squares import (
-    Modes,
-    along_ridges,
-    find_modes,
-    probe_step,
-)
+from sbi_active.criticism.least_squares import find_modes, probe_step
 from sbi_active.criticism.noise_grid import declared_noise, scattered
 from sbi_active.criticism.outcomes import DISAGREEMENT, UNKNOWN_RATES
+from sbi_active.criticism.proposals import regressions, ridges
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
 from sbi_active.criticism.rival import Rival
-from sbi_active.criticism.roughness import by_regression, local_roughness
+from sbi_active.criticism.roughness import local_roughness
 from sbi_active.criticism.scales import SearchCoordinates
 from sbi_active.criticism.tempering import temper
 from sbi_active.criticism.trial_simulator import TrialSimulator
@@ -58,8 +51,6 @@ UNLIKELY = 10.0
 #: Particles and moves of the first cross-check by tempering, and the standard errors
 #: by which it may exceed the evidence before the full number runs.
 FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
-#: Points of a sample near which the shape of a posterior is looked for again.
-NUM_AGAIN = 48
 #: Factor on the covariance at a mode of a simulator that jumps, and the effective
 #: sample size that is enough there.
 ROUGH, ENOUGH_ROUGH = 4.0, 50.0
@@ -269,13 +260,18 @@ class RivalSet:
         modes = find_modes(rival, step=self.step, seed=seed, near=near, widened=widened)
         rng = np.random.default_rng(seed)
         behind = self._behind(rival, modes.u)
-        enough = ENOUGH if self.is_smooth else ENOUGH_ROUGH
+        if self.is_smooth:
+            better, looks, enough = ridges, {}, ENOUGH
+        else:
+            looks = {"looks": range(MAX_ROUNDS), "missed": np.inf}
+            better, enough = regressions, ENOUGH_ROUGH
         sample = importance_sample(
             rival,
             modes.proposal,
             rng=rng,
+            local=better(rival, modes, self.step, rng),
             enough=1.0 if behind > HOPELESS else enough,
-            **self._local(rival, modes, rng),
+            **looks,
         )
         enough = TOO_FEW if behind < UNLIKELY else 0.0
         if sample.effective_sample_size >= enough:
@@ -286,27 +282,6 @@ class RivalSet:
             # Particles that lost a ridge do not find it again.
             return sample, "least squares"
         return other, "tempering"
-
-    def _local(
-        self, rival: Rival, modes: Modes, rng: np.random.Generator
-    ) -> dict[str, Any]:
-        """Return how importance sampling finds a better proposal, and when."""
-
-        def ridges(sample: ImportanceSample, number: int) -> TMixture:
-            points = None
-            if number > 0:
-                points = np.unique(sample.draws(NUM_AGAIN, rng), axis=0)
-            return along_ridges(rival, modes, step=self.step, rng=rng, points=points)
-
-        def regression(sample: ImportanceSample, number: int) -> TMixture:
-            # No quadratic function follows a ridge that bends.
-            if number == LOOKS[-1] and sample.effective_sample_size < MISSED:
-                return ridges(sample, number)
-            return by_regression(rival, sample, rng)
-
-        if self.is_smooth:
-            return {"local": ridges}
-        return {"local": regression, "looks": range(MAX_ROUNDS), "missed": np.inf}
 
     def _behind(self, rival: Rival, modes: Array) -> float:
         """Return how far even the largest likelihood is below a known evidence, nats.
