@@ -4,11 +4,14 @@
     python -m benchmarks.box_collision.run --trials 50      # the paper's number
     python -m benchmarks.box_collision.run --target 1 --setting paper --methods asbi
     python -m benchmarks.box_collision.run --table coverage --rounds 3 --reference none
+    python -m benchmarks.box_collision.run --table references --particles 30
     python -m benchmarks.box_collision.run --summary --figures FOLDER
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method, target and setting, in ``benchmarks/box_collision/results``. The tables are
 printed at the end, or alone by ``--summary``.
+
+``--table references`` adds the reference to trials in the CSV that were run without.
 
 Beside a belief stands the posterior of the same trials by importance sampling
 (``log_p_exact``, with its standard error), which is what the best inference would
@@ -39,6 +42,7 @@ from benchmarks.box_collision.summary import (
     summarize,
 )
 from sbi_active import Campaign, CampaignOptions, MixtureDensity
+from sbi_active.campaign import Trial
 from sbi_active.campaign.methods import METHODS, find_method
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
@@ -48,6 +52,7 @@ from sbi_active.tasks.box_collision import (  # pyright: ignore
 )
 
 RESULTS = Path(__file__).parent / "results"
+TABLES = ("paper", "coverage", "references")
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 #: Options of a campaign, and of the task.
 SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
@@ -226,12 +231,49 @@ def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
     return arguments.results / f"{name}.csv"
 
 
+def add_references(method: str, target: str, arguments: argparse.Namespace) -> None:
+    """Add importance sampling to the last rounds in the file that have none."""
+    path = path_of(method, target, arguments)
+    rows = read(path)
+    for last in rows:
+        seed, number = int(last["seed"]), int(last["round"])
+        wanted = arguments.first <= seed < arguments.trials
+        if not wanted or number != arguments.rounds or last["log_p_exact"]:
+            continue
+        start = time.process_time()
+        task = make_task(target, arguments, seed)
+        past = [r for r in rows if int(r["seed"]) == seed and int(r["round"]) <= number]
+        exact = exact_posterior(
+            task,
+            [recorded(row) for row in past],
+            num_particles=arguments.particles,
+            seed=derive_seed(seed, "reference"),
+        )
+        found = reference_row(task, exact, float(last["log_prob_true"]))
+        found["exact_cpu"] = time.process_time() - start
+        found |= errors(task, Resampled(exact), "exact_rep_err")
+        last |= {k: str(short(v)) for k, v in found.items()}
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        spent = time.process_time() - start
+        print(f"{path.stem} trial {seed}: reference, {spent:.0f} CPU s", flush=True)
+
+
+def recorded(row: dict[str, str]) -> Trial:
+    """Return a trial of the file."""
+    x = torch.tensor([float(row[name]) for name in "xyz"])
+    status = "ok" if int(row["is_valid"]) else "invalid"
+    return Trial(int(row["round"]) - 1, torch.tensor([float(row["speed"])]), x, status)
+
+
 def run_missing(method: str, target: str, arguments: argparse.Namespace) -> None:
     """Run the trials that are not in the file yet."""
     path = path_of(method, target, arguments)
     path.parent.mkdir(parents=True, exist_ok=True)
     done = {int(row["seed"]) for row in read(path)}
-    for seed in range(arguments.trials):
+    for seed in range(arguments.first, arguments.trials):
         if seed in done:
             continue
         start = time.process_time()
@@ -255,11 +297,12 @@ def short(value: object) -> object:
 def parse() -> argparse.Namespace:
     """Return the arguments."""
     parser = argparse.ArgumentParser(description="The paper's box collision.")
-    parser.add_argument("--table", choices=["paper", "coverage"], default="paper")
+    parser.add_argument("--table", choices=TABLES, default="paper")
     parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
     parser.add_argument("--methods", nargs="*", choices=[*METHODS], help="(asbi nsbi)")
     parser.add_argument("--setting", choices=[*SETTINGS], default="default")
     parser.add_argument("--trials", type=int, help="(10; 40 for the coverage)")
+    parser.add_argument("--first", type=int, default=0, help="trial to begin with")
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--noise", type=float, default=0.005, help="m; > 0 (0.005)")
     parser.add_argument("--workers", type=int, default=1)
@@ -308,7 +351,9 @@ def main() -> None:
     for method in arguments.methods:
         for target in targets:
             if not arguments.summary:
-                run_missing(method, target, arguments)
+                is_extra = arguments.table == "references"
+                run = add_references if is_extra else run_missing
+                run(method, target, arguments)
             rows = read(path_of(method, target, arguments))
             rows = [row for row in rows if int(row["seed"]) < arguments.trials]
             if rows:

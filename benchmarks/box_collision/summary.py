@@ -46,6 +46,8 @@ PUBLISHED_TIME = "simulation 22.2, training 8.2, information gain 4.6: 35 s, wit
 COMPARED = 3  # round by which target 2 should be pushed more slowly
 COLORS = {"1": "tab:blue", "2": "tab:orange"}
 
+#: Of the reference's log p, nats, above which importance sampling has failed.
+LARGEST_ERROR = 0.5
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
 
@@ -91,7 +93,7 @@ def errors_table(cells: Cells) -> str:
         entry = [f"target {target}", method.upper(), str(trials)]
         for speed, paper in zip(REPORTED, published, strict=True):
             ours = column(rows, f"rep_err_{speed:g}", last)
-            limit = column(rows, f"exact_rep_err_{speed:g}", last)
+            limit = known(rows, f"exact_rep_err_{speed:g}", last)
             entry += [spread(ours), spread(limit), paper]
         table.append(entry)
     header = ["", "method", "trials"]
@@ -296,15 +298,25 @@ def by_seed(rows: Rows, round_: int) -> dict[int, float]:
 
 
 def gap(rows: Rows, round_: int) -> str:
-    """Return the gap to the exact posterior: mean, its error, 95th percentile."""
-    values = column(rows, "gap", round_)
-    values = values[np.isfinite(values)]
+    """Return the gap to the exact posterior: mean, its error, 95th percentile.
+
+    Of trials whose reference is known well enough; how many are not is said.
+    """
+    every = np.isfinite(column(rows, "gap", round_)).sum()
+    values = known(rows, "gap", round_)
+    lost = f", {every - len(values)} of {every} unknown" if len(values) < every else ""
     if not len(values):
-        return "-"
+        return f"-{lost}"
     error = values.std(ddof=1) / len(values) ** 0.5 if len(values) > 1 else np.nan
-    exact = np.nanmax(column(rows, "log_p_exact_se", round_))
+    exact = known(rows, "log_p_exact_se", round_).max()
     percentile = np.percentile(values, 95)
-    return f"{values.mean():.2f} +- {error:.2f}, {percentile:.2f} ({exact:.2f})"
+    return f"{values.mean():.2f} +- {error:.2f}, {percentile:.2f} ({exact:.2f}){lost}"
+
+
+def known(rows: Rows, key: str, round_: int) -> Any:
+    """Return the reference's column where its log p is known within .5 nats."""
+    values = column(rows, key, round_)
+    return values[column(rows, "log_p_exact_se", round_) <= LARGEST_ERROR]
 
 
 def spread(values: Any) -> str:

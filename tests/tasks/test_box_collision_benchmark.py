@@ -2,18 +2,22 @@ import pytest
 import torch
 
 from sbi_active import simulate
+from sbi_active.campaign import Trial
+from sbi_active.seeding import derive_seed
 from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("mujoco")
 from benchmarks.box_collision.bank import PriorBank  # noqa: E402
-from benchmarks.box_collision.run import SETTINGS, errors  # noqa: E402
+from benchmarks.box_collision.run import COLUMNS, SETTINGS, errors, main  # noqa: E402
 from benchmarks.box_collision.summary import (  # noqa: E402
     REPORTED,
     STAGES,
     coverage_table,
     draw,
+    read,
     summarize,
 )
+from sbi_active.tasks.box_collision import exact_posterior  # pyright: ignore  # noqa: E402
 
 
 def rows(speed, log_prob, hpd=0.3, num=4, rounds=6):
@@ -52,6 +56,37 @@ def test_summary_compares_targets_methods_and_the_paper():
     assert "3.15 / 3.15" in text  # the median over seeds
     assert "0.15 +- 0.06" in text  # gaps 0, .1, .2, .3 of the last round
     assert summarize({}) == "no trials yet"
+
+
+def test_a_reference_that_failed_is_no_gap():
+    trials = rows(5.0, 3.0)
+    trials[5]["log_p_exact_se"] = "0.9"  # seed 0, the last round
+    text = summarize({("asbi", "1"): trials})
+    assert "0.20 +- 0.06, 0.29 (0.05), 1 of 4 unknown" in text  # gaps .1, .2, .3
+
+
+def test_references_are_added_to_recorded_trials(tmp_path, monkeypatch):
+    task = get_task("box_collision", target=1)
+    x = task.real_system(torch.tensor([4.0]), seed=0)
+    recorded = dict.fromkeys(COLUMNS, "1") | {"seed": "0", "round": "1", "speed": "4"}
+    recorded |= {"log_p_exact": "", "gap": "", "log_prob_true": "0.5"}
+    recorded |= dict(zip("xyz", map(str, x.tolist()), strict=True))
+    file = tmp_path / "default_target_1_asbi_rounds_1.csv"
+    lines = [",".join(COLUMNS), ",".join(recorded[name] for name in COLUMNS)]
+    file.write_text("\n".join(lines) + "\n")
+    options = "--table references --target 1 --methods asbi --rounds 1 --particles 20"
+    monkeypatch.setattr("sys.argv", ["run", *options.split(), f"--results={tmp_path}"])
+    main()
+    (row,) = read(file)
+    trial = Trial(0, torch.tensor([4.0]), x, "ok")
+    seed = derive_seed(0, "reference")
+    exact = exact_posterior(task, [trial], num_particles=20, seed=seed)
+    expected = float(exact.log_prob(task.theta_true[None])[0])
+    assert float(row["log_p_exact"]) == pytest.approx(expected, abs=1e-3)
+    assert float(row["gap"]) == pytest.approx(expected - 0.5, abs=1e-3)
+    before = file.read_text()
+    main()  # nothing is left to add
+    assert file.read_text() == before
 
 
 def test_coverage_has_a_binomial_interval():
