@@ -253,10 +253,12 @@ def add_references(method: str, target: str, arguments: argparse.Namespace) -> N
         found["exact_cpu"] = time.process_time() - start
         found |= errors(task, Resampled(exact), "exact_rep_err")
         last |= {k: str(short(v)) for k, v in found.items()}
-        with path.open("w", newline="") as file:
+        whole = path.with_suffix(".part")  # a kill must not cost what was there
+        with whole.open("w", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
+        whole.replace(path)
         spent = time.process_time() - start
         print(f"{path.stem} trial {seed}: reference, {spent:.0f} CPU s", flush=True)
 

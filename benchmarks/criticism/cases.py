@@ -126,10 +126,9 @@ class Truth:
     def without_aliases(self, declared: Sequence[Effect]) -> list[Effect]:
         """Return the declared effects less those that could stand in for the truth.
 
-        While one or two of them leave too little for data to tell, the one of these
-        that alone leaves less is taken out.
+        Out are those that alone leave too little for data to tell, and of each pair
+        that does, closest first, the one that alone leaves less.
         """
-        kept = [*declared]
         alone = {effect.name: self._left_by((effect,)) for effect in declared}
         kept = [effect for effect in declared if alone[effect.name] > SUPPORTED]
         left = {pair: self._left_by(pair) for pair in combinations(kept, 2)}

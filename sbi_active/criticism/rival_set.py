@@ -123,10 +123,7 @@ class RivalSet:
         self.roughness = np.zeros(len(self.measurements))
         if not self.is_smooth and not self.simulator.is_stochastic:
             self.roughness = local_roughness(
-                self.rival(()),
-                self.noise,
-                step=self.step,
-                seed=derive_seed(seed, "roughness"),
+                self.rival(()), step=self.step, seed=derive_seed(seed, "roughness")
             )
             self.noise = self.noise.with_extra(self.roughness)
         self.evidences: dict[str, Evidence] = {}

@@ -23,7 +23,7 @@ ROUNDS = 2
 MEDIAN = 0.6745
 
 
-def local_roughness(rival: Rival, noise: NoiseGrid, *, step: float, seed: int) -> Array:
+def local_roughness(rival: Rival, *, step: float, seed: int) -> Array:
     r"""Return the standard deviation of what no smooth function follows, shape (N,).
 
     A simulator of contact or chaos answers a change of its parameters that is far
@@ -39,7 +39,6 @@ def local_roughness(rival: Rival, noise: NoiseGrid, *, step: float, seed: int) -
 
     Args:
         rival: The bare model, with the declared noise.
-        noise: The same noise.
         step: Of finite differences.
         seed: Of the draws.
 
@@ -47,6 +46,8 @@ def local_roughness(rival: Rival, noise: NoiseGrid, *, step: float, seed: int) -
         Gramacy & Lee, Statistics and Computing 22 (2012), for the nugget of
         deterministic codes; Kennedy & O'Hagan, J. R. Stat. Soc. B 63 (2001).
     """
+    noise = rival.error
+    assert isinstance(noise, NoiseGrid)
     modes = find_modes(rival, step=step, seed=seed)
     rng = np.random.default_rng(seed)
     dim, c = rival.dim, rival.coordinates
