@@ -13,6 +13,7 @@ LENGTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0)  # in standard deviations of the b
 REFINED = (0.7, 1.0, 1.4)  # of the best isotropic length, in the metric of slopes
 NUGGET = 1e-6
 FEW = 300  # rows that choose the metric
+NEGLIGIBLE = 1e-4  # error, below which metrics tie, lest rounding choose among them
 BLOCK = 2**18  # kernel entries at once, to stay in the cache
 
 
@@ -151,4 +152,4 @@ def _leave_one_out(z: Tensor, f: Tensor) -> Tensor:
 
 
 def _score(error: Tensor) -> float:
-    return float(error.square().log1p().mean())
+    return max(float(error.square().log1p().mean()), NEGLIGIBLE**2)
