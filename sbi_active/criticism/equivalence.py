@@ -72,7 +72,7 @@ def equivalent_effects(
 def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
     """Return what counts as large in each number of some trials, shape (N,)."""
     noise = declared_noise(rivals.model.noise, simulator.measurements)
-    unit = np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
+    unit = noise.typical_sd
     if rivals.model.noise is None:
         unit = np.full(len(unit), np.median(rivals.spread))
     return unit

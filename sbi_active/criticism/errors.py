@@ -159,6 +159,11 @@ class NoiseGrid(ErrorModel):
         return lambda residual: cell.whiten(residual) / scale
 
     @property
+    def typical_sd(self) -> Array:
+        """Geometric mean over the cells, shape (N,)."""
+        return np.exp(np.mean([np.log(cell.sd) for cell in self.cells], 0))
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Numbers of cells and scales."""
         return len(self.cells), len(self.scales)

@@ -64,7 +64,7 @@ def formula_effects(rivals: RivalSet) -> list[Effect]:
     names = ["xi"]
     if trials.action.shape[1] > 1:
         names = [f"xi_{i + 1}" for i in range(trials.action.shape[1])]
-    sd = np.exp(np.mean([np.log(cell.sd) for cell in rivals.noise.cells], 0))
+    sd = rivals.noise.typical_sd
     amplitude = float(np.median(np.sqrt(sd * np.maximum(rivals.spread, sd))))
     if rivals.simulator.is_stochastic:
         amplitude = float(np.median(rivals.spread))

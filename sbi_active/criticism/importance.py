@@ -20,6 +20,8 @@ Array = NDArray[Any]
 DEGREES_OF_FREEDOM = 5
 #: Particles a round, rounds at most, and the effective number that ends them.
 ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 100.0
+#: Effective particles that suffice for an evidence far behind another.
+ENOUGH_BEHIND = 20.0
 #: Effective particles below which a round missed the shape, and rounds after which that
 #: is looked at.
 MISSED, LOOKS = 15.0, (0, 7)
@@ -109,6 +111,7 @@ def importance_sample(
     looks: Container[int] = LOOKS,
     missed: float = MISSED,
     enough: float = ENOUGH,
+    dismissed: float = -np.inf,
 ) -> ImportanceSample:
     r"""Return the evidence :math:`Z = E_q[p(x | z) p(z) / q(z)]`.
 
@@ -126,6 +129,8 @@ def importance_sample(
         looks: Rounds after which the effective particles are looked at.
         missed: Number of them below which the proposal missed the shape.
         enough: Effective sample size that ends the rounds.
+        dismissed: Log evidence below which a model hardly counts, so that 20 effective
+            particles end them.
 
     References:
         Cappe et al., Statistics and Computing 18 (2008); Cornuet et al., Scandinavian
@@ -147,7 +152,9 @@ def importance_sample(
         proposals.append(proposal)
         particles, targets = np.concatenate([particles, u]), np.append(targets, target)
         sample = _weighted(particles, targets, log_q - np.log(len(proposals)))
-        if sample.effective_sample_size >= enough:
+        at_most = sample.log_evidence + 2 * sample.standard_error
+        needed = min(enough, ENOUGH_BEHIND) if at_most < dismissed else enough
+        if sample.effective_sample_size >= needed:
             break
         few = sample.effective_sample_size < missed
         if local is not None and few and i in looks:

@@ -13,13 +13,22 @@ from sbi_active.criticism.importance import INFLATION, TMixture
 from sbi_active.criticism.rival import Rival
 from sbi_active.seeding import derive_seed
 
-__all__ = ["Modes", "along_ridges", "find_modes", "local_proposal", "probe_step"]
+__all__ = [
+    "ROUGH",
+    "STEPS",
+    "THOROUGH",
+    "Modes",
+    "Search",
+    "along_ridges",
+    "find_modes",
+    "local_proposal",
+    "probe_step",
+]
 
 Array = NDArray[Any]
 
-#: Starts of a search, among them so many points near smaller rivals' posteriors and
-#: the best of so many draws of the prior.
-NUM_STARTS, MOST_NEAR, NUM_SCREENED, NUM_BEST = 20, 6, 128, 6
+#: Draws of the prior, the best of which are among the starts of a search.
+NUM_SCREENED = 128
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
@@ -28,9 +37,8 @@ NUM_POINTS, RANGE = 64, 4.0
 FLAT = 0.3
 #: Iterations that bring a point back to where the data put it.
 RETURN = 5
-#: Iterations of the first phase in two halves and of each later phase, starts that go
-#: on after either half, and later phases at least and at most.
-EARLY, LATE, NUM_KEPT, PHASES = (3, 3), 4, (10, 6), (2, 10)
+#: Iterations of the first phase in two halves and of each later phase.
+EARLY, LATE = (3, 3), 4
 #: Coordinates within which two points count as the same, early and late.
 NEAR_MODE, SAME_MODE = 0.05, 0.02
 #: Expected fall of a sum of squares that is worth no further iteration.
@@ -40,8 +48,41 @@ PROGRESS = 0.5
 MAX_MODES = 8
 #: Modes whose sum of squares exceeds the best by this hold no mass that counts.
 NEGLIGIBLE = 40.0
-#: Finite-difference steps in prior deviations, and where two of them count as one.
+#: Finite-difference steps in prior deviations, and where two of them count as one; a
+#: coarse one, whose slope is of the same kind where nothing jumps.
 STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2, 0.2), 0.1
+COARSE, SIMILAR_SLOPE = 5e-2, 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """How much a search for modes does.
+
+    Attributes:
+        num_starts: In all.
+        num_near: Of these, points near smaller rivals' posteriors, at most.
+        num_best: Of these, the best of many draws of the prior.
+        num_kept: Starts that go on after either half of the first phase.
+        phases: Later ones, at least and at most.
+        widened: Factor on the covariances at the modes.
+    """
+
+    num_starts: int
+    num_near: int
+    num_best: int
+    num_kept: tuple[int, int]
+    phases: tuple[int, int]
+    widened: float = 1.0
+
+
+THOROUGH = Search(
+    num_starts=20, num_near=6, num_best=6, num_kept=(10, 6), phases=(2, 10)
+)
+#: Where the simulator jumps, derivatives lead to the neighborhood of a mode at most,
+#: and the mode is wider than they say.
+ROUGH = Search(
+    num_starts=10, num_near=4, num_best=4, num_kept=(5, 3), phases=(1, 2), widened=4.0
+)
 
 
 @dataclass(frozen=True)
@@ -59,12 +100,13 @@ class Modes:
     whiten: Whitener
 
 
-def probe_step(rival: Rival, *, seed: int) -> tuple[float, bool]:
-    """Return a step for finite differences, and whether the simulator is smooth.
+def probe_step(rival: Rival, *, seed: int) -> tuple[float | None, bool]:
+    """Return a step for finite differences, and whether slopes hold over a coarse one.
 
     The step is the smallest whose slope agrees with that of twice the step within 10 %
     for most of four draws from the prior: below it rounding or a solver's tolerance
-    speaks, and where there is none the simulator jumps.
+    speaks, and where there is none the simulator jumps. It may jump as well where
+    slopes agree between two jumps and not with those across them.
 
     Args:
         rival: The bare model.
@@ -72,14 +114,19 @@ def probe_step(rival: Rival, *, seed: int) -> tuple[float, bool]:
     """
     u = rival.coordinates.sample(4, seed=seed)
     whiten = rival.error.start()
-    for step in STEPS:
-        _, one = rival.jacobian(u, whiten, step)
-        _, two = rival.jacobian(u, whiten, 2 * step)
+
+    def slope(step: float) -> Array:
+        return rival.jacobian(u, whiten, step)[1]
+
+    def apart(one: Array, two: Array) -> float:
         size = np.sqrt((one**2).sum((1, 2))) + 1e-12
-        gap = np.sqrt(((one - two) ** 2).sum((1, 2))) / size
-        if np.median(gap) < SAME_SLOPE:
-            return step, True
-    return STEPS[-1], False
+        return float(np.median(np.sqrt(((one - two) ** 2).sum((1, 2))) / size))
+
+    for step in STEPS:
+        fine = slope(step)
+        if apart(fine, slope(2 * step)) < SAME_SLOPE:
+            return step, step >= COARSE or apart(fine, slope(COARSE)) < SIMILAR_SLOPE
+    return None, False
 
 
 def find_modes(
@@ -88,7 +135,7 @@ def find_modes(
     step: float,
     seed: int,
     near: Array | None = None,
-    widened: float = 1.0,
+    search: Search = THOROUGH,
 ) -> Modes:
     r"""Return modes of the posterior and t distributions around them.
 
@@ -100,28 +147,28 @@ def find_modes(
         step: Of finite differences, in u.
         seed: Of the starts.
         near: Points to start some of the searches from, shape (k, dim).
-        widened: Factor on the covariances.
+        search: How much it does.
 
     References:
         Marquardt, SIAM Journal on Applied Mathematics 11 (1963); Broyden, Mathematics
         of Computation 19 (1965), for the derivatives of the first phase.
     """
-    u = rival.coordinates.sample(NUM_STARTS, seed=seed)
+    u = rival.coordinates.sample(search.num_starts, seed=seed)
     if near is not None:
-        some = min(len(near), MOST_NEAR)
+        some = min(len(near), search.num_near)
         u[:some] = near[:some]
     fixed = ~rival.searched
     whiten = rival.error.start()
     screened = rival.coordinates.sample(NUM_SCREENED, seed=derive_seed(seed, "screen"))
     squares = (whiten(rival.residual(screened)[0]) ** 2).sum(1)
-    u[-NUM_BEST:] = screened[np.argsort(squares)[:NUM_BEST]]
+    u[-search.num_best :] = screened[np.argsort(squares)[: search.num_best]]
     u[:, fixed] = 0.0
     u = np.clip(u, rival.coordinates.low, rival.coordinates.high)
-    for iterations, most in zip(EARLY, NUM_KEPT, strict=True):
+    for iterations, most in zip(EARLY, search.num_kept, strict=True):
         u, cost = _descend(rival, u, whiten, step, iterations, secant=True)
         u = _distinct(u[np.argsort(cost)], NEAR_MODE)[:most]
     best, stalls = np.inf, 0
-    for phase in range(PHASES[1]):
+    for phase in range(search.phases[1]):
         whiten = rival.error.whitener(rival.residual(u[:1])[0][0])
         u, cost = _descend(rival, u, whiten, step, LATE)
         order = np.argsort(cost)
@@ -130,7 +177,7 @@ def find_modes(
         stalls = stalls + 1 if best - cost[0] < PROGRESS else 0
         # Far from a fit, a phase may be lost to finding the damping.
         patience = 3 if cost[0] > FAR * len(rival.simulator.measurements) else 1
-        if phase + 1 >= PHASES[0] and stalls >= patience:
+        if phase + 1 >= search.phases[0] and stalls >= patience:
             break
         best = cost[0]
     at = _distinct(u[cost - cost[0] < NEGLIGIBLE], SAME_MODE)[:MAX_MODES]
@@ -140,7 +187,7 @@ def find_modes(
         own, _ = _descend(rival, at[:1], other, step, LATE, secant=True)
         means.append(own)
         factors.append(_factors(rival, own, other, step, 1.0))
-    wide = np.concatenate(factors) * np.sqrt(widened)
+    wide = np.concatenate(factors) * np.sqrt(search.widened)
     proposal = TMixture(np.concatenate(means), wide)
     return Modes(at, proposal, whiten)
 

@@ -106,7 +106,7 @@ def predict(
     center, spread = rivals.prior_predictive(simulator)
     missing = ~np.isfinite(mean)
     if missing.any():  # all that is known of such a number is the prior predictive
-        wide = spread / np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
+        wide = spread / noise.typical_sd
         mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
     flags = [
         log_outcomes(p[:, None], v[None])

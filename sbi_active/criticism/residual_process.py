@@ -95,7 +95,7 @@ class ResidualProcess(ErrorModel):
         self.amplitudes = np.geomspace(1.0, max(largest, 3.0), NUM_AMPLITUDES)
         # With an unknown size of the noise, the amplitude is a multiple of it.
         self._log_amplitude = -np.log(NUM_AMPLITUDES)
-        typical = np.exp(np.mean([np.log(c.sd) for c in noise.cells], 0))
+        typical = noise.typical_sd
         self._bases: list[_Basis] = []
         units = {False: typical}
         if spread is not None:

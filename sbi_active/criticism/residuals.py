@@ -97,7 +97,7 @@ def _prequential(
     ratio = np.exp(np.clip(log_l - evidence.log_evidence, -700, 700))
     log_start = -np.log(0.5 + 0.5 * ratio)  # log p(z) / m(z)
     m = rivals.measurements
-    sd = np.exp(np.mean([np.log(c.sd) for c in noise.cells], 0))
+    sd = noise.typical_sd
     found = np.full(len(m), np.nan)
     order = np.argsort(rivals.trials.index.numpy(), kind="stable")
     seen = np.zeros(len(m), dtype=bool)

@@ -138,7 +138,7 @@ class Rival:
         """Typical standard deviation of the noise, shape (N,)."""
         noise = getattr(self.error, "noise", self.error)
         assert isinstance(noise, NoiseGrid)
-        return np.exp(np.mean([np.log(cell.sd) for cell in noise.cells], 0))
+        return noise.typical_sd
 
     def log_likelihood(self, u: Array) -> Array:
         """Return log p(x | z), shape (n,)."""

@@ -19,7 +19,13 @@ from sbi_active.criticism.importance import (
     ImportanceSample,
     importance_sample,
 )
-from sbi_active.criticism.least_squares import find_modes, probe_step
+from sbi_active.criticism.least_squares import (
+    ROUGH,
+    STEPS,
+    THOROUGH,
+    find_modes,
+    probe_step,
+)
 from sbi_active.criticism.noise_grid import declared_noise, scattered
 from sbi_active.criticism.outcomes import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.criticism.proposals import regressions, ridges
@@ -51,9 +57,13 @@ UNLIKELY = 10.0
 #: Particles and moves of the first cross-check by tempering, and the standard errors
 #: by which it may exceed the evidence before the full number runs.
 FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
-#: Factor on the covariance at a mode of a simulator that jumps, and the effective
-#: sample size that is enough there.
-ROUGH, ENOUGH_ROUGH = 4.0, 50.0
+#: Nats by which an evidence is behind another, so that it need not be precise where
+#: the simulator jumps and precision is dear.
+BEHIND = 5.0
+#: Effective sample size that is enough where the simulator jumps.
+ENOUGH_ROUGH = 30.0
+#: Deviations of the noise below which a roughness does not matter.
+SMALL = 0.1
 NUM_SPREAD = 200
 #: Draws of largest weight, among which the best fit is sought.
 NUM_TOP = 20
@@ -117,18 +127,29 @@ class RivalSet:
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         self.can_fail = not trials.valid.all() or self.simulator.failed
-        self.step, self.is_smooth = probe_step(
-            self.rival(()), seed=derive_seed(seed, "probe")
-        )
-        self.roughness = np.zeros(len(self.measurements))
-        if not self.is_smooth and not self.simulator.is_stochastic:
-            self.roughness = local_roughness(
-                self.rival(()), step=self.step, seed=derive_seed(seed, "roughness")
-            )
-            self.noise = self.noise.with_extra(self.roughness)
+        self._look_for_jumps()
         self.evidences: dict[str, Evidence] = {}
         self.samples: dict[str, ImportanceSample] = {}
         self.rivals: dict[str, Rival] = {}
+
+    def _look_for_jumps(self) -> None:
+        """Set the step of finite differences, and count jumps as noise."""
+        bare, seed = self.rival(()), derive_seed(self.seed, "roughness")
+        step, is_steady = probe_step(bare, seed=derive_seed(self.seed, "probe"))
+        self.step = STEPS[-1] if step is None else step
+        self.is_smooth = step is not None
+        self.roughness = np.zeros(len(self.measurements))
+        if is_steady or self.simulator.is_stochastic:
+            return
+        rough = local_roughness(bare, step=self.step, seed=seed)
+        if step is not None:
+            # Fine slopes differ from coarse ones as well where a smooth response bends
+            # within the coarse step.
+            if (rough < SMALL * self.noise.typical_sd).all():
+                return
+            self.step, self.is_smooth = STEPS[-1], False
+            rough = local_roughness(bare, step=self.step, seed=seed)
+        self.roughness, self.noise = rough, self.noise.with_extra(rough)
 
     def rival(self, names: Sequence[str], *, error: str | None = None) -> Rival:
         """Return the simulator with some effects and an error model.
@@ -170,7 +191,7 @@ class RivalSet:
     def residual_process(self) -> ResidualProcess:
         """Return the noise with a smooth function of the action and time."""
         if not hasattr(self, "_process"):
-            sd = np.exp(np.mean([np.log(cell.sd) for cell in self.noise.cells], 0))
+            sd = self.noise.typical_sd
             self._process = ResidualProcess(
                 self.noise,
                 self.measurements,
@@ -252,23 +273,26 @@ class RivalSet:
 
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
         near = self._starts(rival, seed)
-        # Where the simulator jumps, a mode is wider than its derivatives say.
-        widened = 1.0 if self.is_smooth else ROUGH
-        modes = find_modes(rival, step=self.step, seed=seed, near=near, widened=widened)
+        search = THOROUGH if self.is_smooth else ROUGH
+        modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
         rng = np.random.default_rng(seed)
         behind = self._behind(rival, modes.u)
         if self.is_smooth:
-            better, looks, enough = ridges, {}, ENOUGH
+            better, options, enough = ridges, {}, ENOUGH
         else:
-            looks = {"looks": range(MAX_ROUNDS), "missed": np.inf}
             better, enough = regressions, ENOUGH_ROUGH
+            options = {
+                "looks": range(MAX_ROUNDS),
+                "missed": np.inf,
+                "dismissed": self._best_evidence() - BEHIND,
+            }
         sample = importance_sample(
             rival,
             modes.proposal,
             rng=rng,
             local=better(rival, modes, self.step, rng),
             enough=1.0 if behind > HOPELESS else enough,
-            **looks,
+            **options,
         )
         enough = TOO_FEW if behind < UNLIKELY else 0.0
         if sample.effective_sample_size >= enough:
@@ -288,9 +312,12 @@ class RivalSet:
         """
         if rival.has_noise_effect:  # whose coordinates the search leaves alone
             return -np.inf
+        return self._best_evidence() - float(rival.log_likelihood(modes).max())
+
+    def _best_evidence(self) -> float:
+        """Return the largest log evidence so far."""
         known = [e.log_evidence for e in self.evidences.values()]
-        best = max([*known, self.reference])
-        return float(best - rival.log_likelihood(modes).max())
+        return float(max([*known, self.reference]))
 
     def _starts(self, rival: Rival, seed: int) -> Array | None:
         """Return points at posteriors of smaller rivals, the rest from the prior.

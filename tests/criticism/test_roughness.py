@@ -40,12 +40,23 @@ def jumping(theta, action):
     return smooth(theta, action) + JUMP * torch.sin(phase)
 
 
-def rivals(fn, *, seed=0, missing=0.0):
+def stepping(theta, action):
+    """Smooth between two steps, with the slopes of what has none."""
+    phase = 37 * theta.sum(1, keepdim=True) * (action + 3.1)
+    return smooth(theta, action) + JUMP * torch.sign(torch.sin(phase))
+
+
+def bending(theta, action):
+    """Smooth, though its slopes change within a coarse step of differences."""
+    return smooth(theta, action) + 0.04 * torch.sin(150 * theta[:, :1]) * action
+
+
+def rivals(fn, *, seed=0, missing=0.0, sd=NOISE):
     theta = torch.tensor([[0.7, -0.4]], dtype=torch.float64)
     gen = torch.Generator().manual_seed(3)
     noise = torch.randn(8, 1, generator=gen, dtype=torch.float64)
-    x = fn(theta, ACTION.double()) + missing + NOISE * noise
-    model = SimulatorModel(fn, noise=GaussianNoise(NOISE))
+    x = fn(theta, ACTION.double()) + missing + sd * noise
+    model = SimulatorModel(fn, noise=GaussianNoise(sd))
     return RivalSet(model, PRIOR, Trials(ACTION, x), [BIAS], seed=seed)
 
 
@@ -65,6 +76,21 @@ def test_jumps_have_their_size_and_count_as_noise(seed):
         JUMP * np.sqrt(0.5) / 0.6745, rel=0.2
     )
     assert found.noise.cells[0].sd == pytest.approx(np.hypot(NOISE, found.roughness))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_steps_are_jumps_though_the_slopes_between_them_agree(seed):
+    found = rivals(stepping, seed=seed)
+    assert not found.is_smooth
+    assert float(np.median(found.roughness)) > NOISE
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_response_that_bends_does_not_jump(seed):
+    found = rivals(bending, seed=seed, sd=0.001)
+    assert found.is_smooth
+    assert found.step < 1e-2
+    assert not found.roughness.any()
 
 
 @pytest.mark.parametrize("names", [(), ("bias",)])
