@@ -191,6 +191,7 @@ class Truth:
             lambda parameters: self.residual(parameters, effects, target),
             self.starts(effects),
             prior=self.world.prior,
+            is_rough=self.world.is_rough,
         )
 
 

@@ -7,20 +7,49 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import OptimizeResult, differential_evolution, least_squares
 from torch import Tensor
 
 __all__ = ["local_fits", "residual_sum_of_squares"]
 
 STARTS = 8
+GENERATIONS = 20  # of as many candidates as starts, where the simulator is rough
 DIFFERENCE = 1e-5  # of a parameter's range
 
 
 def residual_sum_of_squares(
-    residual: Callable[[Tensor], Tensor], starts: Tensor, *, prior: BoxUniform
+    residual: Callable[[Tensor], Tensor],
+    starts: Tensor,
+    *,
+    prior: BoxUniform,
+    is_rough: bool = False,
 ) -> float:
-    """Return the smallest sum of squares, arguments as for :func:`local_fits`."""
-    return min(2 * fit.cost for fit in local_fits(residual, starts, prior=prior))
+    """Return the smallest sum of squares, arguments as for :func:`local_fits`.
+
+    Args:
+        residual: As there.
+        starts: As there.
+        prior: As there.
+        is_rough: Whether derivatives lead nowhere: differential evolution then searches
+            theta's box and the range of the starts' strengths.
+    """
+    if not is_rough:
+        return min(2 * fit.cost for fit in local_fits(residual, starts, prior=prior))
+    low, high = starts.amin(0), starts.amax(0)
+    edges = torch.stack(_edges(prior)).double()
+    low[: edges.shape[1]], high[: edges.shape[1]] = edges
+    found = differential_evolution(
+        lambda z: residual(torch.from_numpy(z.T.copy())).square().sum(1).numpy(),
+        np.stack([low.numpy(), high.numpy()], 1),
+        init=starts.numpy(),  # pyright: ignore[reportArgumentType]
+        maxiter=GENERATIONS,
+        tol=0.0,
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        rng=0,
+    )
+    return float(found.fun)
 
 
 def local_fits(

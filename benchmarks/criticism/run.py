@@ -89,7 +89,7 @@ def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> 
             rows = score_active(case, number)
         else:
             oracle = kind == "library" and case.truth.effects[0].hook != "noise"
-            oracle = oracle and world.has_oracle
+            oracle = oracle and not world.is_rough
             rows = [score_case(case, number, oracle=oracle)]
         append(path, rows, ACTIVE_COLUMNS if active else COLUMNS)
         last = rows[-1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -91,7 +92,33 @@ def _library(world: World, rows: Sequence[Row]) -> list[str]:
         for r in seen
         if not _right(world, r)
     ]
+    for name in world.hidden:
+        lines += _of_effect(name, [r for r in named if r["effects"] == name])
+    lines += _separated(rows)
     return [*lines, *_errors([r for r in named if _detected(r)])]
+
+
+def _of_effect(name: str, rows: Sequence[Row]) -> list[str]:
+    strong = [_detected(r) for r in rows if float(r["lambda"]) > BINS[-1][0]]
+    verdicts = Counter(r["verdict"] for r in rows if _detected(r))
+    called = ", ".join(f"{v} {n}" for v, n in verdicts.most_common())
+    return [
+        f"{name}: detected {sum(map(_detected, rows))} of {len(rows)}, lambda > 25 "
+        f"{sum(strong)} of {len(strong)}; called {called or '-'}"
+    ]
+
+
+def _separated(rows: Sequence[Row]) -> list[str]:
+    """Return which effects reports say that no permitted action separates."""
+    groups = Counter(
+        " = ".join(sorted(group))
+        for r in rows
+        for group in json.loads(r["equivalent"] or "[]")
+    )
+    return [
+        f"inseparable in the report: {group}, {n} of {len(rows)}"
+        for group, n in groups.most_common()
+    ]
 
 
 def _power(rows: Sequence[Row]) -> list[str]:

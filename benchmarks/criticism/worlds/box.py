@@ -71,7 +71,7 @@ def make_world() -> World:
         ),
         outside=[],
         hidden=HIDDEN,
-        has_oracle=False,
+        is_rough=True,
     )
 
 

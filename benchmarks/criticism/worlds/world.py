@@ -48,7 +48,8 @@ class World:
         sample_times: Of the entries of x, s; empty without a time axis.
         hidden: Names of the effects of the library that cases of that kind have, in
             turn; none has any of the library or noise inflation, at random.
-        has_oracle: Whether the model that is given the true effect is scored besides.
+        is_rough: Whether the simulator jumps, so that derivatives lead nowhere. The
+            model that is given the true effect, which needs them, is then not scored.
     """
 
     name: str
@@ -65,7 +66,7 @@ class World:
     correlations: Sequence[float] = (0.0,)
     sample_times: Sequence[float] = ()
     hidden: Sequence[str] = ()
-    has_oracle: bool = True
+    is_rough: bool = False
 
     @property
     def effects(self) -> list[Effect]:
