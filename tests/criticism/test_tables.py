@@ -23,6 +23,7 @@ def row(case: int, effects: str, verdict: str, strength: float, **changes) -> di
         "verdict": verdict,
         "probabilities": json.dumps(stated),
         "credible_set": json.dumps([verdict]),
+        "equivalent": "[]",
         "formula": "",
         "rmse_before": "2.0",
         "rmse_after": "1.0",
@@ -76,6 +77,24 @@ def test_second_place_counts_for_top_2_alone():
     assert "top-1 0.000 (0/1)" in text
     assert "top-2 1.000 (1/1)" in text
     assert "quadratic 1.5 called drift" in text
+
+
+def test_hidden_effects_have_a_line_each():
+    pytest.importorskip("mujoco")
+    same = json.dumps([["none", "time stamp"]])
+    rows = [
+        row(0, "aim", "center of mass", 90.0, equivalent=same),
+        row(1, "aim", "aim", 20.0, equivalent=same),
+        row(2, "aim", "none", 30.0),
+        row(3, "tilt", "none", 1.0, equivalent=same),
+    ]
+    text = table("loop", {"library": rows}, "D")
+    assert (
+        "aim: detected 2 of 3, lambda > 25 1 of 2; called center of mass 1, aim 1"
+        in text
+    )
+    assert "tilt: detected 0 of 1, lambda > 25 0 of 0; called -" in text
+    assert "inseparable in the report: none = time stamp, 3 of 4" in text
 
 
 def test_failures_are_counted_apart():

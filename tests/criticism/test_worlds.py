@@ -5,10 +5,12 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
+from sbi.utils import BoxUniform
 
 from benchmarks.criticism.cases import SUPPORTED, Problem, draw_case, extend, respond
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.intervals import brier_score, reliability, wilson
+from benchmarks.criticism.refit import residual_sum_of_squares
 from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.block import EDGE, GRAVITY, slide
 from benchmarks.criticism.worlds.sliding_block import NOISE_SD, TIMES
@@ -264,3 +266,18 @@ def test_unknown_names_list_the_valid_ones():
         get_world("Z")
     with pytest.raises(ValueError, match="expected a kind among.*'pair'.*got 'odd'"):
         draw_case(get_world("A"), "odd", 0)  # type: ignore[arg-type]
+
+
+def test_a_rough_fit_needs_no_derivatives():
+    """Steps of .01, between which a descent stays where it starts."""
+    prior = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
+    torch.manual_seed(0)
+    starts = prior.sample((64,)).double()
+
+    def residual(z):
+        return 3 * (100 * z).round() / 100 - torch.tensor([6.0, -3.0])
+
+    found = residual_sum_of_squares(residual, starts, prior=prior, is_rough=True)
+    descended = residual_sum_of_squares(residual, starts, prior=prior)
+    assert descended == float(residual(starts).square().sum(1).min())
+    assert found < 0.1 * descended
