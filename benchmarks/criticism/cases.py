@@ -179,9 +179,16 @@ class Truth:
         return x.reshape(len(parameters), num, *x.shape[1:])
 
     def starts(self, effects: Sequence[Effect]) -> Tensor:
-        """Return draws of theta and strengths to start fits from, float64."""
+        """Return draws of theta and strengths to start fits from, float64.
+
+        Where the simulator is rough, half of theta's are near the truth.
+        """
         with forked_generators(derive_seed(self.seed, "refit")):
             theta = self.world.prior.sample((64,)).double()
+            if self.world.is_rough:
+                near = torch.arange(len(theta)) % 2 == 0
+                share = torch.logspace(-3, 0, int(near.sum()), dtype=torch.float64)
+                theta[near] += (1 - share[:, None]) * (self.theta - theta[near])
             return torch.cat([theta, *[e.sample(64) for e in effects]], -1)
 
     def _left_by(self, effects: Sequence[Effect]) -> float:
