@@ -15,14 +15,12 @@ from sbi_active.seeding import derive_seed
 
 __all__ = [
     "ROUGH",
-    "STEPS",
     "THOROUGH",
     "Modes",
     "Search",
     "along_ridges",
     "find_modes",
     "local_proposal",
-    "probe_step",
 ]
 
 Array = NDArray[Any]
@@ -48,10 +46,6 @@ PROGRESS = 0.5
 MAX_MODES = 8
 #: Modes whose sum of squares exceeds the best by this hold no mass that counts.
 NEGLIGIBLE = 40.0
-#: Finite-difference steps in prior deviations, and where two of them count as one; a
-#: coarse one, whose slope is of the same kind where nothing jumps.
-STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2, 0.2), 0.1
-COARSE, SIMILAR_SLOPE = 5e-2, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,35 +92,6 @@ class Modes:
     u: Array
     proposal: TMixture
     whiten: Whitener
-
-
-def probe_step(rival: Rival, *, seed: int) -> tuple[float | None, bool]:
-    """Return a step for finite differences, and whether slopes hold over a coarse one.
-
-    The step is the smallest whose slope agrees with that of twice the step within 10 %
-    for most of four draws from the prior: below it rounding or a solver's tolerance
-    speaks, and where there is none the simulator jumps. It may jump as well where
-    slopes agree between two jumps and not with those across them.
-
-    Args:
-        rival: The bare model.
-        seed: Of the draws.
-    """
-    u = rival.coordinates.sample(4, seed=seed)
-    whiten = rival.error.start()
-
-    def slope(step: float) -> Array:
-        return rival.jacobian(u, whiten, step)[1]
-
-    def apart(one: Array, two: Array) -> float:
-        size = np.sqrt((one**2).sum((1, 2))) + 1e-12
-        return float(np.median(np.sqrt(((one - two) ** 2).sum((1, 2))) / size))
-
-    for step in STEPS:
-        fine = slope(step)
-        if apart(fine, slope(2 * step)) < SAME_SLOPE:
-            return step, step >= COARSE or apart(fine, slope(COARSE)) < SIMILAR_SLOPE
-    return None, False
 
 
 def find_modes(

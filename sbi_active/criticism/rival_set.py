@@ -19,20 +19,14 @@ from sbi_active.criticism.importance import (
     ImportanceSample,
     importance_sample,
 )
-from sbi_active.criticism.least_squares import (
-    ROUGH,
-    STEPS,
-    THOROUGH,
-    find_modes,
-    probe_step,
-)
+from sbi_active.criticism.least_squares import ROUGH, THOROUGH, find_modes
 from sbi_active.criticism.noise_grid import declared_noise, scattered
 from sbi_active.criticism.outcomes import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.criticism.proposals import regressions, ridges
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
 from sbi_active.criticism.rival import Rival
-from sbi_active.criticism.roughness import local_roughness
+from sbi_active.criticism.roughness import look_for_jumps
 from sbi_active.criticism.scales import SearchCoordinates
 from sbi_active.criticism.tempering import temper
 from sbi_active.criticism.trial_simulator import TrialSimulator
@@ -62,8 +56,6 @@ FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
 BEHIND = 5.0
 #: Effective sample size that is enough where the simulator jumps.
 ENOUGH_ROUGH = 30.0
-#: Deviations of the noise below which a roughness does not matter.
-SMALL = 0.1
 NUM_SPREAD = 200
 #: Draws of largest weight, among which the best fit is sought.
 NUM_TOP = 20
@@ -127,29 +119,14 @@ class RivalSet:
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         self.can_fail = not trials.valid.all() or self.simulator.failed
-        self._look_for_jumps()
+        self.step, self.is_smooth, self.roughness = look_for_jumps(
+            self.rival(()), seed=seed
+        )
+        if self.roughness.any():
+            self.noise = self.noise.with_extra(self.roughness)
         self.evidences: dict[str, Evidence] = {}
         self.samples: dict[str, ImportanceSample] = {}
         self.rivals: dict[str, Rival] = {}
-
-    def _look_for_jumps(self) -> None:
-        """Set the step of finite differences, and count jumps as noise."""
-        bare, seed = self.rival(()), derive_seed(self.seed, "roughness")
-        step, is_steady = probe_step(bare, seed=derive_seed(self.seed, "probe"))
-        self.step = STEPS[-1] if step is None else step
-        self.is_smooth = step is not None
-        self.roughness = np.zeros(len(self.measurements))
-        if is_steady or self.simulator.is_stochastic:
-            return
-        rough = local_roughness(bare, step=self.step, seed=seed)
-        if step is not None:
-            # Fine slopes differ from coarse ones as well where a smooth response bends
-            # within the coarse step.
-            if (rough < SMALL * self.noise.typical_sd).all():
-                return
-            self.step, self.is_smooth = STEPS[-1], False
-            rough = local_roughness(bare, step=self.step, seed=seed)
-        self.roughness, self.noise = rough, self.noise.with_extra(rough)
 
     def rival(self, names: Sequence[str], *, error: str | None = None) -> Rival:
         """Return the simulator with some effects and an error model.
