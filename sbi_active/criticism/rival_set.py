@@ -54,8 +54,10 @@ FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
 #: Nats by which an evidence is behind another, so that it need not be precise where
 #: the simulator jumps and precision is dear.
 BEHIND = 5.0
-#: Effective sample size that is enough where the simulator jumps.
-ENOUGH_ROUGH = 30.0
+#: Effective sample size that is enough where the simulator jumps, and the one below
+#: which importance sampling is not trusted there: tempering, which climbs over the same
+#: jumps, would have to do better.
+ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
 NUM_SPREAD = 200
 #: Draws of largest weight, among which the best fit is sought.
 NUM_TOP = 20
@@ -255,9 +257,11 @@ class RivalSet:
         rng = np.random.default_rng(seed)
         behind = self._behind(rival, modes.u)
         if self.is_smooth:
-            better, options, enough = ridges, {}, ENOUGH
+            better, options = ridges, {}
+            enough, too_few = ENOUGH, TOO_FEW
         else:
-            better, enough = regressions, ENOUGH_ROUGH
+            better = regressions
+            enough, too_few = ENOUGH_ROUGH, TOO_FEW_ROUGH
             options = {
                 "looks": range(MAX_ROUNDS),
                 "missed": np.inf,
@@ -271,8 +275,7 @@ class RivalSet:
             enough=1.0 if behind > HOPELESS else enough,
             **options,
         )
-        enough = TOO_FEW if behind < UNLIKELY else 0.0
-        if sample.effective_sample_size >= enough:
+        if not behind < UNLIKELY or sample.effective_sample_size >= too_few:
             return sample, "least squares"
         other = temper(rival, seed=seed)
         both = np.hypot(sample.standard_error, other.standard_error)
