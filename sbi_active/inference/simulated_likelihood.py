@@ -18,6 +18,7 @@ __all__ = ["MeanTable", "SimulatedLikelihood", "declares_noise"]
 
 Array = NDArray[Any]
 
+BATCH = 64  # rows a call: the same ones whatever the number of workers
 DEEP = 30.0  # nats below the peak that count as any more do
 FORGETTING = 0.3
 
@@ -55,9 +56,7 @@ class MeanTable:
         self.simulator, self.engine = simulator, dict(engine)
         self.num_simulations = self.num_missing = 0
         # The same object at each call, so that worker processes are kept.
-        self._bare = SimulatorModel(
-            simulator.fn, setup=simulator.setup, batched=simulator.is_batched
-        )
+        self._bare = simulator.without_noise()
         self._known: dict[bytes, Array | None] = {}
 
     def knows(self, theta: Tensor, action: Tensor) -> NDArray[np.bool_]:
@@ -95,7 +94,14 @@ class MeanTable:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
             try:
-                rows = simulate(self._bare, theta, actions, seed=0, **self.engine)
+                rows = simulate(
+                    self._bare,
+                    theta,
+                    actions,
+                    seed=0,
+                    batch_size=BATCH,
+                    **self.engine,
+                )
             except SimulationError:  # of a few rows, all may be lost
                 self.num_missing += len(theta)
                 return [None] * len(theta)

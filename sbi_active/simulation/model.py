@@ -185,6 +185,12 @@ class SimulatorModel:
         assert self.noise is not None
         return self.noise.log_prob(x, mean)
 
+    def without_noise(self) -> SimulatorModel:
+        """Return a model of ``fn`` alone, which has other worker processes."""
+        bare = SimulatorModel(self.fn, setup=self.setup, batched=self.is_batched)
+        bare._is_deterministic = self._is_deterministic
+        return bare
+
     def is_deterministic(self, theta: Tensor, action: Tensor, **effects: Any) -> bool:
         """Return whether ``fn`` gives the same output under two seeds.
 
@@ -346,7 +352,8 @@ def _keywords(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
 def takes_seeds(simulator: Callable[..., Any]) -> bool:
     """Return whether each row of the simulator is a function of its seed."""
     if isinstance(simulator, SimulatorModel):
-        return simulator.fn_takes_seeds
+        has_no_use = simulator.noise is None and simulator._is_deterministic is True
+        return simulator.fn_takes_seeds or has_no_use
     try:
         return "seeds" in inspect.signature(simulator).parameters
     except (TypeError, ValueError):  # builtins and C functions have no signature
