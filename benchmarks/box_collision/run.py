@@ -41,7 +41,7 @@ from benchmarks.box_collision.summary import (
     read,
     summarize,
 )
-from sbi_active import Campaign, CampaignOptions, MixtureDensity
+from sbi_active import Campaign, CampaignOptions, MixtureDensity, Refinement
 from sbi_active.campaign import Trial
 from sbi_active.campaign.methods import METHODS, find_method
 from sbi_active.seeding import derive_seed, forked_generators
@@ -71,7 +71,12 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
     # The paper's simulations with this library's inference; as in the paper, those of
     # the training give the information as well.
     "paper_size": (
-        CampaignOptions(num_simulations=41 * 500, num_scored=500, design_on="training"),
+        CampaignOptions(
+            num_simulations=41 * 500,
+            num_scored=500,
+            design_on="training",
+            refinement=Refinement(num_effective=100),
+        ),
         {},
     ),
     "default": (CampaignOptions(num_samples=250, num_scored=500), {}),

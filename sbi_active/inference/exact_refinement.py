@@ -89,6 +89,7 @@ def refine_exactly(
     histories: HistoryRecord,
     pool: WeightedPool | None,
     num_histories: int,
+    num_effective: float,
     defensive: float,
     seed: int,
 ) -> ExactBelief | None:
@@ -102,6 +103,7 @@ def refine_exactly(
         histories: Simulated before, for the record.
         pool: Draws of the first of these trials.
         num_histories: A third of the simulations a trial to spend at most.
+        num_effective: Effective draws that end it.
         defensive: Share of the prior in the belief.
         seed: Of everything random here.
     """
@@ -116,6 +118,7 @@ def refine_exactly(
         past=pool,
         num_simulations=ROUGH * num_histories * len(likelihood),
         num_draws=max(num_histories // 6, 100),
+        num_effective=num_effective,
     )
     if pool.effective_sample_size < USABLE:
         return None

@@ -43,7 +43,6 @@ Array = NDArray[Any]
 NEGLIGIBLE = 25.0  # nats below the best draw, beyond which a draw is given up
 FEWEST = 60.0  # effective draws, below which the likelihood is tempered
 BROAD = 150.0  # effective draws that shape the wide half of a proposal
-ENOUGH = 200.0  # effective draws that end it
 MAX_STAGES = 40
 
 
@@ -169,6 +168,7 @@ def importance_sample(
     past: WeightedPool | None = None,
     num_simulations: int,
     num_draws: int,
+    num_effective: float = 200,
 ) -> WeightedPool:
     r"""Return weighted draws of the posterior of all trials.
 
@@ -188,6 +188,7 @@ def importance_sample(
         past: The pool of the first of these trials.
         num_simulations: To spend; the last stage may exceed it.
         num_draws: A stage.
+        num_effective: Effective draws that end it.
     """
     table, num_past = likelihood.table, 0
     stop = table.num_simulations + num_simulations
@@ -210,11 +211,11 @@ def importance_sample(
         pool.keep(np.isfinite(new))
     pool.num_trials = len(likelihood)
 
-    reached = 0.0 if pool.effective_sample_size < ENOUGH else 1.0
+    reached = 0.0 if pool.effective_sample_size < num_effective else 1.0
     if reached == 0:
         pool.restart()
     for _ in range(MAX_STAGES):
-        is_done = reached == 1 and pool.effective_sample_size >= ENOUGH
+        is_done = reached == 1 and pool.effective_sample_size >= num_effective
         if is_done or not len(pool.z) or table.num_simulations >= stop:
             break
         log_new = pool.log_likelihood - log_past

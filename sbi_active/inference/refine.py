@@ -64,6 +64,9 @@ class Refinement:
             where the surrogate is good sooner. A trial that had a measurement is
             simulated again, up to 16 times, where by chance simulations have none.
             A simulated likelihood may take three times as many.
+        num_effective: Effective draws that end the sampling of a simulated likelihood.
+            The log density of the belief is off by about their number to the power
+            -1/2, in nats.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
@@ -87,6 +90,7 @@ class Refinement:
     """
 
     num_histories: int = 3_000
+    num_effective: float = 200
     defensive: float = 1e-5
     first_share: float = 0.25
     stage_share: float = 0.15
@@ -101,6 +105,7 @@ class Refinement:
     def __post_init__(self) -> None:
         for name, low, high in (
             ("num_histories", 200, np.inf),
+            ("num_effective", 20, np.inf),
             ("defensive", 1e-6, 0.5),
             ("first_share", 0.05, 1.0),
             ("stage_share", 0.02, 1.0),
@@ -196,6 +201,7 @@ def refine(
                 histories=past,
                 pool=past.pool,
                 num_histories=settings.num_histories,
+                num_effective=settings.num_effective,
                 defensive=settings.defensive,
                 seed=seed,
             )
@@ -308,6 +314,7 @@ def _refine(
                 histories=histories.record(),
                 pool=None,
                 num_histories=settings.num_histories,
+                num_effective=settings.num_effective,
                 defensive=settings.defensive,
                 seed=seed,
             )

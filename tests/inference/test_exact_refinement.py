@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -222,6 +223,18 @@ def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):
     corrected = x.clone()
     corrected[0] += 0.1
     assert not second.histories.leads_to(model, ACTION, corrected)  # pyright: ignore
+
+
+def test_it_ends_at_the_effective_draws_that_are_asked_for(model: SimulatorModel):
+    x = observe(model, 2)[:1]
+    spent = []
+    for num_effective in (50, 400):
+        settings = replace(FEW, num_histories=3_000, num_effective=num_effective)
+        belief = refine(model, BOX, ACTION[:1], x, settings=settings, seed=0)
+        assert isinstance(belief, ExactBelief)
+        assert belief.diagnostics["effective_sample_size"] >= num_effective
+        spent.append(belief.diagnostics["num_simulations"])
+    assert spent[0] < spent[1]
 
 
 def test_a_smooth_density_costs_no_simulations(model: SimulatorModel):

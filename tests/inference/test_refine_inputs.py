@@ -103,7 +103,12 @@ def test_deterministic_simulator_is_refused():
 
 @pytest.mark.parametrize(
     "option",
-    [{"num_histories": 50}, {"defensive": 0.0}, {"replicate_share": 0.9}],
+    [
+        {"num_histories": 50},
+        {"num_effective": 5},
+        {"defensive": 0.0},
+        {"replicate_share": 0.9},
+    ],
 )
 def test_settings_validate_themselves(option: dict):
     with pytest.raises(ValueError, match=f"expected {next(iter(option))} in"):
