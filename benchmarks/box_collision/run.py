@@ -75,7 +75,7 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
             num_simulations=41 * 500,
             num_scored=500,
             design_on="training",
-            refinement=Refinement(num_effective=100),
+            refinement=Refinement(num_effective=100, num_draws=100),
         ),
         {},
     ),

@@ -90,6 +90,7 @@ def refine_exactly(
     pool: WeightedPool | None,
     num_histories: int,
     num_effective: float,
+    num_draws: int | None,
     defensive: float,
     seed: int,
 ) -> ExactBelief | None:
@@ -104,6 +105,7 @@ def refine_exactly(
         pool: Draws of the first of these trials.
         num_histories: A third of the simulations a trial to spend at most.
         num_effective: Effective draws that end it.
+        num_draws: Of each proposal; None takes a sixth of ``num_histories``.
         defensive: Share of the prior in the belief.
         seed: Of everything random here.
     """
@@ -117,7 +119,7 @@ def refine_exactly(
         base=PriorProposal(coordinates),
         past=pool,
         num_simulations=ROUGH * num_histories * len(likelihood),
-        num_draws=max(num_histories // 6, 100),
+        num_draws=num_draws or max(num_histories // 6, 100),
         num_effective=num_effective,
     )
     if pool.effective_sample_size < USABLE:

@@ -67,6 +67,9 @@ class Refinement:
         num_effective: Effective draws that end the sampling of a simulated likelihood.
             The log density of the belief is off by about their number to the power
             -1/2, in nats.
+        num_draws: Of each proposal of a simulated likelihood; None takes a sixth of
+            ``num_histories``, at least 100. Fewer reach a narrow posterior in fewer
+            simulations.
         defensive: Share of the prior in the belief, so that no parameter is ruled out
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
@@ -91,6 +94,7 @@ class Refinement:
 
     num_histories: int = 3_000
     num_effective: float = 200
+    num_draws: int | None = None
     defensive: float = 1e-5
     first_share: float = 0.25
     stage_share: float = 0.15
@@ -106,6 +110,7 @@ class Refinement:
         for name, low, high in (
             ("num_histories", 200, np.inf),
             ("num_effective", 20, np.inf),
+            ("num_draws", 50, np.inf),
             ("defensive", 1e-6, 0.5),
             ("first_share", 0.05, 1.0),
             ("stage_share", 0.02, 1.0),
@@ -114,6 +119,8 @@ class Refinement:
             ("max_regions", 1, 32),
         ):
             value = getattr(self, name)
+            if name == "num_draws" and value is None:
+                continue
             if not low <= value <= high:
                 raise ValueError(
                     f"expected {name} in [{low:g}, {high:g}]; got {value}; do choose "
@@ -202,6 +209,7 @@ def refine(
                 pool=past.pool,
                 num_histories=settings.num_histories,
                 num_effective=settings.num_effective,
+                num_draws=settings.num_draws,
                 defensive=settings.defensive,
                 seed=seed,
             )
@@ -315,6 +323,7 @@ def _refine(
                 pool=None,
                 num_histories=settings.num_histories,
                 num_effective=settings.num_effective,
+                num_draws=settings.num_draws,
                 defensive=settings.defensive,
                 seed=seed,
             )

@@ -228,12 +228,15 @@ def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):
 def test_it_ends_at_the_effective_draws_that_are_asked_for(model: SimulatorModel):
     x = observe(model, 2)[:1]
     spent = []
+    settings = replace(FEW, num_histories=3_000)
     for num_effective in (50, 400):
-        settings = replace(FEW, num_histories=3_000, num_effective=num_effective)
+        settings = replace(settings, num_effective=num_effective, num_draws=150)
         belief = refine(model, BOX, ACTION[:1], x, settings=settings, seed=0)
         assert isinstance(belief, ExactBelief)
         assert belief.diagnostics["effective_sample_size"] >= num_effective
         spent.append(belief.diagnostics["num_simulations"])
+        numbers = [num for num, _ in belief.histories.pool.proposals]  # pyright: ignore
+        assert set(numbers) == {750, 150}  # those of the first proposals, then of all
     assert spent[0] < spent[1]
 
 
