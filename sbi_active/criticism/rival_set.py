@@ -237,12 +237,10 @@ class RivalSet:
         own = self.evidence(names, error=error)
         seed = derive_seed(self.seed, "tempering", rival.name)
         before = self.simulator.num_simulations
-        sample = temper(
-            rival, seed=seed, num_particles=FEW_PARTICLES, num_moves=FEW_MOVES
-        )
+        sample = self._temper(rival, seed, few=True)
         either = np.hypot(own.standard_error, sample.standard_error)
         if not sample.log_evidence < own.log_evidence + TOLERATED * either:
-            sample = temper(rival, seed=seed)
+            sample = self._temper(rival, seed, few=False)
         other = self._record(rival, sample, "tempering", before, seed)
         both = float(np.hypot(own.standard_error, other.standard_error))
         if other.log_evidence > own.log_evidence + 2 * both:
@@ -277,12 +275,18 @@ class RivalSet:
         )
         if not behind < UNLIKELY or sample.effective_sample_size >= too_few:
             return sample, "least squares"
-        other = temper(rival, seed=seed)
-        both = np.hypot(sample.standard_error, other.standard_error)
-        if sample.log_evidence > other.log_evidence + 2 * both:
-            # Particles that lost a ridge do not find it again.
-            return sample, "least squares"
+        # Where the simulator jumps, all particles are dear, and most often behind.
+        for few in (False,) if self.is_smooth else (True, False):
+            other = self._temper(rival, seed, few=few)
+            both = np.hypot(sample.standard_error, other.standard_error)
+            if sample.log_evidence > other.log_evidence + 2 * both:
+                # Particles that lost a ridge do not find it again.
+                return sample, "least squares"
         return other, "tempering"
+
+    def _temper(self, rival: Rival, seed: int, *, few: bool) -> ImportanceSample:
+        size = {"num_particles": FEW_PARTICLES, "num_moves": FEW_MOVES} if few else {}
+        return temper(rival, seed=seed, **size)
 
     def _behind(self, rival: Rival, modes: Array) -> float:
         """Return how far even the largest likelihood is below a known evidence, nats.
