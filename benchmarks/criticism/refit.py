@@ -14,6 +14,8 @@ __all__ = ["local_fits", "residual_sum_of_squares"]
 
 STARTS = 8
 GENERATIONS = 20  # of as many candidates as starts, where the simulator is rough
+RUNS = 4  # there at most, as each finds an upper bound
+NOTHING = 10.0  # sum of squares, below which no data tell, and no run must follow
 DIFFERENCE = 1e-5  # of a parameter's range
 
 
@@ -31,25 +33,30 @@ def residual_sum_of_squares(
         starts: As there.
         prior: As there.
         is_rough: Whether derivatives lead nowhere: differential evolution then searches
-            theta's box and the range of the starts' strengths.
+            theta's box and the range of the starts' strengths, up to four times.
     """
     if not is_rough:
         return min(2 * fit.cost for fit in local_fits(residual, starts, prior=prior))
     low, high = starts.amin(0), starts.amax(0)
     edges = torch.stack(_edges(prior)).double()
     low[: edges.shape[1]], high[: edges.shape[1]] = edges
-    found = differential_evolution(
-        lambda z: residual(torch.from_numpy(z.T.copy())).square().sum(1).numpy(),
-        np.stack([low.numpy(), high.numpy()], 1),
-        init=starts.numpy(),  # pyright: ignore[reportArgumentType]
-        maxiter=GENERATIONS,
-        tol=0.0,
-        polish=False,
-        vectorized=True,
-        updating="deferred",
-        rng=0,
-    )
-    return float(found.fun)
+    best = np.inf
+    for run in range(RUNS):
+        found = differential_evolution(
+            lambda z: residual(torch.from_numpy(z.T.copy())).square().sum(1).numpy(),
+            np.stack([low.numpy(), high.numpy()], 1),
+            init=starts.numpy(),  # pyright: ignore[reportArgumentType]
+            maxiter=GENERATIONS,
+            tol=0.0,
+            polish=False,
+            vectorized=True,
+            updating="deferred",
+            rng=run,
+        )
+        best = min(best, float(found.fun))
+        if best < NOTHING:
+            break
+    return best
 
 
 def local_fits(

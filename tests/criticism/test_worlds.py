@@ -281,3 +281,21 @@ def test_a_rough_fit_needs_no_derivatives():
     descended = residual_sum_of_squares(residual, starts, prior=prior)
     assert descended == float(residual(starts).square().sum(1).min())
     assert found < 0.1 * descended
+
+
+def test_a_rough_fit_is_repeated_where_much_is_left():
+    prior = BoxUniform(-torch.ones(1), torch.ones(1))
+    torch.manual_seed(0)
+    starts = prior.sample((16,)).double()
+    rows = {}
+    for left in (9.0, 11.0):
+        count = []
+
+        def residual(z, left=left, count=count):
+            count.append(len(z))
+            return torch.full((len(z), 1), left).double().sqrt() + 0.0 * z
+
+        found = residual_sum_of_squares(residual, starts, prior=prior, is_rough=True)
+        assert found == pytest.approx(left)
+        rows[left] = sum(count)
+    assert rows[11.0] == 4 * rows[9.0]
