@@ -18,6 +18,7 @@ from sbi_active.inference.exact_belief import ExactBelief
 from sbi_active.inference.histories import HistoryRecord
 from sbi_active.inference.importance import WeightedPool, importance_sample
 from sbi_active.inference.population import Proposal
+from sbi_active.inference.refinement import Refinement
 from sbi_active.inference.regions import PriorProposal
 from sbi_active.inference.simulated_likelihood import MeanTable, SimulatedLikelihood
 from sbi_active.inference.trust import EDGE, RARE
@@ -88,10 +89,7 @@ def refine_exactly(
     first: Sequence[tuple[int, Proposal]],
     histories: HistoryRecord,
     pool: WeightedPool | None,
-    num_histories: int,
-    num_effective: float,
-    num_draws: int | None,
-    defensive: float,
+    settings: Refinement,
     seed: int,
 ) -> ExactBelief | None:
     """Return the posterior by importance sampling; None where too few draws count.
@@ -103,10 +101,7 @@ def refine_exactly(
         first: Numbers of draws and proposals to begin with, where there is no pool.
         histories: Simulated before, for the record.
         pool: Draws of the first of these trials.
-        num_histories: A third of the simulations a trial to spend at most.
-        num_effective: Effective draws that end it.
-        num_draws: Of each proposal; None takes a sixth of ``num_histories``.
-        defensive: Share of the prior in the belief.
+        settings: Budget, draws, and the prior's share in the belief.
         seed: Of everything random here.
     """
     table = likelihood.table
@@ -118,13 +113,15 @@ def refine_exactly(
         first=first,
         base=PriorProposal(coordinates),
         past=pool,
-        num_simulations=ROUGH * num_histories * len(likelihood),
-        num_draws=num_draws or max(num_histories // 6, 100),
-        num_effective=num_effective,
+        num_simulations=ROUGH * settings.num_histories * len(likelihood),
+        num_draws=settings.num_draws or max(settings.num_histories // 6, 100),
+        num_effective=settings.num_effective,
     )
     if pool.effective_sample_size < USABLE:
         return None
-    belief = ExactBelief(prior, coordinates, likelihood, pool, defensive=defensive)
+    belief = ExactBelief(
+        prior, coordinates, likelihood, pool, defensive=settings.defensive
+    )
     belief.diagnostics = _diagnose(likelihood, coordinates, pool, seed)
     num_simulations = table.num_simulations - before[0]
     num_missing = table.num_missing - before[1]

@@ -168,7 +168,7 @@ def importance_sample(
     past: WeightedPool | None = None,
     num_simulations: int,
     num_draws: int,
-    num_effective: float = 200,
+    num_effective: float,
 ) -> WeightedPool:
     r"""Return weighted draws of the posterior of all trials.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from sbi_active.inference.population import (
     population_monte_carlo,
 )
 from sbi_active.inference.refined_belief import RefinedBelief
+from sbi_active.inference.refinement import Refinement
 from sbi_active.inference.regions import (
     PriorProposal,
     Region,
@@ -52,80 +53,6 @@ Array = NDArray[Any]
 
 HALF = 0.5  # of the budget, after which misfit is taken to stay
 MIN_STAGE = 60  # histories below which another stage adds nothing
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refinement:
-    """Settings of the refinement.
-
-    Attributes:
-        num_histories: Budget of simulated histories, replicates included; a history is
-            a parameter set at which each executed action is simulated. Fewer are used
-            where the surrogate is good sooner. A trial that had a measurement is
-            simulated again, up to 16 times, where by chance simulations have none.
-            A simulated likelihood may take three times as many.
-        num_effective: Effective draws that end the sampling of a simulated likelihood.
-            The log density of the belief is off by about their number to the power
-            -1/2, in nats.
-        num_draws: Of each proposal of a simulated likelihood; None takes a sixth of
-            ``num_histories``, at least 100. Fewer reach a narrow posterior in fewer
-            simulations.
-        defensive: Share of the prior in the belief, so that no parameter is ruled out
-            by an error of the surrogate: a truth that it misses costs log(1 / share)
-            nats and not infinitely many. Moments see the share too: .01 of a wide
-            prior outweighs a sharp posterior.
-        first_share: Share of the budget for the first stage, over the whole prior. It
-            must find every mode; what it spends is lost where the posterior is narrow.
-        stage_share: Share for each later stage.
-        replicate_share: Share of a stage simulated twice, which tells noise from
-            misfit.
-        num_particles: Of the importance sample of the surrogate, which costs no
-            simulations; its effective number bounds the error of the normalizer.
-        max_regions: Ellipsoids at most, but for splits against misfit.
-        check_order: Refine a second time, with the trials in reverse and new
-            simulations, and report the divergence between the two: what the order and
-            the draws contribute. It doubles the cost. A simulated likelihood has no
-            order and no such check.
-        num_workers: Of the simulations, see :func:`~sbi_active.simulation.simulate`.
-        time_limit: Seconds a simulated row may take; None waits for ever.
-        num_retries: How often a row that a fault lost is tried again. A history of
-            which a row stays lost is left out.
-    """
-
-    num_histories: int = 3_000
-    num_effective: float = 200
-    num_draws: int | None = None
-    defensive: float = 1e-5
-    first_share: float = 0.25
-    stage_share: float = 0.15
-    replicate_share: float = 0.2
-    num_particles: int = 8_000
-    max_regions: int = 8
-    check_order: bool = False
-    num_workers: int = 1
-    time_limit: float | None = None
-    num_retries: int = 0
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("num_histories", 200, np.inf),
-            ("num_effective", 20, np.inf),
-            ("num_draws", 50, np.inf),
-            ("defensive", 1e-6, 0.5),
-            ("first_share", 0.05, 1.0),
-            ("stage_share", 0.02, 1.0),
-            ("replicate_share", 0.05, 0.5),
-            ("num_particles", 1_000, np.inf),
-            ("max_regions", 1, 32),
-        ):
-            value = getattr(self, name)
-            if name == "num_draws" and value is None:
-                continue
-            if not low <= value <= high:
-                raise ValueError(
-                    f"expected {name} in [{low:g}, {high:g}]; got {value}; do choose "
-                    "a value in this range"
-                )
 
 
 def refine(
@@ -199,7 +126,7 @@ def refine(
     with single_thread():
         belief = None
         if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
-            past.table.engine = _engine(settings)
+            past.table.engine = settings.engine
             belief = refine_exactly(
                 prior,
                 SimulatedLikelihood(past.table, action, outcome),
@@ -207,10 +134,7 @@ def refine(
                 first=[],
                 histories=past,
                 pool=past.pool,
-                num_histories=settings.num_histories,
-                num_effective=settings.num_effective,
-                num_draws=settings.num_draws,
-                defensive=settings.defensive,
+                settings=settings,
                 seed=seed,
             )
         if belief is None:
@@ -245,7 +169,7 @@ def _refine(
 ) -> RefinedBelief | ExactBelief:
     rng = np.random.default_rng(derive_seed(seed, "refine"))
     coordinates = PriorCoordinates(prior, rng)
-    observed, engine = outcome.numpy().reshape(len(outcome), -1), _engine(settings)
+    observed, engine = outcome.numpy().reshape(len(outcome), -1), settings.engine
     histories = Histories(simulator, action, observed, coordinates, seed, past, engine)
 
     regions = [whole_space(coordinates.dim)]
@@ -321,10 +245,7 @@ def _refine(
                 ],
                 histories=histories.record(),
                 pool=None,
-                num_histories=settings.num_histories,
-                num_effective=settings.num_effective,
-                num_draws=settings.num_draws,
-                defensive=settings.defensive,
+                settings=settings,
                 seed=seed,
             )
             if exact is not None:
@@ -355,14 +276,6 @@ def _refine(
             stacklevel=3,
         )
     return belief
-
-
-def _engine(settings: Refinement) -> dict[str, Any]:
-    return {
-        "num_workers": settings.num_workers,
-        "time_limit": settings.time_limit,
-        "num_retries": settings.num_retries,
-    }
 
 
 def _stage_size(settings: Refinement, used: int) -> int:

@@ -90,6 +90,7 @@ def sampled(model: SimulatorModel, x: Tensor, count: int, seed: int = 0, past=No
         past=past,
         num_simulations=9_000,
         num_draws=500,
+        num_effective=200,
     )
     return likelihood, pool
 

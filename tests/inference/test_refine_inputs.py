@@ -106,6 +106,7 @@ def test_deterministic_simulator_is_refused():
     [
         {"num_histories": 50},
         {"num_effective": 5},
+        {"num_draws": 1},
         {"defensive": 0.0},
         {"replicate_share": 0.9},
     ],
