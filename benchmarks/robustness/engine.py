@@ -1,0 +1,7 @@
+"""Attacks on the engine: hostile simulators, workers that die, interrupted runs."""
+
+from __future__ import annotations
+
+from benchmarks.robustness.attacks import Attacks
+
+ATTACKS = Attacks()
