@@ -44,7 +44,7 @@ class BoxActions(ActionSpace):
         names: Sequence[str] | None = None,
         units: Sequence[str] | None = None,
     ) -> None:
-        limits = [torch.as_tensor(v, dtype=torch.float32) for v in (low, high)]
+        limits = [torch.as_tensor(v, dtype=torch.float32).clone() for v in (low, high)]
         self.low, self.high = (v[None] if v.ndim == 0 else v for v in limits)
         if self.low.ndim != 1 or self.low.shape != self.high.shape or not len(self.low):
             raise ValueError(

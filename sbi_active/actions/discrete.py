@@ -38,7 +38,7 @@ class DiscreteActions(ActionSpace):
         names: Sequence[str] | None = None,
         units: Sequence[str] | None = None,
     ) -> None:
-        tensor = torch.as_tensor(values, dtype=torch.float32)
+        tensor = torch.as_tensor(values, dtype=torch.float32).clone()
         if tensor.ndim == 1:
             tensor = tensor[:, None]
         if tensor.ndim != 2 or tensor.numel() == 0:

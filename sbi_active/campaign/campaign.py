@@ -301,7 +301,7 @@ class Campaign:
             index = self.ask().index
             if self.stop_reason is not None:
                 break
-            self.tell(real_system(self.state.trials[index].action), trial=index)
+            self.tell(real_system(self.state.trials[index].action.clone()), trial=index)
             self.update()
             if on_round is not None:
                 on_round(self.state.trials[index])

@@ -75,7 +75,7 @@ class AugmentedSimulator(SimulatorModel):
         self.next_index = next_index
         times = getattr(model, "sample_times", None)
         times = times if sample_times is None else sample_times
-        self._times = None if times is None else torch.as_tensor(times).double()
+        self._times = None if times is None else torch.as_tensor(times).double().clone()
         names = base.parameter_names
         if names is not None:
             campaign = [e for e in self.effects if e.scope == "campaign"]

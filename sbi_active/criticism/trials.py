@@ -310,7 +310,8 @@ class Trials:
 
 
 def _tensor(value: Any) -> Tensor:
-    return torch.as_tensor(np.asarray(value), dtype=torch.float64)
+    """Return numbers in float64 that their owner cannot change afterwards."""
+    return torch.as_tensor(np.asarray(value), dtype=torch.float64).clone()
 
 
 def _padded(value: Any) -> Tensor:

@@ -219,7 +219,7 @@ class ActionRounds:
 
     def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
         """Return the checked trial."""
-        x = torch.as_tensor(x_o, dtype=torch.float32)
+        x = torch.as_tensor(x_o)
         shape = self._outcome_shape
         if shape is None:  # no simulations yet: the first trial says
             shape = self.trials[0].x.shape if self.trials else x.shape or (1,)

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from sbi_active.simulation.simulator import own_tensor, single_precision
+
 __all__ = ["ActionEmbedding", "action_rows", "outcome_rows", "pack", "unpack"]
 
 
@@ -37,7 +39,7 @@ def unpack(condition: Tensor, x_shape: Sequence[int]) -> tuple[Tensor, Tensor]:
 def action_rows(
     action: Tensor, action_dim: int | None, *, num_rows: int | None = None
 ) -> Tensor:
-    """Return actions as float32 rows, one action repeated where one is given.
+    """Return actions as float32 rows of their own, one repeated where one is given.
 
     Args:
         action: Shape (action_dim,), (1, action_dim) or (n, action_dim).
@@ -50,7 +52,7 @@ def action_rows(
     Raises:
         ValueError: If the shape does not fit.
     """
-    rows = torch.as_tensor(action, dtype=torch.float32)
+    rows = torch.as_tensor(action, dtype=torch.float32).clone()
     rows = rows.reshape(1, -1) if rows.ndim < 2 else rows
     wrong_dim = rows.ndim != 2 or action_dim not in (None, rows.shape[-1])
     if wrong_dim or (num_rows is not None and len(rows) not in (1, num_rows)):
@@ -64,7 +66,7 @@ def action_rows(
 
 
 def outcome_rows(x: Tensor, x_shape: Sequence[int]) -> Tensor:
-    """Return outcomes as float32 rows of the shape seen in training.
+    """Return outcomes as float32 rows of their own, of the shape seen in training.
 
     Args:
         x: Shape x_shape or (n, *x_shape); a scalar where x is one number.
@@ -74,10 +76,10 @@ def outcome_rows(x: Tensor, x_shape: Sequence[int]) -> Tensor:
         Shape (n, *x_shape).
 
     Raises:
-        ValueError: If the shape does not fit.
+        ValueError: If the shape does not fit, or a number is complex or beyond float32.
     """
     shape = torch.Size(x_shape)
-    rows = torch.as_tensor(x, dtype=torch.float32)
+    rows = single_precision(own_tensor(x))
     if rows.shape == shape or (rows.ndim == 0 and shape.numel() == 1):
         return rows.reshape(1, *shape)
     if rows.shape[1:] == shape:

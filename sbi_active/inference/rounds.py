@@ -68,8 +68,8 @@ def round_rows(
     Raises:
         ValueError: If shapes do not fit, theta leaves the support, or no row is valid.
     """
-    theta = torch.as_tensor(theta, dtype=torch.float32)
-    x = torch.as_tensor(x, dtype=torch.float32)
+    theta = torch.as_tensor(theta, dtype=torch.float32).clone()
+    x = torch.as_tensor(x)
     x = x[:, None] if x.ndim == 1 else x
     dim = parameter_dim(prior)
     if theta.ndim != 2 or theta.shape[1] != dim or len(x) != len(theta):

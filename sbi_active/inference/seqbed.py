@@ -342,7 +342,7 @@ class SeqBED:
         return belief
 
     def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
-        x = torch.as_tensor(x_o, dtype=torch.float32)
+        x = torch.as_tensor(x_o)
         shape = self._x_shape
         if shape is None:
             shape = self.trials[0].x.shape if self.trials else x.shape or (1,)

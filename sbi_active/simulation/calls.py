@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
-from sbi_active.simulation.simulator import outcome_tensor
+from sbi_active.simulation.simulator import outcome_tensor, single_precision
 
 __all__ = ["BLOCK", "Call", "Fault", "Reply", "answer"]
 
@@ -24,6 +24,9 @@ __all__ = ["BLOCK", "Call", "Fault", "Reply", "answer"]
 BLOCK = 256
 
 Fault = Literal["raised", "timed out", "worker died", "misused", "not loaded"]
+
+#: What is caught in the user's process, where an interrupt means the whole program.
+HERE = (Exception, SystemExit)
 
 _INTERFACE = {SimulatorModel.__module__, outcome_tensor.__module__}
 
@@ -101,12 +104,24 @@ class Reply:
         return Reply, (self.x, self.seconds, self.fault, self.traceback)
 
 
-def answer(simulator: Callable[..., Any], call: Call) -> Reply:
-    """Run the simulator over the rows of a call; its exceptions become a reply."""
+def answer(
+    simulator: Callable[..., Any],
+    call: Call,
+    *,
+    catches: type[BaseException] | tuple[type[BaseException], ...] = HERE,
+) -> Reply:
+    """Run the simulator over the rows of a call; its exceptions become a reply.
+
+    Args:
+        simulator: Takes theta, the action, and seeds where the call says so.
+        call: The rows.
+        catches: Exceptions that become a reply. All of them in a process that serves
+            calls alone, where nobody else would tell what was raised.
+    """
     start = time.perf_counter()
     try:
-        x = _draw(simulator, call).float()
-    except (Exception, SystemExit) as error:
+        x = _draw(simulator, call)
+    except catches as error:
         fault = "misused" if _is_of_the_interface(error) else "raised"
         return Reply(None, 0.0, fault, traceback.format_exc(), error)
     return Reply(x, time.perf_counter() - start)
@@ -114,17 +129,27 @@ def answer(simulator: Callable[..., Any], call: Call) -> Reply:
 
 def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
     if call.draws == "seeds":
-        x = simulator(call.theta, call.action, seeds=call.seeds)
-        return outcome_tensor(x, len(call))
+        return _run(simulator, call, has_seeds=True)
     parts = []
     kind = "block" if call.draws == "blocks" else "row"
+    has_seeds = isinstance(simulator, SimulatorModel)
     for rows in call.blocks():
         part = call.part(rows)
-        seeds = {"seeds": part.seeds} if isinstance(simulator, SimulatorModel) else {}
         with _GENERATORS, forked_generators(call.seed, kind, int(part.rows[0])):
-            x = simulator(part.theta, part.action, **seeds)
-        parts.append(outcome_tensor(x, len(part)))
+            parts.append(_run(simulator, part, has_seeds=has_seeds))
     return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _run(simulator: Callable[..., Any], call: Call, *, has_seeds: bool) -> Tensor:
+    """Call the simulator, whose arguments and output it shares with nobody.
+
+    It may change the arguments in place, and return a buffer that it fills again.
+    """
+    theta, action = call.theta.clone(), call.action.clone()
+    seeds = {"seeds": call.seeds.clone()} if has_seeds else {}
+    return single_precision(
+        outcome_tensor(simulator(theta, action, **seeds), len(call))
+    )
 
 
 def _is_of_the_interface(error: BaseException) -> bool:

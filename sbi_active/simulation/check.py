@@ -121,6 +121,7 @@ class _Runs:
     def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Any:
         """Call the simulator as it is, whatever it returns."""
         taken = takes_seeds(self.simulator)
+        theta, action, seeds = theta.clone(), action.clone(), seeds.clone()
         if isinstance(self.simulator, SimulatorModel) or taken:
             with forked_generators(self.seed, "call"):
                 return self.simulator(theta, action, seeds=seeds)

@@ -106,7 +106,7 @@ def simulate(
         >>> rows.x.shape
         torch.Size([3, 1])
     """
-    theta, action = _checked(theta, action)
+    theta, action = _checked(torch.as_tensor(theta), torch.as_tensor(action))
     _check_options(num_workers, batch_size, time_limit, num_retries)
     pool = _pool(simulator, num_workers, time_limit)
     if not isinstance(pool, InProcess):
@@ -143,6 +143,7 @@ def _checked(theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         )
     if not len(theta):
         raise ValueError("expected at least one row; got none; do pass theta of n >= 1")
+    theta, action = _own_rows(theta), _own_rows(action)
     for name, rows in (("theta", theta), ("action", action)):
         finite = rows.isfinite().flatten(1).all(-1)
         if not bool(finite.all()):
@@ -151,7 +152,17 @@ def _checked(theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
                 f"expected finite {name}; got NaN or inf in {len(bad)} rows, first "
                 f"{int(bad[0])}: {rows[bad[0]].tolist()}; do remove those rows"
             )
-    return theta.float(), action.float()
+    return theta, action
+
+
+def _own_rows(rows: Tensor) -> Tensor:
+    """Return parameters or actions in float32, which no caller changes later."""
+    if rows.is_complex():
+        raise ValueError(
+            f"expected theta and action of real numbers; got {rows.dtype}; pass the "
+            "real and the imaginary part as two columns"
+        )
+    return rows.to(torch.float32, copy=True)
 
 
 def _check_options(

@@ -17,6 +17,7 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.noise import NoiseModel
 from sbi_active.simulation.simulator import (
     Simulator,
+    outcome_array,
     outcome_tensor,
     require_noise,
 )
@@ -92,9 +93,10 @@ class SimulatorModel:
         self.setup = setup
         self.parameter_names = None if parameter_names is None else [*parameter_names]
         self.channel_names = None if channel_names is None else [*channel_names]
-        self.sample_times = sample_times
+        self.sample_times = None
         if sample_times is not None:
-            self.sample_times = torch.as_tensor(sample_times, dtype=torch.float64)
+            times = torch.as_tensor(sample_times, dtype=torch.float64)
+            self.sample_times = times.clone()
         self.noise = noise
         if noise is not None and self.sample_times is not None:
             self.noise = noise.at(self.sample_times)
@@ -255,8 +257,9 @@ class SimulatorModel:
             x = self._run_rows(theta, action, seeds, effects, keywords)
         else:
             if self.fn_takes_seeds:
-                keywords["seeds"] = seeds
-            x = self.fn(theta, action, **effects, **keywords)
+                keywords["seeds"] = _copied(seeds)
+            own = {k: _copied(v) for k, v in effects.items()}
+            x = self.fn(theta.clone(), action.clone(), **own, **keywords)
         x = outcome_tensor(x, len(theta))
         names = self.channel_names
         if names is not None and x.shape[-1] != len(names):
@@ -279,10 +282,10 @@ class SimulatorModel:
         arrays = {k: np.asarray(v, dtype=np.float64) for k, v in effects.items()}
         rows: list[np.ndarray] = []
         for i, seed in enumerate(seeds.tolist()):
-            own = {k: v[i] if v.ndim else float(v) for k, v in arrays.items()}
+            own = {k: v[i].copy() if v.ndim else float(v) for k, v in arrays.items()}
             rng = np.random.default_rng(seed)
             x = self.fn(thetas[i].copy(), actions[i].copy(), rng, **own, **keywords)
-            rows.append(np.asarray(x, dtype=np.float64))
+            rows.append(outcome_array(x))
             if rows[i].shape != rows[0].shape:
                 raise ValueError(
                     f"expected rows of one shape, {rows[0].shape}; got "
@@ -330,6 +333,13 @@ class SimulatorModel:
                     f"expected {name} as a number or one a row, shape ({len(theta)}, "
                     f"...); got {tuple(np.shape(value))}; do repeat it for each row"
                 )
+
+
+def _copied(value: Any) -> Any:
+    """Return an array that ``fn`` may change; a number is what it is."""
+    if isinstance(value, Tensor):
+        return value.clone()
+    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def _zeros(theta: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,7 +53,7 @@ class NoiseModel(ABC):
     def at(self, times: Tensor | None) -> NoiseModel:
         """Return the same noise at time stamps (T,), in seconds."""
         noise = copy.copy(self)
-        noise.times = None if times is None else torch.as_tensor(times).double()
+        noise.times = None if times is None else _copied(times)
         return noise
 
     @abstractmethod
@@ -123,7 +124,7 @@ class ScaleNoise(NoiseModel):
         shared: Mapping[str, float | Tensor] | None = None,
         posterior: Distribution | None = None,
     ) -> None:
-        self.sd = torch.as_tensor(sd, dtype=torch.float64)
+        self.sd = _copied(sd)
         if self.sd.ndim > 1:
             raise ValueError(
                 "expected a standard deviation that is a number or one a channel; got "
@@ -275,6 +276,11 @@ class ScaleNoise(NoiseModel):
     def _by_channel(self, terms: Tensor) -> Tensor:
         """Return sums over all but the channels, (n, *x_shape) -> (n, num_sd)."""
         return terms.reshape(len(terms), -1, self._num_sd).sum(1)
+
+
+def _copied(values: Any) -> Tensor:
+    """Return numbers in float64 that their owner cannot change afterwards."""
+    return torch.as_tensor(values, dtype=torch.float64).clone()
 
 
 def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:

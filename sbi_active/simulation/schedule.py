@@ -100,7 +100,7 @@ class Schedule:
         known = status != Outcome.MISSING  # a fault is tried again
         index, x, status = index[known], x[known], status[known]
         if len(index):
-            self._settle(index, x.float(), status.to(torch.int8))
+            self._settle(index, x.to(torch.float32, copy=True), status.to(torch.int8))
             self._has_succeeded = True
         return len(index)
 
@@ -203,8 +203,10 @@ class Schedule:
         self._take(call, reply.x)
 
     def _take(self, call: Call, x: Tensor) -> None:
-        x = torch.where(x.isfinite(), x, torch.nan)
-        measured = x.flatten(1).isfinite().any(-1).cpu()
+        finite = x.isfinite()
+        if not bool(finite.all()):
+            x = x.masked_fill(~finite, torch.nan)
+        measured = finite.flatten(1).any(-1).cpu()
         status = torch.where(measured, Outcome.OK, Outcome.INVALID).to(torch.int8)
         index = torch.from_numpy(call.rows)
         fresh = self.status[index] == _UNFINISHED

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Simulator", "outcome_tensor", "require_noise"]
+__all__ = [
+    "Simulator",
+    "outcome_array",
+    "outcome_tensor",
+    "own_tensor",
+    "require_noise",
+    "single_precision",
+]
 
 
 class Simulator(Protocol):
@@ -30,10 +38,12 @@ class Simulator(Protocol):
 def outcome_tensor(x: Any, num_rows: int) -> Tensor:
     """Return a simulator's output as a tensor with one row a parameter set.
 
+    It has memory of its own: a simulator may return the buffer that it works in.
+
     Raises:
-        ValueError: If the output does not have ``num_rows`` rows.
+        ValueError: If the output does not have ``num_rows`` rows of real numbers.
     """
-    x = torch.as_tensor(x)
+    x = own_tensor(x)
     if x.ndim == 0 or x.shape[0] != num_rows:
         raise ValueError(
             f"expected x with one row a parameter set, shape ({num_rows}, ...); got "
@@ -41,7 +51,101 @@ def outcome_tensor(x: Any, num_rows: int) -> Tensor:
         )
     if x.ndim == 1:  # one number a row
         x = x[:, None]
+    if not x.shape[1:].numel():
+        raise ValueError(
+            f"expected at least one number a row of x; got shape {tuple(x.shape)}; "
+            "return what was measured, and NaN where there is no measurement"
+        )
     return x if x.is_floating_point() else x.to(torch.get_default_dtype())
+
+
+def own_tensor(x: Any) -> Tensor:
+    """Return real numbers as a tensor that shares no memory with x.
+
+    Raises:
+        ValueError: If a number is complex.
+    """
+    x = _filled(x)
+    first = x[0] if isinstance(x, list | tuple) and x else None
+    if isinstance(x, Tensor):
+        tensor = x.clone()
+    elif isinstance(first, Tensor):
+        tensor = torch.stack(list(x))
+    elif isinstance(first, np.ndarray) or hasattr(x, "__array__"):
+        tensor = _from_numpy(np.array(x, order="C"))
+    else:
+        tensor = torch.as_tensor(x)
+        if tensor.is_floating_point():  # of Python's numbers, which have 64 bits
+            _require_in_range(torch.as_tensor(x, dtype=torch.float64), tensor)
+    _require_real(tensor.dtype, tensor.is_complex())
+    return tensor
+
+
+def outcome_array(x: Any) -> np.ndarray:
+    """Return the outcome of one row as float64, in memory of its own.
+
+    Raises:
+        ValueError: If a number is complex.
+    """
+    array = np.array(_filled(x))
+    _require_real(array.dtype, array.dtype.kind == "c")
+    return array.astype(np.float64, copy=False)
+
+
+def single_precision(x: Tensor) -> Tensor:
+    """Return real numbers in float32.
+
+    Raises:
+        ValueError: If one is finite but beyond float32.
+    """
+    rounded = x.to(torch.float32)
+    if x.dtype == torch.float64:
+        _require_in_range(x, rounded)
+    return rounded
+
+
+def _require_real(dtype: Any, is_complex: bool) -> None:
+    if is_complex:
+        raise ValueError(
+            f"expected x of real numbers; got {dtype}, whose imaginary part would be "
+            "lost; return the real and the imaginary part as two numbers"
+        )
+
+
+def _require_in_range(x: Tensor, rounded: Tensor) -> None:
+    """Raise where rounding to float32 made a measurement infinite."""
+    if bool(rounded.isfinite().all()):
+        return
+    beyond = x.isfinite() & ~rounded.isfinite()
+    if bool(beyond.any()):
+        raise ValueError(
+            "expected x within +-3.4e38, the range of float32; got "
+            f"{x[beyond][0].item():g}, which would count as no measurement; return x "
+            "in other units, or NaN where there is no measurement"
+        )
+
+
+def _filled(x: Any) -> Any:
+    """Return an outcome with NaN for masked numbers, which were not measured.
+
+    Raises:
+        RuntimeError: If there is none; it counts as an exception of the simulator.
+    """
+    if x is None:
+        raise RuntimeError(
+            "expected an outcome from the simulator; got None; return x, with NaN "
+            "where there is no measurement"
+        )
+    if isinstance(x, np.ma.MaskedArray):
+        return np.ma.filled(x.astype(np.float64), np.nan)
+    return x
+
+
+def _from_numpy(array: np.ndarray) -> Tensor:
+    """Convert dtypes that torch refuses, too: of other bytes, precision or None."""
+    if array.dtype == np.longdouble or array.dtype == object:
+        array = array.astype(np.float64)
+    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:

@@ -1,0 +1,284 @@
+"""Arrays that a simulator or a caller changes after they were handed over."""
+
+import sys
+import warnings
+
+import cloudpickle
+import joblib
+import numpy as np
+import pytest
+import torch
+
+from sbi_active import (
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+    simulate,
+)
+from sbi_active.criticism import Trials
+from sbi_active.inference.condition import action_rows, outcome_rows
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import MissingRowsWarning, check_simulator
+
+# A worker cannot import a test module.
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
+
+THETA = torch.linspace(0, 0.2, 600)[:, None]
+ACTION = torch.ones(600, 1)
+ENGINE = [{}, {"batch_size": 7}, {"num_workers": 2}]
+
+
+class State:
+    """What MuJoCo calls data: one set of arrays for all rows."""
+
+    def __init__(self):
+        self.qpos = np.zeros(2)
+        self.batch = torch.zeros(1000, 3)
+
+
+def one_row(theta, action, rng, *, context):
+    context.qpos[:] = theta[0], -action[0]
+    return context.qpos
+
+
+def one_number(theta, action, rng, *, context):
+    context.qpos[0] = theta[0]
+    return context.qpos[:1]
+
+
+@pytest.mark.parametrize("options", ENGINE)
+@pytest.mark.parametrize("noise", [None, GaussianNoise(0.0)])
+def test_rows_that_return_a_view_keep_their_own_x(options, noise):
+    model = SimulatorModel(one_row, batched=False, setup=State, noise=noise)
+    x = simulate(model, THETA, ACTION, seed=0, **options).x
+    assert torch.equal(x, torch.cat([THETA, -ACTION], 1))
+
+
+def test_the_mean_of_rows_that_return_a_view():
+    noise = GaussianNoise(0.1)
+    model = SimulatorModel(one_number, batched=False, setup=State, noise=noise)
+    mean = model.mean(THETA, ACTION)
+    assert torch.equal(mean.float(), THETA)
+
+
+class Buffer:
+    """Returns a part of the one array that it works in, filled anew in each call."""
+
+    def __init__(self, kind, seeded):
+        self.kind = kind
+        self.buffer = torch.zeros(1000, 3)
+        if seeded:
+            self.__class__ = SeededBuffer
+
+    def __call__(self, theta, action):
+        part = self.buffer[: len(theta), 1:2]
+        part.copy_(2 * theta)
+        return part if self.kind == "torch" else part.numpy()
+
+
+class SeededBuffer(Buffer):
+    def __call__(self, theta, action, seeds):
+        return super().__call__(theta, action)
+
+
+@pytest.mark.parametrize("options", ENGINE)
+@pytest.mark.parametrize("seeded", [True, False])
+@pytest.mark.parametrize("kind", ["torch", "numpy"])
+def test_a_simulator_may_return_the_buffer_it_fills_again(kind, seeded, options):
+    x = simulate(Buffer(kind, seeded), THETA, ACTION, seed=0, **options).x
+    assert torch.equal(x, 2 * THETA)
+
+
+@pytest.mark.parametrize("seeded", [True, False])
+def test_buffers_in_rounds_of_joblib(seeded):
+    with joblib.parallel_config(backend="sequential"):
+        x = simulate(
+            Buffer("torch", seeded), THETA, ACTION, seed=0, num_workers=2, batch_size=50
+        ).x
+    assert torch.equal(x, 2 * THETA)
+
+
+def test_a_mean_is_not_overwritten_by_the_next():
+    model = SimulatorModel(Buffer("torch", seeded=False), noise=GaussianNoise(1.0))
+    mean = model.mean(THETA, ACTION)
+    model.mean(5 * THETA, ACTION)
+    assert torch.equal(mean, 2 * THETA)
+
+
+def test_a_random_buffer_is_no_noise_free_output():
+    buffer = torch.zeros(8, 1)
+
+    def fn(theta, action):
+        return buffer[: len(theta)].normal_()
+
+    model = SimulatorModel(fn, noise=GaussianNoise(1.0))
+    assert not model.is_deterministic(THETA, ACTION)
+
+
+def change(theta, action, seeds):
+    """Change all arguments in place, torch's and through NumPy."""
+    theta.mul_(2)
+    action.numpy()[:] += 1
+    seeds.zero_()
+
+
+def changing(theta, action, seeds):
+    x = theta + action + row_normals(seeds, 1).float()
+    change(theta, action, seeds)
+    return x
+
+
+def changing_blocks(theta, action):
+    x = theta + action
+    change(theta, action, torch.zeros(1))
+    return x
+
+
+SIMULATORS = [
+    changing,
+    changing_blocks,
+    SimulatorModel(changing),
+    SimulatorModel(changing, noise=GaussianNoise(1.0)),
+    SimulatorModel(changing_blocks, noise=GaussianNoise(1.0)),
+]
+
+
+@pytest.mark.parametrize("options", ENGINE)
+@pytest.mark.parametrize("simulator", SIMULATORS)
+def test_a_simulator_may_change_its_arguments(simulator, options):
+    theta, action = THETA.clone(), ACTION.clone()
+    rows = simulate(simulator, theta, action, seed=3, **options)
+    assert torch.equal(theta, THETA)
+    assert torch.equal(action, ACTION)
+    assert torch.equal(rows.theta, THETA)
+    assert torch.equal(rows.action, ACTION)
+    again = simulate(simulator, THETA, ACTION, seed=3, num_workers=2)
+    assert torch.equal(rows.x, again.x)
+
+
+def test_the_noise_of_a_row_has_its_own_seed():
+    def plain(theta, action, seeds):
+        return theta + action + row_normals(seeds, 1).float()
+
+    expected, x = (
+        simulate(SimulatorModel(fn, noise=GaussianNoise(1.0)), THETA, ACTION, seed=3).x
+        for fn in (plain, changing)
+    )
+    assert torch.equal(x, expected)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_a_row_that_is_tried_again_gets_its_own_theta(num_workers):
+    theta, action = torch.arange(300.0)[:, None], torch.zeros(300, 1)
+
+    def simulator(theta, action, seeds):
+        rows = theta.clone()
+        theta += 1000
+        if bool(torch.isin(rows, torch.tensor([5.0, 70.0, 200.0])).any()):
+            raise RuntimeError("no")
+        return rows
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissingRowsWarning)
+        rows = simulate(simulator, theta, action, seed=0, num_workers=num_workers)
+    assert rows.tracebacks.keys() == {5, 70, 200}
+    assert torch.equal(rows.x[rows.valid], theta[rows.valid])
+
+
+def test_a_simulator_may_keep_its_arguments_and_change_them_later():
+    kept = []
+
+    def simulator(theta, action, seeds):
+        for old in kept:
+            old.fill_(torch.nan)
+        kept.extend([theta, action])
+        return theta + action
+
+    rows = simulate(simulator, THETA, ACTION, seed=0, batch_size=100)
+    assert torch.equal(rows.x, THETA + ACTION)
+    assert rows.theta.isfinite().all()
+
+
+def test_a_model_called_directly_may_change_its_arguments():
+    effect, seeds = torch.ones(600, 1), torch.arange(600)
+
+    def fn(theta, action, seeds, gain=0.0):
+        gain += 1
+        return changing(theta, action, seeds) * gain
+
+    theta, action = THETA.clone(), ACTION.clone()
+    SimulatorModel(fn)(theta, action, seeds=seeds, gain=effect)
+    assert torch.equal(theta, THETA)
+    assert torch.equal(action, ACTION)
+    assert torch.equal(effect, torch.ones(600, 1))
+    assert torch.equal(seeds, torch.arange(600))
+
+
+def test_effects_of_rows_may_be_changed():
+    def fn(theta, action, rng, gain=None):
+        gain += 1
+        return theta + gain
+
+    effect = torch.zeros(4, 1, dtype=torch.float64)
+    model = SimulatorModel(fn, batched=False, noise=GaussianNoise(1.0))
+    for _ in range(2):
+        assert torch.equal(
+            model.mean(THETA[:4], ACTION[:4], gain=effect) - 1, THETA[:4]
+        )
+
+
+def test_the_check_survives_a_simulator_that_changes_its_arguments():
+    from sbi.utils import BoxUniform
+
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    report = check_simulator(changing, prior, DiscreteActions([1.0, 2.0]), num_rows=32)
+    assert report.is_ready
+    assert report.rows_are_independent
+
+
+def test_simulations_keep_the_theta_that_was_simulated():
+    theta, action = THETA.clone(), ACTION.clone()
+    rows = simulate(changing, theta, action, seed=0)
+    theta.zero_()
+    action.zero_()
+    assert torch.equal(rows.theta, THETA)
+    assert torch.equal(rows.action, ACTION)
+
+
+def test_noise_keeps_the_values_that_were_declared():
+    sd, times = torch.ones(2, dtype=torch.float64), np.arange(3.0)
+    noise = GaussianNoise(sd).at(times)
+    model = SimulatorModel(changing, noise=GaussianNoise(1.0), sample_times=times)
+    sd.fill_(9.0)
+    times += 7
+    assert noise.sd.tolist() == [1.0, 1.0]
+    for kept in (noise.times, model.sample_times, model.noise.times):
+        assert kept.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_actions_keep_the_values_that_were_given():
+    values, low, high = np.arange(3, dtype=np.float32), torch.zeros(1), torch.ones(1)
+    listed, box = DiscreteActions(values), BoxActions(low, high)
+    for given in (values, low, high):
+        given += 5
+    assert listed.values.flatten().tolist() == [0.0, 1.0, 2.0]
+    assert (box.low.item(), box.high.item()) == (0.0, 1.0)
+
+
+def test_trials_keep_the_numbers_that_were_measured():
+    action, x = np.arange(4.0)[:, None], torch.ones(4, 2, dtype=torch.float64)
+    trials = Trials(action, x, sample_times=(times := np.arange(2.0)))
+    for given in (action, x, times):
+        given += 5
+    assert trials.action.flatten().tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert trials.x.unique().tolist() == [1.0]
+    assert trials.sample_times.tolist() == [0.0, 1.0]
+
+
+def test_conditions_are_rows_of_their_own():
+    x, action = torch.ones(3, 2), torch.ones(3, 1)
+    rows = outcome_rows(x, (2,)), action_rows(action, 1)
+    x.zero_()
+    action.zero_()
+    assert all(r.unique().tolist() == [1.0] for r in rows)

@@ -1,0 +1,164 @@
+"""What a simulator may return, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from sbi_active import GaussianNoise, SimulatorModel, simulate
+from sbi_active.campaign.telling import outcome_told
+from sbi_active.inference.condition import outcome_rows
+from sbi_active.simulation import MissingRowsWarning, SimulationError
+from sbi_active.simulation.simulator import outcome_tensor
+
+THETA = torch.arange(4.0)[:, None]
+ONE = torch.Size([1])
+
+
+def x_of(function, **options):
+    return simulate(lambda t, a, seeds: function(t), THETA, THETA, seed=0, **options).x
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda t: t.numpy()[::-1][::-1],  # a view, strides > 0
+        lambda t: t.flip(0).numpy()[::-1],
+        lambda t: t.numpy().astype(">f8"),
+        lambda t: t.numpy().astype(np.longdouble),
+        lambda t: t.numpy().astype(np.uint32),
+        lambda t: t.numpy().astype(object),
+        lambda t: t.numpy().astype(np.float16),
+        lambda t: t.bfloat16(),
+        lambda t: t.long(),
+        lambda t: t.tolist(),
+        lambda t: list(t),
+        lambda t: tuple(t.numpy()),
+        lambda t: t[:, 0],
+        lambda t: np.broadcast_to(t.numpy(), (4, 1)),  # not writable
+        lambda t: np.asfortranarray(t.numpy()),
+    ],
+)
+def test_forms_of_x_that_are_taken(function, recwarn):
+    assert torch.equal(x_of(function), THETA)
+    assert not recwarn.list
+
+
+def test_masked_numbers_were_not_measured():
+    def function(theta):
+        return np.ma.masked_greater(theta.repeat(1, 2).numpy() * [1, 0], 1.5)
+
+    expected = torch.tensor([[0, 0], [1, 0], [torch.nan, 0], [torch.nan, 0]])
+    assert torch.equal(x_of(function).nan_to_num(-1), expected.nan_to_num(-1))
+
+
+def model_of(function):
+    return SimulatorModel(lambda theta, action: function(theta))
+
+
+BEYOND = [
+    lambda t: t.double() + 1e39,
+    lambda t: t.double().numpy() - 1e200,
+    lambda t: [1e39, 0.0, 0.0, 0.0],
+    lambda t: torch.where(t == 2, 1e39, t.double()),
+]
+COMPLEX = [
+    lambda t: t + 1j,
+    lambda t: t.numpy() + 1j,
+    lambda t: [1j, 0, 0, 0],
+    lambda t: np.fft.fft(t.numpy(), axis=0),
+]
+EMPTY = [lambda t: t[:, :0], lambda t: torch.zeros(4, 3, 0), lambda t: [[]] * 4]
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+@pytest.mark.parametrize(
+    ("functions", "text"),
+    [
+        (BEYOND, r"expected x within \+-3.4e38"),
+        (COMPLEX, "expected x of real numbers; got .*complex"),
+        (EMPTY, "expected at least one number a row of x"),
+    ],
+)
+def test_numbers_that_would_be_lost_are_refused(functions, text, num_workers):
+    for function in functions[: 1 if num_workers == 2 else None]:
+        with pytest.raises(ValueError, match=text):
+            x_of(function, num_workers=num_workers)
+        with pytest.raises(ValueError, match=text):
+            simulate(model_of(function), THETA, THETA, seed=0)
+
+
+@pytest.mark.parametrize("row", [1j, np.array([1j]), torch.tensor([1j])])
+def test_complex_rows_are_refused(row):
+    model = SimulatorModel(
+        lambda theta, action, rng: row, batched=False, noise=GaussianNoise(1.0)
+    )
+    with pytest.raises(ValueError, match="expected x of real numbers"):
+        model.mean(THETA, THETA)
+    with pytest.raises(ValueError, match="expected x of real numbers"):
+        simulate(model, THETA, THETA, seed=0)
+
+
+def test_rows_of_no_numbers_are_refused():
+    model = SimulatorModel(lambda theta, action, rng: [], batched=False)
+    with pytest.raises(ValueError, match="expected at least one number a row"):
+        simulate(model, THETA, THETA, seed=0)
+
+
+def test_a_row_without_an_outcome_is_missing():
+    def row(theta, action, rng):
+        return None if theta[0] == 2 else theta
+
+    model = SimulatorModel(row, batched=False)
+    with pytest.warns(MissingRowsWarning, match="expected an outcome .* got None"):
+        rows = simulate(model, THETA, THETA, seed=0)
+    assert rows.counts == {"ok": 3, "invalid": 0, "missing": 1}
+    nothing = SimulatorModel(lambda theta, action, rng: None, batched=False)
+    for simulator in (nothing, lambda theta, action: None):
+        with pytest.raises(SimulationError, match="got None; return x"):
+            simulate(simulator, THETA, THETA, seed=0)
+
+
+def test_infinite_numbers_stay_no_measurement():
+    rows = simulate(
+        lambda t, a, seeds: torch.where(t == 2, torch.inf, t.double()),
+        THETA,
+        THETA,
+        seed=0,
+    )
+    assert rows.counts == {"ok": 3, "invalid": 1, "missing": 0}
+
+
+def test_the_largest_number_is_kept():
+    largest = torch.finfo(torch.float32).max
+    assert (x_of(lambda t: t.double() * 0 + largest) == largest).all()
+
+
+@pytest.mark.parametrize(
+    "x", [1e39, [1e39], np.float64(-1e39), torch.tensor([1e39], dtype=torch.float64)]
+)
+def test_an_outcome_beyond_float32_is_refused(x):
+    with pytest.raises(ValueError, match=r"expected x within \+-3.4e38"):
+        outcome_rows(x, ONE)
+    with pytest.raises(ValueError, match=r"expected x within \+-3.4e38"):
+        outcome_told(x, "ok", ONE)
+
+
+@pytest.mark.parametrize("x", [1j, [1j], np.array([1 + 0j]), torch.tensor([1j])])
+def test_a_complex_outcome_is_refused(x):
+    with pytest.raises(ValueError, match="expected x of real numbers"):
+        outcome_rows(x, ONE)
+    with pytest.raises(ValueError, match="expected x of real numbers"):
+        outcome_told(x, "ok", ONE)
+
+
+@pytest.mark.parametrize("name", ["theta", "action"])
+def test_complex_parameters_and_actions_are_refused(name):
+    rows = {"theta": THETA, "action": THETA}
+    rows[name] = rows[name] + 1j
+    with pytest.raises(ValueError, match="expected theta and action of real numbers"):
+        simulate(lambda t, a: t, **rows, seed=0)
+
+
+def test_a_number_a_row_is_a_column():
+    assert outcome_tensor([1.0, 2.0], 2).shape == (2, 1)
+    assert outcome_tensor(np.zeros((2, 3)), 2).dtype == torch.float64
