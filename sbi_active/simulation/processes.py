@@ -251,7 +251,7 @@ def _work(connection: Connection, surroundings: dict[str, Any]) -> None:
         simulator = cloudpickle.loads(connection.recv_bytes())
         if isinstance(simulator, SimulatorModel):
             simulator.prepare()  # no row's time limit counts it
-    except Exception:
+    except BaseException:  # the process ends, and says why
         reply = Reply(fault="not loaded", traceback=traceback.format_exc())
         connection.send_bytes(pickle.dumps(reply))
         return
@@ -261,7 +261,7 @@ def _work(connection: Connection, surroundings: dict[str, Any]) -> None:
             call = pickle.loads(connection.recv_bytes())
         except (EOFError, OSError):
             return
-        reply = answer(simulator, call)
+        reply = answer(simulator, call, catches=BaseException)
         sys.stdout.flush()
         sys.stderr.flush()
         with suppress(OSError):  # nobody waits for it any more

@@ -10,7 +10,7 @@ import cloudpickle
 import pytest
 import torch
 
-from sbi_active import simulate
+from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, Outcome, SimulationError
 
@@ -233,6 +233,38 @@ def test_wrong_shapes_are_no_fault_of_a_row(num_workers):
 def test_a_simulator_that_takes_no_action_is_no_fault_of_a_row():
     with pytest.raises(TypeError, match="positional argument"):
         simulate(lambda theta: theta, *index_rows(30), seed=0)
+
+
+class Stop(BaseException):
+    """What except Exception does not see."""
+
+
+@pytest.mark.parametrize("kind", [Stop, SystemExit, KeyboardInterrupt, GeneratorExit])
+def test_whatever_is_raised_in_a_worker_has_its_traceback(kind):
+    def simulator(theta, action, seeds):
+        if (theta == 1).any():
+            raise kind("the reason")
+        return seeded(theta, action, seeds)
+
+    rows = quietly(simulator, *index_rows(8), seed=0, num_workers=2)
+    assert rows.tracebacks.keys() == {1}
+    assert 'raise kind("the reason")' in rows.tracebacks[1]
+    assert rows.tracebacks[1].strip().endswith("the reason")
+    expected = simulate(seeded, *index_rows(8), seed=0).x
+    assert torch.equal(rows.x[rows.valid], expected[rows.valid])
+
+
+@pytest.mark.parametrize("kind", [Stop, SystemExit])
+def test_whatever_ends_the_loading_has_its_traceback(kind):
+    def setup():
+        raise kind("no licence")
+
+    def fn(theta, action, *, context):
+        return theta
+
+    model = SimulatorModel(fn, setup=setup)
+    with pytest.raises(SimulationError, match=r"(?s)can load; got.*no licence"):
+        simulate(model, *index_rows(3), seed=0, num_workers=2)
 
 
 def test_a_simulator_that_cannot_be_loaded():
