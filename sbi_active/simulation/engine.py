@@ -21,6 +21,7 @@ from sbi_active.simulation.outcomes import (
     SimulationInterrupted,
     Simulations,
 )
+from sbi_active.simulation.pace import pace_of
 from sbi_active.simulation.pools import InProcess, Pool, WorkerPool
 from sbi_active.simulation.schedule import Schedule
 from sbi_active.simulation.simulator import require_noise
@@ -78,9 +79,11 @@ def simulate(
         seed: Seed of the whole set.
         num_workers: Calls at a time; -1 means one a core. One worker without a time
             limit is this process.
-        batch_size: Rows a call; None gives all to a simulator in this process, and
-            to workers as many as take a quarter of a second. A simulator that takes no
-            seeds is given whole blocks.
+        batch_size: Rows a call; None gives workers as many as take a quarter of a
+            second. A simulator in this process is given all at once, or, after its
+            first rows have shown that this would take long, as many as take about a
+            second: an interrupt loses no more. One that takes no seeds is given whole
+            blocks.
         time_limit: Seconds a row, loading the simulator not counted; a batch may take
             as much as its rows. None waits for ever.
         num_retries: How often a missing row is tried again, with the same seed.
@@ -109,15 +112,17 @@ def simulate(
     theta, action = _checked(torch.as_tensor(theta), torch.as_tensor(action))
     _check_options(num_workers, batch_size, time_limit, num_retries)
     pool = _pool(simulator, num_workers, time_limit)
+    pace = None
     if not isinstance(pool, InProcess):
         theta, action = theta.detach().cpu(), action.detach().cpu()
     elif batch_size is None and not show_progress and store is None:
-        batch_size = len(theta)  # nobody looks on
+        pace = pace_of(simulator)  # nobody looks on
     options = {
         "has_seeds": takes_seeds(simulator),
         "time_limit": time_limit,
         "num_retries": num_retries,
         "batch_size": batch_size,
+        "pace": pace,
     }
     schedule = Schedule(theta, action, seed=seed, **options)
     with closing(pool):

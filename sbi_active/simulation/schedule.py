@@ -13,6 +13,7 @@ from torch import Tensor
 from sbi_active.seeding import row_seeds
 from sbi_active.simulation.calls import BLOCK, Call, Reply
 from sbi_active.simulation.outcomes import Outcome, SimulationError
+from sbi_active.simulation.pace import Pace
 from sbi_active.simulation.pools import Pool
 
 __all__ = ["Schedule"]
@@ -39,6 +40,8 @@ class Schedule:
         seed: Of the whole set.
         has_seeds: Whether the simulator takes them.
         batch_size: Rows a call; None measures how many take ``BATCH_SECONDS``.
+        pace: Sizes the calls where no batch size is given, as one worker needs it:
+            a short simulation is one call, a long one is cut.
         time_limit: Seconds a row; None waits for ever.
         num_retries: How often a missing row is tried again.
         on_rows: Told about finished rows: index (k,), x (k, *x_shape), status (k,).
@@ -57,6 +60,10 @@ class Schedule:
     #: evenly spread, that it is probed with.
     NUM_PROBES = 16
 
+    #: Calls that may be simulated again, in one with all others, once they have shown
+    #: that the whole takes no longer than a part may.
+    MAX_TIMED = 4
+
     #: A call may take this multiple of the time its rows took before, and the limit of
     #: a row on top, until it is divided: a hanging row then costs its own limit.
     SLACK = 5.0
@@ -69,6 +76,7 @@ class Schedule:
         seed: int,
         has_seeds: bool,
         batch_size: int | None = None,
+        pace: Pace | None = None,
         time_limit: float | None = None,
         num_retries: int = 0,
         on_rows: Callable[[Tensor, Tensor, Tensor], None] | None = None,
@@ -79,6 +87,7 @@ class Schedule:
         self.seed = seed
         self.has_seeds = has_seeds
         self.batch_size = batch_size
+        self.pace = pace
         self.time_limit = time_limit
         self.num_retries = num_retries
         self.on_rows = on_rows
@@ -94,6 +103,7 @@ class Schedule:
         self._num_probing: int | None = None
         self._has_succeeded = False
         self._next = 0  # position in the rows to come
+        self._num_timed = 0  # calls
 
     def restore(self, index: Tensor, x: Tensor, status: Tensor) -> int:
         """Take rows as finished that a store holds; return how many."""
@@ -159,6 +169,8 @@ class Schedule:
         """Return the rows of the next call; this never changes x."""
         if self.batch_size is not None:
             size = self.batch_size
+        elif self.pace is not None:
+            size = self.pace.size(num_left)
         else:
             # The last calls are small, so that all workers end together.
             fair = -(-num_left // (2 * pool.num_slots))
@@ -200,7 +212,30 @@ class Schedule:
             return
         self._seconds_a_row = reply.seconds / len(call)
         self._largest = max(self._largest, 8 * len(call))
+        if self.pace is not None and call.draws != "alone":
+            self.pace.observe(len(call), reply.seconds)
+            self._num_timed += 1
+            if self._is_short_after_all(self.pace):
+                self._start_over()
+                return
         self._take(call, reply.x)
+
+    def _is_short_after_all(self, pace: Pace) -> bool:
+        """Return whether the few rows that were timed show that one call will do."""
+        is_timing = self.has_seeds and self._num_timed <= self.MAX_TIMED
+        is_clean = not (self._urgent or self.tracebacks)
+        is_part = self._next < len(self._to_come)
+        return is_timing and is_clean and is_part and pace.is_short(len(self._to_come))
+
+    def _start_over(self) -> None:
+        """Forget the rows that were timed, so that x is that of one call.
+
+        A simulator may round otherwise in a batch of another size; what is known of
+        its pace must make no difference.
+        """
+        self.status[torch.from_numpy(self._to_come[: self._next])] = _UNFINISHED
+        self.x = None
+        self._next = 0
 
     def _take(self, call: Call, x: Tensor) -> None:
         finite = x.isfinite()

@@ -1,0 +1,112 @@
+"""How many rows a call in this process gets, so that an interrupt costs about a second.
+
+A call cannot be interrupted without losing its rows, so a long simulation is cut into
+parts. A vectorized simulator takes as long for few rows as for many, and would lose
+more by that than an interrupt costs: its parts are as long as they must be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+__all__ = ["Pace", "pace_of"]
+
+
+class Pace:
+    """What calls of a simulator took, a fixed time and a time a row.
+
+    Example:
+        >>> pace = Pace()
+        >>> pace.size(2_000)  # nothing is known
+        2
+        >>> pace.observe(2, 0.02)
+        >>> pace.size(1_998)  # 10 ms a row at most
+        100
+        >>> pace.is_short(100)
+        True
+    """
+
+    #: A part is sized to take this long.
+    SECONDS = 1.0
+
+    #: One that is this much longer is not cut.
+    SLACK = 1.5
+
+    #: The share of the fixed time of calls in their time that cutting may cause.
+    SHARE = 1 / 32
+
+    #: Rows of the first call. A single one is a shape that simulators may not expect.
+    FEWEST = 2
+
+    #: A larger call that takes less than this share of a smaller one shows that the
+    #: latter had something to load or to compile.
+    WARM = 0.8
+
+    def __init__(self) -> None:
+        self._small: tuple[int, float] | None = None  # rows and seconds of a call
+        self._last: tuple[int, float] | None = None
+
+    def observe(self, num_rows: int, seconds: float) -> None:
+        """Take the time of a call."""
+        call = num_rows, seconds
+        small, last = self._small, self._last
+        if last is None:
+            self._last = call
+        elif num_rows >= 2 * last[0]:
+            is_warm = seconds >= self.WARM * last[1]
+            self._small, self._last = (last if is_warm else None), call
+        elif 2 * num_rows < last[0] or (small is not None and num_rows <= small[0]):
+            self._small = call
+        else:
+            self._last = call
+
+    def is_short(self, num_rows: int) -> bool:
+        """Return whether rows take too little time to be cut."""
+        if self._last is None:
+            return num_rows <= self.FEWEST
+        rows, seconds = self._last
+        return seconds * max(num_rows / rows, 1.0) <= self.SLACK * self.SECONDS
+
+    def size(self, num_left: int) -> int:
+        """Return the rows of the next call, of those that are left."""
+        if self.is_short(num_left):
+            return num_left
+        wanted = 0.0 if self._last is None else self._wanted(*self._last)
+        size = max(int(min(wanted, num_left)), self.FEWEST)
+        return size if num_left - size >= self.FEWEST else num_left
+
+    def _wanted(self, rows: int, seconds: float) -> float:
+        """Return the rows of a part, given those of the last one and its time."""
+        timely = self.SECONDS * rows / seconds  # or less, where some time is fixed
+        if self._small is None:
+            return max(timely, (2 if seconds > self.SECONDS / 2 else 4) * rows)
+        wanted = max(timely, self._efficient(*self._small, rows, seconds))
+        # What compiles for each shape is better off with one.
+        return rows if wanted / 2 <= rows <= 2 * wanted else wanted
+
+    def _efficient(self, few: int, least: float, rows: int, seconds: float) -> float:
+        """Return the rows that a part needs, given a small call and a larger one."""
+        ratio = rows / few
+        a_row = max((seconds - least) / (rows - few), 1e-12)
+        fixed = max(seconds - a_row * rows, 0.0)
+        if fixed < least / ratio:  # it may be chance
+            return 0.0
+        growth = 256 if seconds < 1.1 * least else min(2 * ratio, 16)
+        return min(fixed / self.SHARE / a_row, growth * rows)
+
+
+# By the simulator, or by the object and the name of its method. What is known is kept
+# from one simulation to the next, so that only the first has to find out.
+_PACES: WeakKeyDictionary[Any, dict[str, Pace]] = WeakKeyDictionary()
+
+
+def pace_of(simulator: Callable[..., Any]) -> Pace:
+    """Return what is known of a simulator in this process."""
+    owner = getattr(simulator, "__self__", simulator)
+    try:
+        paces = _PACES.setdefault(owner, {})
+    except TypeError:  # it has no hash, or takes no weak reference
+        return Pace()
+    return paces.setdefault(getattr(simulator, "__qualname__", ""), Pace())

@@ -1,0 +1,239 @@
+"""What an interrupt costs in this process: about a second, and what cutting costs."""
+
+import gc
+import pickle
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from sbi_active import GaussianNoise, SimulatorModel, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import Outcome
+from sbi_active.simulation.pace import Pace, pace_of
+
+SCRIPT = """
+import pickle, sys, time, torch
+from sbi_active import SimulatorModel, simulate
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import SimulationInterrupted
+
+def seeded(theta, action, seeds):
+    time.sleep(0.002 * len(theta))
+    return theta + row_normals(seeds, 1).float()
+
+def blocks(theta, action):
+    time.sleep(0.002 * len(theta))
+    return theta + torch.randn_like(theta)
+
+def row(theta, action, rng):
+    time.sleep(0.002)
+    return theta + rng.normal(size=1)
+
+simulator = {
+    "seeded": seeded, "blocks": blocks, "row": SimulatorModel(row, batched=False)
+}[sys.argv[1]]
+theta = torch.rand(20_000, 1, generator=torch.Generator().manual_seed(0))
+print("ready", flush=True)
+try:
+    simulate(simulator, theta, torch.zeros_like(theta), seed=3)
+except SimulationInterrupted as error:
+    rows = error.simulations
+    with open(sys.argv[2], "wb") as file:
+        pickle.dump((rows.theta, rows.x, rows.status), file)
+"""
+
+
+def expected_rows(kind, theta):
+    def blocks(theta, action):
+        return theta + torch.randn_like(theta)
+
+    def seeded(theta, action, seeds):
+        return theta + row_normals(seeds, 1).float()
+
+    row = SimulatorModel(
+        lambda theta, action, rng: theta + rng.normal(size=1), batched=False
+    )
+    simulator = {"seeded": seeded, "blocks": blocks, "row": row}[kind]
+    return simulate(simulator, theta, torch.zeros_like(theta), seed=3).x
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["seeded", pytest.param("blocks", marks=SLOW), pytest.param("row", marks=SLOW)],
+)
+def test_an_interrupt_in_the_default_setting_keeps_finished_rows(kind, tmp_path):
+    script, out = tmp_path / "script.py", tmp_path / "rows.pickle"
+    script.write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, script, kind, out],
+        stdout=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    time.sleep(2.0)  # of some 40
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 0
+    process.stdout.close()
+    theta, x, status = pickle.loads(out.read_bytes())
+    finished = status == Outcome.OK
+    assert finished.sum() >= 200  # of some 1,200, on a busy machine fewer
+    assert (status[~finished] == Outcome.MISSING).all()
+    assert x[~finished].isnan().all()
+    assert torch.equal(x[finished], expected_rows(kind, theta)[finished])
+
+
+def sizes_of(seconds, num_rows, pace):
+    """Return the rows of calls that take as long as a function of their rows says."""
+    sizes = []
+    while num_rows:
+        sizes.append(pace.size(num_rows))
+        pace.observe(sizes[-1], seconds(sizes[-1]))
+        num_rows -= sizes[-1]
+    return sizes
+
+
+def test_slow_rows_are_cut_into_parts_of_a_second():
+    sizes = sizes_of(lambda n: 0.01 * n, 2_000, Pace())
+    assert sizes[0] == 2
+    assert max(sizes) <= 150
+    assert len(sizes) <= 25
+    sizes = sizes_of(lambda n: 1.0 * n, 30, Pace())
+    assert max(sizes) <= 4
+
+
+def test_fast_rows_are_one_call():
+    pace = Pace()
+    pace.observe(2, 1e-4)
+    assert pace.size(5_000) == 5_000
+
+
+@pytest.mark.parametrize("seconds", [0.05, 0.5, 3.0])
+def test_a_simulator_as_slow_for_few_rows_is_hardly_cut(seconds):
+    pace = Pace()
+    assert len(sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace)) <= 5
+    assert sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace) == [5_000]
+
+
+def test_parts_are_as_long_as_their_fixed_time_asks_for():
+    pace = Pace()
+
+    def seconds(n):
+        return 0.1 + 1e-3 * n
+
+    sizes_of(seconds, 20_000, pace)
+    sizes = sizes_of(seconds, 20_000, pace)
+    total = sum(map(seconds, sizes))
+    assert total <= 1.12 * seconds(20_000)
+    assert max(map(seconds, sizes)) < 5.0
+
+
+def test_a_slow_first_call_is_not_taken_for_the_pace():
+    calls = []
+
+    def seconds(n):
+        calls.append(n)
+        return 0.01 * n + (3.0 if len(calls) == 1 else 0.0)
+
+    sizes = sizes_of(seconds, 2_000, Pace())
+    assert max(sizes) <= 150
+    assert len(sizes) <= 30
+
+
+def test_no_part_is_a_single_row():
+    for n in range(2, 60):
+        sizes = sizes_of(lambda k: 0.7 * k, n, Pace())
+        assert sum(sizes) == n
+        assert min(sizes) >= 2
+
+
+def test_a_simulator_is_timed_once(monkeypatch):
+    monkeypatch.setattr(Pace, "SECONDS", 60.0)  # whatever else the machine does
+    sizes = []
+
+    def simulator(theta, action, seeds):
+        sizes.append(len(theta))
+        return theta
+
+    theta = torch.rand(700, 1)
+    for n in (700, 700, 3, 700):
+        simulate(simulator, theta[:n], theta[:n], seed=0)
+    assert sizes == [2, 700, 700, 3, 700]
+
+
+def test_x_is_that_of_one_call_where_that_is_short():
+    def simulator(theta, action, seeds):  # whose rows are not independent
+        return theta + len(theta)
+
+    theta = torch.rand(500, 1)
+    for _ in range(2):
+        rows = simulate(simulator, theta, theta, seed=0)
+        assert torch.equal(rows.x, theta + 500)
+        assert rows.counts == {"ok": 500, "invalid": 0, "missing": 0}
+
+
+def test_rows_that_raise_while_the_first_are_timed():
+    def simulator(theta, action, seeds):
+        if (theta < 2).any():
+            raise RuntimeError("no")
+        return theta
+
+    theta = torch.arange(100.0)[:, None]
+    with pytest.warns(UserWarning, match="2 of 100 rows are missing"):
+        rows = simulate(simulator, theta, theta, seed=0)
+    assert torch.equal(rows.x[2:], theta[2:])
+
+
+def test_blocks_stay_whole():
+    sizes = []
+
+    def simulator(theta, action):
+        sizes.append(len(theta))
+        return theta
+
+    theta = torch.rand(1_000, 1)
+    simulate(SimulatorModel(simulator, noise=GaussianNoise(1.0)), theta, theta, seed=0)
+    assert sizes == [256, 256, 256, 232]
+
+
+class Robot:
+    """Equal to all of its kind, which so have no hash."""
+
+    def __eq__(self, other):
+        return isinstance(other, Robot)
+
+    def run(self, theta, action):
+        return theta
+
+    def __call__(self, theta, action):
+        return theta
+
+
+class Arm:
+    def run(self, theta, action):
+        return theta
+
+    def walk(self, theta, action):
+        return theta
+
+
+def test_the_pace_is_known_by_the_simulator():
+    arm = Arm()
+    assert pace_of(arm.run) is pace_of(arm.run)
+    assert pace_of(arm.run) is not pace_of(arm.walk)
+    assert pace_of(arm.run) is not pace_of(Arm().run)
+    assert pace_of(Robot()) is not pace_of(Robot())
+    assert isinstance(pace_of(Robot().run), Pace)
+    assert isinstance(pace_of(torch.add), Pace)
+    before = pace_of(model := SimulatorModel(lambda t, a: t))
+    assert pace_of(model) is before
+    del model
+    gc.collect()
+    assert pace_of(SimulatorModel(lambda t, a: t)) is not before
