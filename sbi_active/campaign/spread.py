@@ -1,0 +1,86 @@
+"""Gaussian spread of rows of numbers, few or many, some of them not measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["Spread"]
+
+#: Shares of the diagonal among which the leave-one-out likelihood chooses.
+SHARES = torch.logspace(-10, 0, 21, dtype=torch.float64)
+FLOOR = 1e-10  # of the largest variance, for numbers that never vary
+
+
+@dataclass(frozen=True)
+class Spread:
+    r"""Mean and covariance of rows, the latter shrunk towards its diagonal.
+
+    .. math::
+        C = (1 - \lambda) \hat C + \lambda \operatorname{diag} \hat C,
+
+    with the :math:`\lambda` of the largest leave-one-out Gaussian likelihood: C serves
+    with more numbers than rows. What was not measured counts as at the mean. All
+    are the same functions of the rows in any order.
+
+    Attributes:
+        mean: Shape (q,).
+        scale: Standard deviations, shape (q,).
+        share: :math:`\lambda`.
+        z: Standardized rows, zero where not measured, shape (n, q).
+        distance: Squared Mahalanobis distance of each row, shape (n,).
+
+    References:
+        Hoffbeck & Landgrebe, IEEE PAMI 1996 (leave-one-out shrinkage).
+    """
+
+    mean: Tensor
+    scale: Tensor
+    share: float
+    z: Tensor
+    distance: Tensor
+
+    @staticmethod
+    def of(rows: Tensor) -> Spread:
+        """Return the spread of rows (n, q), float64, NaN where not measured."""
+        present = rows.isfinite()
+        count = present.sum(0).clamp_min(1)
+        mean = rows.nansum(0) / count
+        gap = torch.where(present, rows - mean, 0.0)
+        variance = gap.square().sum(0) / count
+        floor = FLOOR * variance.max().clamp_min(1e-30)
+        scale = (variance + floor).sqrt()
+        z = gap / scale
+        share, distance = _shrunk(z)
+        return Spread(mean, scale, share, z, distance)
+
+    def root(self) -> Tensor:
+        """Return the lower Cholesky factor of C, shape (q, q)."""
+        covariance = (1 - self.share) * self.z.T @ self.z / len(self.z)
+        diagonal = torch.full_like(self.scale, self.share).clamp_min(FLOOR).diag()
+        return self.scale[:, None] * torch.linalg.cholesky(covariance + diagonal)
+
+
+def _shrunk(z: Tensor) -> tuple[float, Tensor]:
+    r"""Return the share of the diagonal and each row's squared distance with it.
+
+    With :math:`d_i = z_i^\top C^{-1} z_i` and :math:`b = (1 - \lambda) / (n - 1)`, the
+    covariance without row i has the determinant :math:`|C| (1 - b d_i)`, and row i the
+    squared distance :math:`d_i / (1 - b d_i)` by it.
+    """
+    n, q = z.shape
+    if q <= n:
+        value, vector = torch.linalg.eigh(z.T @ z / n)
+        square = (z @ vector).square()
+    else:  # the same from the smaller matrix of products of rows
+        value, vector = torch.linalg.eigh(z @ z.T / n)
+        square = n * vector.square() * value.clamp_min(0)
+    shrunk = (1 - SHARES) * value.clamp_min(0)[:, None] + SHARES
+    distance = square @ (1 / shrunk)
+    log_det = shrunk.log().sum(0) + (q - len(value)) * SHARES.log()
+    kept = (1 - (1 - SHARES) / max(n - 1, 1) * distance).clamp_min(1e-12)
+    loss = log_det + (kept.log() + distance / kept).mean(0)
+    best = int(loss.argmin())
+    return float(SHARES[best]), distance[:, best]
