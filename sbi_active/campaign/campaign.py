@@ -213,7 +213,8 @@ class Campaign:
 
         Args:
             x: The outcome, shape x_shape; NaN throughout makes the trial "invalid", NaN
-                in part of it says that these numbers were not observed.
+                in part of it says that these numbers were not observed, which tells
+                nothing by itself. Infinite numbers count as NaN, with a warning.
             trial: The trial or its index; None is the pending one, or a new trial
                 where none is pending and ``action`` is given.
             action: The executed action where it is not the one asked for.

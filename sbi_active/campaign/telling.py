@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,9 @@ def trial_to_tell(
 
 
 def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
-    """Return the outcome, shape x_shape; None for a missing trial.
+    """Return the outcome, NaN where not measured, shape x_shape.
+
+    None for a missing trial. A number that is infinite was not measured either.
 
     Raises:
         ValueError: If there is no outcome, or one of another shape.
@@ -64,7 +67,20 @@ def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
     tensor = x if isinstance(x, Tensor) else torch.as_tensor(np.asarray(x))
     if tensor.shape != x_shape and tensor.numel() == x_shape.numel() == 1:
         tensor = tensor.reshape(x_shape)
-    return outcome_rows(tensor, x_shape)[0]
+    return _measured(outcome_rows(tensor, x_shape)[0])
+
+
+def _measured(x: Tensor) -> Tensor:
+    """Return x with NaN for infinite numbers, which no sensor measures."""
+    infinite = x.isinf()
+    if not bool(infinite.any()):
+        return x
+    warnings.warn(
+        f"{int(infinite.sum())} of {x.numel()} told numbers are infinite and count as "
+        "not measured; pass NaN where a sensor gave nothing",
+        stacklevel=4,
+    )
+    return torch.where(infinite, torch.nan, x)
 
 
 def same_outcome(a: Trial, b: Trial) -> bool:
