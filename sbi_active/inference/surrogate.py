@@ -91,6 +91,8 @@ class LocalRegression:
         residual: Whitened residuals, shape (n, q).
         standardized: Residuals over their deviations, not rotated, shape (n, q).
         whitening: :math:`L^{-1}`, shape (q, q).
+        leverage: h of the simulations, as part of the fit, shape (n,).
+        shrinkage: Of the correlations within a trial, 1 where S has none.
     """
 
     region: Region
@@ -107,6 +109,8 @@ class LocalRegression:
     residual: Array
     standardized: Array
     whitening: Array
+    leverage: Array
+    shrinkage: float
 
     @property
     def has_misfit(self) -> bool:
@@ -172,7 +176,7 @@ class LocalRegression:
         freedom = n - len(root)
         ratio = (residual**2).sum(0) / freedom / noise.variance
         excess = _excess(ratio, freedom, noise.num_pairs)
-        covariance, precision = _covariance(
+        covariance, precision, shrinkage = _covariance(
             residual, freedom, noise.variance, trial, excess <= MISFIT
         )
         factor = np.linalg.cholesky(covariance)
@@ -192,6 +196,8 @@ class LocalRegression:
             residual=_spread(residual @ inverse.T, used),
             standardized=_spread(residual / np.sqrt(np.diag(covariance)), used),
             whitening=inverse,
+            leverage=((basis(u) @ root) ** 2).sum(1),
+            shrinkage=shrinkage,
         )
 
     def whitened(self, z: Array) -> tuple[Array, Array]:
@@ -308,8 +314,8 @@ def _covariance(
     noise_variance: Array,
     trial: NDArray[np.intp],
     independent: bool,
-) -> tuple[Array, float]:
-    r"""Return the residuals' covariance, shrunk, and the factor of its inverse.
+) -> tuple[Array, float, float]:
+    r"""Return the residuals' covariance, the factor of its inverse, and the shrinkage.
 
     Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`,
     apart within a trial and across trials. Noise does not correlate across trials,
@@ -324,7 +330,7 @@ def _covariance(
     """
     q = residual.shape[1]
     if q == 0:
-        return np.zeros((0, 0)), 1.0
+        return np.zeros((0, 0)), 1.0, 1.0
     deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise_variance)
     standardized = residual / deviation
     correlation = standardized.T @ standardized / freedom
@@ -337,7 +343,7 @@ def _covariance(
     size = q if across < 1 else int(np.bincount(trial).max())
     free = 1 + (size - 1) * (1 - shrunk) ** 2
     precision = max((freedom - free - 1) / freedom, 0.2)
-    return correlation * np.outer(deviation, deviation), precision
+    return correlation * np.outer(deviation, deviation), precision, shrunk
 
 
 def _shrinkage(correlation: Array, freedom: int) -> float:

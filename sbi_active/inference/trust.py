@@ -11,6 +11,7 @@ from scipy.stats import kurtosis
 
 from sbi_active.inference.population import Particles
 from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
+from sbi_active.inference.tails import tail_probability
 
 __all__ = ["Course", "Stage", "diagnose"]
 
@@ -148,7 +149,7 @@ def diagnose(
     fits = last.surrogate.regressions
     live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
     dim = last.draws.shape[1]
-    tail, joint = _tail_probability(last, num_trials, rng)
+    tail, joint = tail_probability(last.surrogate, last.draws, num_trials)
     edge = np.abs(last.draws[:, last.surrogate.coordinates.bounded]) > 0.98
     edge_mass = float(edge.any(1).mean())
     effective = min(
@@ -243,46 +244,6 @@ def diagnose(
         "trustworthy": not warnings,
         "warnings": warnings,
     }
-
-
-def _tail_probability(
-    stage: Stage, num_trials: int, rng: np.random.Generator, num_pairs: int = 50
-) -> tuple[list[float], float]:
-    r"""Return how often a simulation misses its prediction by more than reality does.
-
-    .. math::
-        P\big(D(x, \theta) \ge D(x_o, \theta)\big), \quad \theta \sim b,\;
-        x \sim p(x | \theta), \quad D = |L^{-1} (x - B^\top f)|^2,
-
-    a trial and for all trials, with residuals of the simulations as x.
-
-    References:
-        Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
-    """
-    label = stage.surrogate.assign(stage.draws)
-    exceeded, count = np.zeros(num_trials + 1), 0
-    for k, fit in enumerate(stage.surrogate.regressions):
-        z = stage.draws[label == k]
-        if len(z) == 0:
-            continue
-        error, widening = fit.whitened(z)
-        n, q = fit.residual.shape
-        # A little leverage is the price of few rows; much of it is extrapolation, which
-        # must not excuse a misfit.
-        observed = _squares(error, num_trials) / np.minimum(widening, 2.0)[:, None]
-        rows = rng.integers(n, size=(len(z), num_pairs))
-        inflation = n / (n - len(fit.root))  # residuals are smaller than the noise
-        simulated = inflation * _squares(fit.residual, num_trials)[rows]
-        exceeded += (simulated >= observed[:, None]).sum((0, 1))
-        count += rows.size
-    tail = (exceeded + 1) / (count + 1)
-    return [float(p) for p in tail[:-1]], float(tail[-1])
-
-
-def _squares(whitened: Array, num_trials: int) -> Array:
-    """Return squared lengths of each trial's part and of all, shape (n, t + 1)."""
-    parts = (whitened.reshape(len(whitened), num_trials, -1) ** 2).sum(-1)
-    return np.concatenate([parts, parts.sum(1, keepdims=True)], 1)
 
 
 def _noise_shape(

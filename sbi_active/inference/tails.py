@@ -1,0 +1,104 @@
+"""How far the observations lie from what simulations at the belief give."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.inference.surrogate import LocalRegression, Surrogate
+
+__all__ = ["tail_probability"]
+
+Array = NDArray[Any]
+
+RESOLUTION = 2e-5  # least tail probability
+
+
+def tail_probability(
+    surrogate: Surrogate, draws: Array, num_trials: int
+) -> tuple[list[float], float]:
+    r"""Return how often a simulation misses its prediction by more than reality does.
+
+    .. math::
+        P\big(D(x, \theta) \ge D(x_o, \theta)\big), \quad \theta \sim b,\;
+        x \sim p(x | \theta), \quad D = |L^{-1} (x - B^\top f)|,
+
+    a trial and for all trials. The simulations' x are their residuals by a fit without
+    them, since reality was not fitted to either.
+
+    Args:
+        surrogate: With the residuals of its regressions.
+        draws: From the belief b, in the prior's coordinates, shape (m, d).
+        num_trials: Trials t.
+
+    References:
+        Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
+    """
+    label = surrogate.assign(draws)
+    beyond, count = np.zeros(num_trials + 1), 0
+    for k, fit in enumerate(surrogate.regressions):
+        z = draws[label == k]
+        if len(z) == 0:
+            continue
+        error, widening = fit.whitened(z)
+        # A little leverage is the price of few rows; much of it is extrapolation, which
+        # must not excuse a misfit.
+        observed = _squares(error, num_trials) / np.minimum(widening, 2.0)[:, None]
+        simulated = _held_out(fit, num_trials)
+        pairs = zip(simulated.T**0.5, observed.T**0.5, strict=True)
+        beyond += [_exceedance(known, value).sum() for known, value in pairs]
+        count += len(z)
+    tail = (beyond / max(count, 1)).clip(RESOLUTION, 1.0)
+    return [float(p) for p in tail[:-1]], float(tail[-1])
+
+
+def _exceedance(known: Array, value: Array) -> Array:
+    r"""Return the probability that a further draw is as large, shape (m,).
+
+    Among n draws it is a rank. Ranks end at 1 / (n + 1), so that beyond the largest k
+    the excess over a threshold is taken for exponential, of which the mean of k is
+    known: :math:`P(y) = (1 + y / (k \bar y))^{-k}`, a little large for Gaussian tails.
+
+    Args:
+        known: Draws, shape (n,).
+        value: Shape (m,).
+    """
+    ordered, n = np.sort(known), len(known)
+    k = max(n // 10, 5)
+    threshold = ordered[-k - 1]
+    mean = (ordered[-k:] - threshold).mean() + 1e-12 * (1 + threshold)
+    rank = (n - np.searchsorted(ordered, value) + 1) / (n + 1)
+    excess = (value - threshold).clip(0.0) / mean
+    tail = (k + 1) / (n + 1) * (1 + excess / k) ** -k
+    return np.where(value > threshold, tail, rank)
+
+
+def _held_out(fit: LocalRegression, num_trials: int) -> Array:
+    r"""Return the squares of simulations by a fit without them, shape (n, t + 1).
+
+    With f the degrees of freedom, :math:`e_i` a residual over
+    :math:`\sqrt{1 - h_i}` and S its shrunk covariance, the one without it is
+
+    .. math::
+        S_{-i} = \tfrac{f}{f - 1} \big(S - \tfrac{1 - \lambda}{f} e_i e_i^\top
+        - \tfrac{\lambda}{f} \operatorname{diag}(e_i^2)\big),
+
+    of which the first term is inverted exactly (Sherman & Morrison, Ann. Math. Stat.
+    1950) and the second, of one number among many rows, to first order.
+    """
+    freedom = len(fit.residual) - len(fit.root)
+    apart = 1 / np.sqrt((1 - fit.leverage).clip(1e-6))[:, None]
+    square = _squares(apart * fit.residual, num_trials)[:, :-1]
+    fourth = _squares((apart * fit.standardized) ** 2, num_trials)[:, :-1]
+    kept = 1 - (1 - fit.shrinkage) * square / freedom
+    square = (square + fit.shrinkage * fourth / freedom) / kept.clip(1e-6)
+    square *= (freedom - 1) / freedom
+    return np.concatenate([square, square.sum(1, keepdims=True)], 1)
+
+
+def _squares(whitened: Array, num_trials: int) -> Array:
+    """Return squared lengths of each trial's part and of all, shape (n, t + 1)."""
+    parts = (whitened.reshape(len(whitened), num_trials, -1) ** 2).sum(-1)
+    return np.concatenate([parts, parts.sum(1, keepdims=True)], 1)
