@@ -115,7 +115,7 @@ def _add_trials(
     dims: dict[str, list[str]],
     seed: int,
 ) -> None:
-    trials = [t for t in campaign.history if t.x is not None]
+    trials = [t for t in campaign.history if t.is_measured]
     if not trials:
         return
     action = torch.stack([t.action for t in trials])

@@ -5,6 +5,14 @@ depends neither on the number of workers nor on the size of a batch. Random numb
 a row come from a counter (SplitMix64), which NumPy and torch cannot do for many keys
 at once. Code that only knows the global generators of torch and NumPy runs under
 :func:`forked_generators`, which restores them.
+
+What takes a seed, or needs none, leaves both global generators as it found them and
+does not depend on them: campaigns, designs, refinements, updates with a seed,
+simulators and their noise, reports, exports. Three kinds of calls draw from torch's, as
+anywhere in torch and sbi: sampling that takes no seed (``belief.sample``, as of any
+distribution, and ``model(theta, action)`` without ``seeds``), a call whose ``seed=`` is
+left at None, and what is sbi's own to the last bit: making a trainer (sbi draws from
+the prior to look at it), ``train``, and sampling an sbi posterior.
 """
 
 from __future__ import annotations
@@ -21,6 +29,7 @@ from torch import Tensor
 __all__ = [
     "derive_seed",
     "forked_generators",
+    "kept_generators",
     "row_normals",
     "row_seeds",
     "row_uniforms",
@@ -64,14 +73,21 @@ def forked_generators(seed: int | None, *key: int | str) -> Iterator[None]:
         yield
         return
     derived = derive_seed(seed, *key) if key else seed
-    numpy_state = np.random.get_state()
-    with torch.random.fork_rng(enabled=True, devices=_devices()):
+    with kept_generators():
         # torch.manual_seed would queue a call, with a stack trace, for every device
         # that is not initialized yet.
         torch.default_generator.manual_seed(derived)
         if torch.cuda.is_initialized():
             torch.cuda.manual_seed_all(derived)
         np.random.seed(derived % 2**32)
+        yield
+
+
+@contextmanager
+def kept_generators() -> Iterator[None]:
+    """Restore torch's and NumPy's global generators after the block."""
+    numpy_state = np.random.get_state()
+    with torch.random.fork_rng(enabled=True, devices=_devices()):
         try:
             yield
         finally:

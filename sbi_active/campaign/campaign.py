@@ -14,14 +14,20 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.health import Health, assess
+from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learner import Learner
 from sbi_active.campaign.limits import Limits
 from sbi_active.campaign.methods import METHODS, find_method
 from sbi_active.campaign.planner import Planner
-from sbi_active.campaign.revision import criticize, revise
-from sbi_active.campaign.state import CampaignOptions, CampaignState, Status, Trial
-from sbi_active.campaign.telling import outcome_told, same_outcome, trial_to_tell
-from sbi_active.inference.condition import action_rows
+from sbi_active.campaign.revision import criticize, recompute, revise
+from sbi_active.campaign.state import (
+    UNSCORED,
+    CampaignOptions,
+    CampaignState,
+    Status,
+    Trial,
+)
+from sbi_active.campaign.telling import find_trial, told_trial
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -53,8 +59,9 @@ class Campaign:
         options: Sizes and estimators.
 
     Raises:
-        ValueError: If the method is unknown, the prior has no support, the simulator
-            is deterministic, or the cost or the constraint has another shape.
+        ValueError: If the method is unknown, the prior has no support, or no width that
+            float32 holds, the simulator is deterministic or gives no numbers, or the
+            cost or the constraint has another shape.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -74,6 +81,7 @@ class Campaign:
         >>> belief = campaign.update()
     """
 
+    @isolated
     def __init__(
         self,
         simulator: Callable[..., Any],
@@ -104,8 +112,16 @@ class Campaign:
 
     @property
     def belief(self) -> Distribution:
-        """The belief after the trials in ``state.processed``; the prior before any."""
-        return self._learner.belief
+        """The belief after the trials in ``state.processed``; the prior before any.
+
+        A trial that nothing in the prior explains, as after a slip of the unit, is left
+        out of it: five times the range of all simulations from the prior beyond them,
+        the model's word would be an extrapolation that pushes the belief to an edge.
+        ``belief.diagnostics["trustworthy"]`` is then False and ``["warnings"]`` names
+        the trial, until it is told again or withdrawn. Trials that are beyond all
+        simulations but nearer stay in the belief and are named as well.
+        """
+        return self._learner.stated_belief
 
     @property
     def simulator(self) -> Callable[..., Any]:
@@ -160,6 +176,7 @@ class Campaign:
             self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
         )
 
+    @isolated
     def ask(self, *, target: str | Sequence[str] = "auto") -> Trial:
         """Return the pending trial, or design the next one.
 
@@ -201,6 +218,7 @@ class Campaign:
             raise
         return self.state.trials[index]
 
+    @isolated
     def tell(
         self,
         x: Tensor | np.ndarray | float | Sequence[float] | None = None,
@@ -210,6 +228,12 @@ class Campaign:
         status: Status = "ok",
     ) -> Trial:
         """Record the outcome of a trial and return at once.
+
+        A trial can be told again: with ``trial=``, another outcome takes the place of
+        the recorded one, and the next :meth:`update` computes everything again, beliefs
+        and scores of the later trials too, as if it had been told at once. Trials
+        behind an adoption are then given to the current model anew, and no longer have
+        scores under the models before it.
 
         Args:
             x: The outcome, shape x_shape; NaN throughout makes the trial "invalid", NaN
@@ -222,51 +246,61 @@ class Campaign:
                 the parameters) or "missing" (a fault unrelated to them).
 
         Returns:
-            The recorded trial. Telling the same outcome again changes nothing.
+            The recorded trial. Telling the same outcome again changes nothing, with
+            ``trial=`` or, for the last trial while none is pending, without.
 
         Raises:
-            ValueError: If there is no such trial, shapes do not fit, or another
-                outcome was recorded for it.
+            ValueError: If there is no such trial, shapes do not fit, the action is not
+                finite, or what was told are no real numbers that float32 holds.
         """
-        if status not in ("ok", "invalid", "missing"):
-            raise ValueError(
-                f"expected status 'ok', 'invalid' or 'missing'; got {status!r}; do "
-                "choose one of these"
-            )
-        target = trial_to_tell(self.state, trial, has_action=action is not None)
-        outcome = outcome_told(x, status, self._learner.x_shape)
-        if outcome is not None and not bool(outcome.isfinite().any()):
-            status = "invalid"
-        executed = target.action
-        if action is not None:
-            row = torch.as_tensor(np.asarray(action), dtype=torch.float32)
-            executed = action_rows(row, self.actions.action_dim, num_rows=1)[0]
-        if not bool(self.actions.contains(executed)):
+        told = told_trial(
+            self.state,
+            x,
+            trial=trial,
+            action=action,
+            status=status,
+            x_shape=self._learner.x_shape,
+            action_dim=self.actions.action_dim,
+        )
+        if not bool(self.actions.contains(told.action)):
             warnings.warn(
-                f"the executed action {executed.tolist()} is not in {self.actions}; it "
-                "is simulated where it was executed",
-                stacklevel=2,
+                f"the executed action {told.action.tolist()} is not in {self.actions}; "
+                "it is simulated where it was executed",
+                stacklevel=3,
             )
-        told = replace(target, action=executed, x=outcome, status=status)
-        if target.status != "pending":
-            if not same_outcome(target, told):
-                raise ValueError(
-                    f"expected no second outcome for trial {target.index}; got another "
-                    "one than the one recorded; do tell(x, action=...) to record a "
-                    "further trial"
-                )
-            return target
-        if target.index == len(self.state.trials):
-            self.state.trials.append(told)
-        self.state.trials[target.index] = told
-        return told
+        if any(told is known for known in self.state.trials):
+            return told
+        return self.state.record(told)
 
+    def withdraw(self, trial: Trial | int, *, reason: str = "") -> Trial:
+        """Take a trial out; it stays in the history, with the status "withdrawn".
+
+        The next :meth:`update` computes everything again without it, as if it had been
+        "missing". :meth:`tell` with ``trial=`` brings it back.
+
+        Args:
+            trial: The trial or its index, a pending one too.
+            reason: Kept with the trial.
+
+        Returns:
+            The recorded trial.
+
+        Raises:
+            ValueError: If there is no such trial.
+        """
+        found = find_trial(self.state, trial)
+        changes: dict[str, Any] = {"status": "withdrawn", "reason": reason}
+        return self.state.record(replace(found, **changes, **UNSCORED))
+
+    @isolated
     def update(self) -> Distribution:
         """Bring the belief up to date with every trial told so far, and return it."""
+        if self.state.is_stale:
+            recompute(self.state, self._learner)
         for trial in self.history:
             if trial.index in self.state.processed:
                 continue
-            if trial.status != "missing":
+            if trial.is_measured:
                 if trial.version != self.state.version.number:
                     self._learner.score(trial)
                 self._learner.learn(self.state.trials[trial.index])
@@ -302,12 +336,14 @@ class Campaign:
             index = self.ask().index
             if self.stop_reason is not None:
                 break
-            self.tell(real_system(self.state.trials[index].action.clone()), trial=index)
+            action = self.state.trials[index].action.clone()
+            self.tell(real_system(action), trial=index)
             self.update()
             if on_round is not None:
                 on_round(self.state.trials[index])
         return self.belief
 
+    @isolated
     def criticize(
         self, effects: Sequence[Effect] | None = None, *, evaluate: bool = True
     ) -> Report:
@@ -329,11 +365,12 @@ class Campaign:
         self.update()
         return criticize(
             self.state,
-            self._planner.compare(self._learner, effects),
+            self._planner.compare(self._learner, self.state.measured, effects),
             evaluate=evaluate,
             designed=find_method(self.state.method).designs,
         )
 
+    @isolated
     def adopt(self, report: Report) -> Distribution:
         """Go on with the augmented simulator of a report.
 

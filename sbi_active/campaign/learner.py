@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,9 +17,16 @@ from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_i
 from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.campaign.unexplained import (
+    doubts,
+    in_doubt,
+    is_suspect,
+    outlyingness,
+    simulate_prior,
+)
 from sbi_active.inference import information_gained
-from sbi_active.inference.belief import require_support
-from sbi_active.inference.rounds import Observation
+from sbi_active.inference.belief import require_support, require_width
+from sbi_active.inference.rounds import Observation, UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 
@@ -40,7 +49,8 @@ class Learner:
             them; else None.
 
     Raises:
-        ValueError: If the prior has no support, or the simulator is deterministic.
+        ValueError: If the prior has no support or no width, the simulator is
+            deterministic, or its outcomes have no numbers.
     """
 
     def __init__(
@@ -52,11 +62,20 @@ class Learner:
     ) -> None:
         self.simulator, self.prior = simulator, require_support(prior)
         self._actions, self._state = actions, state
-        self._inference = find_method(state.method).build(prior, state.options)
+        names = getattr(simulator, "parameter_names", None)
+        require_width(prior, names, seed=derive_seed(state.seed, "width"))
+        self.restart()
         self.x_shape = self._probe()
         seed = derive_seed(state.seed, "index")
         self._has_index = depends_on_index(simulator, prior, actions, seed=seed)
+
+    def restart(self) -> None:
+        """Forget all trials: the belief is the prior again."""
+        self._inference = find_method(self._state.method).build(
+            self.prior, self._state.options
+        )
         self._round_ready = False
+        self._stated: tuple[Distribution, list[str], Distribution] | None = None
         self.simulations: Simulations | None = None
 
     @property
@@ -65,6 +84,16 @@ class Learner:
         belief = self._inference.belief
         assert belief is not None
         return belief
+
+    @property
+    def stated_belief(self) -> Distribution:
+        """The belief, marked untrustworthy where trials are beyond all simulations."""
+        belief, texts = self.belief, doubts(self._state.measured)
+        if self._state.is_stale:
+            texts.append("a trial was corrected since: update() computes it again")
+        if self._stated is None or self._stated[:2] != (belief, texts):
+            self._stated = belief, texts, in_doubt(belief, self.prior, texts)
+        return self._stated[2]
 
     def at(self, index: int) -> Callable[..., Any]:
         """Return the simulator of the trial of an index."""
@@ -92,9 +121,50 @@ class Learner:
             log_score=score.log_score,
             version=state.version.number,
         )
+        self._examine(self._state.trials[trial.index])
+
+    def _examine(self, trial: Trial) -> Trial:
+        """Compare a trial that the belief did not lead to with all of the prior."""
+        if not is_suspect(trial):
+            return trial
+        assert trial.x is not None
+        state = self._state
+        with state.stage(trial.index, "scoring"):
+            rows = simulate_prior(
+                trial,
+                self.at(trial.index),
+                self.prior,
+                num_samples=state.options.num_scored,
+                seed=derive_seed(state.seed, "prior", trial.index),
+                engine=state.options.engine,
+            )
+        far = outlyingness(trial.x, rows.without_missing().x)
+        lost = rows.counts["missing"]
+        self._account(trial.index, len(rows), lost, outlyingness=far)
+        return self._warned(trial.index)
+
+    def _warned(self, index: int) -> Trial:
+        trial = self._state.trials[index]
+        for text in doubts([trial]):
+            warnings.warn(text, stacklevel=2)
+        return trial
 
     def learn(self, trial: Trial) -> None:
-        """Bring the belief up to date with one more trial."""
+        """Bring the belief up to date with one more trial.
+
+        One that nothing in the prior explains leaves it as it is.
+        """
+        if trial.is_explained:
+            try:
+                self._learn(trial)
+                return
+            except UnexplainedOutcomeError:
+                self._account(trial.index, 0, 0, outlyingness=math.inf)
+                self._warned(trial.index)
+        # Its tail probability is below what any number of simulations resolves.
+        self._account(trial.index, 0, 0, information_gained=0.0, misfit=0.0)
+
+    def _learn(self, trial: Trial) -> None:
         assert trial.x is not None
         if not self._has_index:
             self.trained(trial.index)
@@ -103,7 +173,7 @@ class Learner:
         seed, options = state.seed, state.options
         with state.stage(trial.index, "update"):
             if self._has_index:
-                earlier = [t for t in state.measured if t.index != trial.index]
+                earlier = [t for t in state.explained if t.index != trial.index]
                 belief = self._infer([*earlier, trial], trial.index)
             else:
                 with forked_generators(seed, "update", trial.index):
@@ -127,10 +197,18 @@ class Learner:
             misfit=misfit(figures),
         )
 
-    def infer(self, trials: Sequence[Trial]) -> Any:
-        """Replace the belief by that of these trials, from scratch; return it."""
-        self._round_ready = False
-        return self._infer(trials, len(trials))
+    def infer(self, trials: Sequence[Trial]) -> float | None:
+        """Replace the belief by that of these trials, from scratch.
+
+        Returns:
+            Its misfit to them, as in :class:`~sbi_active.campaign.ModelVersion`.
+        """
+        self.restart()
+        explained = [t for t in map(self._examine, trials) if t.is_explained]
+        if not explained:
+            return 0.0 if trials else None
+        found = misfit(self._infer(explained, len(trials)).diagnostics)
+        return found if len(explained) == len(trials) else 0.0
 
     def _infer(self, trials: Sequence[Trial], key: int) -> Any:
         simulator: Any = self.simulator
@@ -160,18 +238,20 @@ class Learner:
         state = self._state
         if not self._round_ready:
             seed, options = state.seed, state.options
+            # Not the index: a trial that was missing, or taken out, trains nothing.
+            key = len(state.explained)
             with state.stage(index, "simulation"):
-                with forked_generators(seed, "theta", index):
+                with forked_generators(seed, "theta", key):
                     theta = self.belief.sample(torch.Size([options.num_simulations]))
                 action = self._actions.sample(
-                    (options.num_simulations,), seed=derive_seed(seed, "action", index)
+                    (options.num_simulations,), seed=derive_seed(seed, "action", key)
                 )
                 theta, action = self._inference.arrange(theta, action)
                 rows = simulate(
                     self.at(index),
                     theta,
                     action,
-                    seed=derive_seed(seed, "x", index),
+                    seed=derive_seed(seed, "x", key),
                     **options.engine,
                 )
                 known = rows.without_missing()
@@ -181,7 +261,7 @@ class Learner:
                 self._inference.append_simulations(
                     known.theta, known.x, action=known.action, belief=self.belief
                 )
-                with forked_generators(seed, "train", index):
+                with forked_generators(seed, "train", key):
                     self._inference.train()
             self._account(index, len(rows), rows.counts["missing"])
             self._round_ready = True
@@ -212,7 +292,13 @@ class Learner:
             check_noise=True,
             **self._state.options.engine,
         )
-        return rows.x.shape[1:]
+        x_shape = rows.x.shape[1:]
+        if x_shape.numel() == 0:
+            raise ValueError(
+                f"expected outcomes with numbers; got x of shape {tuple(rows.x.shape)} "
+                "from the simulator; return at least one number a row"
+            )
+        return x_shape
 
 
 def misfit(diagnostics: dict[str, Any]) -> float | None:

@@ -12,7 +12,7 @@ from sbi_active.campaign.learner import Learner
 from sbi_active.campaign.limits import Limits
 from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.revision import compare
-from sbi_active.campaign.state import CampaignState
+from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.unlike import most_unlike
 from sbi_active.design import Design, action_name
 from sbi_active.designer import InformationGainDesigner, RandomDesigner
@@ -67,7 +67,7 @@ class Planner:
                 f"{self._state.method!r} draws actions at random; got {target!r}; do "
                 "use a method that designs them, such as 'asbi'"
             )
-        told = sum(t.status in ("ok", "invalid") for t in self._state.trials)
+        told = sum(t.is_measured for t in self._state.trials)
         if target == "model" and not (self.effects and told >= FEWEST_TRIALS):
             lacking = f"{told} trials" if self.effects else "no effects"
             raise ValueError(
@@ -77,12 +77,16 @@ class Planner:
             )
 
     def compare(
-        self, learner: Learner, effects: Sequence[Effect] | None = None
+        self,
+        learner: Learner,
+        trials: Sequence[Trial],
+        effects: Sequence[Effect] | None = None,
     ) -> Criticism:
-        """Return the comparison of the current simulator with all trials.
+        """Return the comparison of the current simulator with trials.
 
         Args:
             learner: Of the current simulator.
+            trials: That gave a measurement, or none.
             effects: What it may lack; None takes the campaign's.
         """
         return compare(
@@ -90,6 +94,7 @@ class Planner:
             learner.simulator,
             learner.prior,
             self._limits.permitted(),
+            trials=trials,
             effects=self.effects if effects is None else effects,
         )
 
@@ -111,7 +116,7 @@ class Planner:
                 to be learned about its parameters does not count.
         """
         options = self._state.options
-        told = [t for t in self._state.trials if t.status in ("ok", "invalid")]
+        told = [t for t in self._state.trials if t.is_measured]
         executed = torch.stack([t.action for t in told]) if told else torch.empty(0)
         exclude = None if options.repeat or not told else executed
         limits = self._limits.options(exclude)
@@ -123,11 +128,13 @@ class Planner:
             designer = RandomDesigner(places, **options.engine)
             return self._select(index, learner, designer), "check"
         about_model = None
-        can_compare = self.effects and len(self._state.measured) >= FEWEST_TRIALS
+        # What nothing explains would draw the next trial after it; reports have it.
+        trials = self._state.explained
+        can_compare = self.effects and len(trials) >= FEWEST_TRIALS
         if target == "model" or (target == "auto" and can_compare):
             with self._state.stage(index, "criticism"):
                 about_model = _model_design(
-                    self.compare(learner), self._limits, exclude
+                    self.compare(learner, trials), self._limits, exclude
                 )
         if about_model is not None and (target == "model" or alarmed):
             return about_model, "model"

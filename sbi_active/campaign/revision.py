@@ -10,15 +10,15 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.learner import Learner, misfit
-from sbi_active.campaign.state import CampaignState, ModelVersion
+from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Criticism, Effect, Report
 
-__all__ = ["compare", "criticize", "revise"]
+__all__ = ["compare", "criticize", "recompute", "revise"]
 
 
 def compare(
@@ -27,6 +27,7 @@ def compare(
     prior: Distribution,
     actions: ActionSpace,
     *,
+    trials: Sequence[Trial],
     effects: Sequence[Effect],
 ) -> Criticism:
     """Return the comparison of a campaign's simulator with its trials.
@@ -36,32 +37,32 @@ def compare(
         simulator: The current one; a plain callable is the draw.
         prior: Of its parameters.
         actions: The permitted ones.
+        trials: To compare it with.
         effects: What it may lack; those already adopted are left out.
     """
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
 
-    measured = state.measured
-    if len(measured) < 2:
+    if len(trials) < 2:
         raise ValueError(
-            f"expected at least two trials to compare; got {len(measured)}; do run "
-            "more trials first"
+            f"expected at least two trials to compare; got {len(trials)}; run more "
+            "trials first"
         )
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)
-    outcomes = [t.x for t in measured if t.x is not None]
+    outcomes = [t.x for t in trials if t.x is not None]
     adopted = state.version.effects
     return Criticism(
         simulator,
         prior,
         Trials(
-            torch.stack([t.action for t in measured]),
+            torch.stack([t.action for t in trials]),
             torch.stack(outcomes),
-            index=[t.index for t in measured],
+            index=[t.index for t in trials],
         ),
         effects=[e for e in effects if e.name not in adopted],
         actions=actions,
-        seed=derive_seed(state.seed, "criticism", len(measured)),
+        seed=derive_seed(state.seed, "criticism", len(trials)),
     )
 
 
@@ -117,13 +118,37 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
         effects=(*names,),
         digest=report.digest,
         num_trials=len(state.measured),
+        trials=(*state.processed,),
     )
     state.versions.append(version)
     try:
         revised = Learner(report.simulator, report.prior, actions, state)
-        belief = revised.infer(state.measured)
+        misfit = revised.infer(state.measured)
     except BaseException:
         state.versions.pop()
         raise
-    state.versions[-1] = replace(version, misfit=misfit(belief.diagnostics))
+    state.versions[-1] = replace(version, misfit=misfit)
     return revised
+
+
+def recompute(state: CampaignState, learner: Learner) -> None:
+    """Start again, as if what trials say now had been told from the start.
+
+    The trials behind an adoption are given to the current model at once, as in the
+    adoption; all others are left to be scored and learned one after another.
+
+    Args:
+        state: Of the campaign; its trials lose their scores.
+        learner: Of the current model; its belief is that of the adoption, or the prior.
+    """
+    version = state.version
+    state.processed.clear()
+    for trial in state.trials:
+        state.unscore(trial.index)
+    learner.restart()
+    if version.trials:
+        before = [t for i in version.trials if (t := state.trials[i]).is_measured]
+        misfit = learner.infer(before)
+        state.versions[-1] = replace(version, misfit=misfit)
+        state.processed.extend(version.trials)
+    state.is_stale = False

@@ -17,9 +17,21 @@ from sbi_active.inference.kernel_belief import Bandwidth
 from sbi_active.inference.mixture_density import MixtureDensity
 from sbi_active.inference.refine import Refinement
 
-__all__ = ["CampaignOptions", "CampaignState", "ModelVersion", "Status", "Trial"]
+__all__ = [
+    "FAR",
+    "UNSCORED",
+    "CampaignOptions",
+    "CampaignState",
+    "ModelVersion",
+    "Status",
+    "Trial",
+]
 
-Status = Literal["pending", "ok", "invalid", "missing"]
+Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
+
+#: Ranges of the simulations from the prior beyond all of them at which an outcome is no
+#: longer used: no simulator that is worth refining is that far off.
+FAR = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +155,7 @@ class Trial:
         x: The outcome, shape x_shape; None while pending or missing.
         status: "pending"; "ok"; "invalid" where the trial ran and gave no measurement,
             which is information; "missing" where a fault unrelated to the parameters
-            hit it, which is ignored.
+            hit it, and "withdrawn" where it was taken back, which are ignored.
         design: The design behind the action; None where the trial was not asked for.
         target: What the action was chosen for: "theta" or names of parameters, "model",
             "check" for one where no trial was, "random"; None where it was not asked
@@ -154,8 +166,14 @@ class Trial:
         log_score: Log density of x under it, nats.
         misfit: Tail probability of all trials so far under the belief after this one,
             which was fitted to them; None for a belief that was not refined.
+        outlyingness: How far x lies beyond all simulations from the prior at this
+            action, in their range, by its farthest number; inf where none of them had
+            such a number, None where it is as others from the belief before are. Above
+            5 nothing in the prior explains the trial, and the belief leaves it out.
+        reason: Why it was withdrawn.
         version: Number of the model that scored the trial.
-        seconds: Wall time by stage.
+        seconds: Wall time by stage; this and what follows add up where the campaign is
+            computed again.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
         num_missing: Those of them lost to faults of the simulator.
@@ -171,11 +189,23 @@ class Trial:
     surprise: float | None = None
     log_score: float | None = None
     misfit: float | None = None
+    outlyingness: float | None = None
+    reason: str = ""
     version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     cpu_seconds: dict[str, float] = field(default_factory=dict)
     num_simulations: int = 0
     num_missing: int = 0
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether it ran and tells about the parameters, by a measurement or none."""
+        return self.status in ("ok", "invalid")
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether it is measured and something in the prior may explain it."""
+        return self.is_measured and (self.outlyingness or 0.0) <= FAR
 
 
 @dataclass(frozen=True)
@@ -189,6 +219,7 @@ class ModelVersion:
         num_trials: Told before it was adopted.
         misfit: As in :class:`Trial`, of the trials that the version was given.
         examined: Digests of the comparisons of this version with trials, in order.
+        trials: Indices of those told before it was adopted, which it was given at once.
     """
 
     number: int = 0
@@ -197,6 +228,18 @@ class ModelVersion:
     num_trials: int = 0
     misfit: float | None = None
     examined: tuple[str, ...] = ()
+    trials: tuple[int, ...] = ()
+
+
+#: Of a trial that was not scored.
+UNSCORED: dict[str, Any] = {
+    "information_gained": None,
+    "surprise": None,
+    "log_score": None,
+    "misfit": None,
+    "outlyingness": None,
+    "version": None,
+}
 
 
 @dataclass
@@ -210,6 +253,7 @@ class CampaignState:
         trials: In the order in which they were asked for or told.
         processed: Indices of trials that the belief contains, in order of use.
         versions: Lineage of the simulator, the current one last.
+        is_stale: Whether a trial that the belief contains was corrected since.
     """
 
     method: str
@@ -218,6 +262,7 @@ class CampaignState:
     trials: list[Trial] = field(default_factory=list)
     processed: list[int] = field(default_factory=list)
     versions: list[ModelVersion] = field(default_factory=lambda: [ModelVersion()])
+    is_stale: bool = False
 
     @property
     def version(self) -> ModelVersion:
@@ -226,9 +271,25 @@ class CampaignState:
 
     @property
     def measured(self) -> Sequence[Trial]:
-        """The trials that the belief contains, those without a fault, in order."""
-        used = [self.trials[i] for i in self.processed]
-        return [t for t in used if t.status in ("ok", "invalid")]
+        """The trials so far that tell about the parameters, in the order of use."""
+        return [t for i in self.processed if (t := self.trials[i]).is_measured]
+
+    @property
+    def explained(self) -> Sequence[Trial]:
+        """The trials that the belief rests on, in the order of use."""
+        return [t for t in self.measured if t.is_explained]
+
+    def record(self, trial: Trial) -> Trial:
+        """Keep a trial at its index, and note where that changes what was used."""
+        if trial.index == len(self.trials):
+            self.trials.append(trial)
+        self.trials[trial.index] = trial
+        self.is_stale |= trial.index in self.processed
+        return trial
+
+    def unscore(self, index: int) -> None:
+        """Forget what a trial was found to be."""
+        self.change(index, **UNSCORED)
 
     def change(self, index: int, **changes: Any) -> None:
         """Replace entries of a trial."""

@@ -2,47 +2,80 @@
 
 from __future__ import annotations
 
+import operator
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.campaign.state import CampaignState, Status, Trial
-from sbi_active.inference.condition import outcome_rows
+from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
+from sbi_active.inference.condition import action_rows, outcome_rows
 
-__all__ = ["outcome_told", "same_outcome", "trial_to_tell"]
+__all__ = ["find_trial", "told_trial"]
+
+LARGEST = torch.finfo(torch.float32).max
 
 
-def trial_to_tell(
-    state: CampaignState, trial: Trial | int | None, *, has_action: bool
+def told_trial(
+    state: CampaignState,
+    x: Any,
+    *,
+    trial: Trial | int | None,
+    action: Any,
+    status: Status,
+    x_shape: torch.Size,
+    action_dim: int,
 ) -> Trial:
-    """Return the trial that is meant, a new one where none is pending.
+    """Return the record of a trial as told; the recorded one where nothing is new.
 
     Args:
         state: Of the campaign.
+        x: The outcome.
         trial: The trial, its index, or None for the pending one.
-        has_action: Whether an executed action was told.
+        action: The executed one; None is the one asked for.
+        status: As told.
+        x_shape: Of an outcome.
+        action_dim: Numbers in an action.
 
     Raises:
-        ValueError: If there is no such trial.
+        ValueError: If there is no such trial, or numbers or shapes do not fit.
     """
-    if trial is None:
-        pending = [t for t in state.trials if t.status == "pending"]
-        if pending:
-            return pending[0]
-        if not has_action:
-            raise ValueError(
-                "expected a pending trial; got none; do ask() first, or pass "
-                "action= to record a trial that was not asked for"
-            )
-        return Trial(len(state.trials), torch.empty(0))
-    index = trial.index if isinstance(trial, Trial) else trial
+    if status not in ("ok", "invalid", "missing"):
+        raise ValueError(
+            f"expected status 'ok', 'invalid' or 'missing'; got {status!r}; choose one "
+            "of these, or withdraw(trial)"
+        )
+    outcome = outcome_told(x, status, x_shape)
+    if outcome is not None and not bool(outcome.isfinite().any()):
+        status = "invalid"
+    target = _trial_to_tell(
+        state, trial, outcome, status, has_action=action is not None
+    )
+    executed = target.action if action is None else _action_told(action, action_dim)
+    told = replace(target, action=executed, x=outcome, status=status)
+    if target.status != "pending":
+        told = replace(told, reason="", **UNSCORED)
+        return target if same_outcome(target, told) else told
+    return told
+
+
+def find_trial(state: CampaignState, trial: Trial | int) -> Trial:
+    """Return the recorded trial of an index.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    try:
+        index = trial.index if isinstance(trial, Trial) else operator.index(trial)
+    except TypeError:
+        index = -1
     if not 0 <= index < len(state.trials):
         raise ValueError(
             f"expected the index of one of {len(state.trials)} trials; got "
-            f"{index}; do pass the trial that ask() returned"
+            f"{trial if index < 0 else index}; pass the trial that ask() returned"
         )
     return state.trials[index]
 
@@ -53,7 +86,8 @@ def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
     None for a missing trial. A number that is infinite was not measured either.
 
     Raises:
-        ValueError: If there is no outcome, or one of another shape.
+        ValueError: If there is no outcome, or one of another shape, or what was told
+            are no numbers that float32 holds.
     """
     if status == "missing":
         return None
@@ -61,13 +95,19 @@ def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
         return torch.full(x_shape, torch.nan)
     if x is None:
         raise ValueError(
-            "expected the outcome x; got None; do tell(x), or tell(status=...) "
-            "with 'invalid' or 'missing' where there is none"
+            "expected the outcome x; got None; tell(x), or tell(status=...) with "
+            "'invalid' or 'missing' where there is none"
         )
-    tensor = x if isinstance(x, Tensor) else torch.as_tensor(np.asarray(x))
+    tensor = _numbers(x, "the outcome x")
     if tensor.shape != x_shape and tensor.numel() == x_shape.numel() == 1:
         tensor = tensor.reshape(x_shape)
-    return _measured(outcome_rows(tensor, x_shape)[0])
+    rows = outcome_rows(tensor, x_shape)
+    if len(rows) != 1:
+        raise ValueError(
+            f"expected one outcome of shape {tuple(x_shape)}; got {len(rows)}; tell "
+            "one trial at a time"
+        )
+    return _measured(rows[0])
 
 
 def _measured(x: Tensor) -> Tensor:
@@ -78,7 +118,7 @@ def _measured(x: Tensor) -> Tensor:
     warnings.warn(
         f"{int(infinite.sum())} of {x.numel()} told numbers are infinite and count as "
         "not measured; pass NaN where a sensor gave nothing",
-        stacklevel=4,
+        stacklevel=6,
     )
     return torch.where(infinite, torch.nan, x)
 
@@ -90,3 +130,82 @@ def same_outcome(a: Trial, b: Trial) -> bool:
     if a.x is None or b.x is None:
         return a.x is b.x
     return bool(torch.allclose(a.x, b.x, equal_nan=True))
+
+
+def _trial_to_tell(
+    state: CampaignState,
+    trial: Trial | int | None,
+    outcome: Tensor | None,
+    status: Status,
+    *,
+    has_action: bool,
+) -> Trial:
+    """Return the trial that is meant, a new one where none is pending."""
+    if trial is not None:
+        return find_trial(state, trial)
+    pending = [t for t in state.trials if t.status == "pending"]
+    if pending:
+        return pending[0]
+    if has_action:
+        return Trial(len(state.trials), torch.empty(0))
+    if state.trials:  # the last one, told twice
+        last = state.trials[-1]
+        if same_outcome(last, replace(last, x=outcome, status=status)):
+            return last
+    raise ValueError(
+        "expected a pending trial; got none; ask() first, pass action= to record a "
+        "trial that was not asked for, or trial= to correct one"
+    )
+
+
+def _action_told(action: Any, action_dim: int) -> Tensor:
+    row = action_rows(_numbers(action, "the action"), action_dim, num_rows=1)[0]
+    if not bool(row.isfinite().all()):
+        raise ValueError(
+            f"expected a finite action; got {row.tolist()}; pass the action that was "
+            "executed, or status='missing' where it is unknown"
+        )
+    return row
+
+
+def _numbers(told: Any, what: str) -> Tensor:
+    """Return numbers in float32, apart from what the caller may still change."""
+    with torch.inference_mode(False):  # tensors of that mode are barred from training
+        if isinstance(told, Tensor):
+            tensor = told.detach().cpu().clone()
+        else:
+            tensor = torch.from_numpy(_array(told, what))
+        if tensor.is_complex():
+            raise ValueError(
+                f"expected real numbers for {what}; got complex ones; pass the real "
+                "and the imaginary part, or the absolute value, as numbers of their own"
+            )
+        size = tensor.double().abs()
+        too_large = size.isfinite() & (size > LARGEST)
+        if bool(too_large.any()):
+            raise ValueError(
+                f"expected {what} within {LARGEST:.2g}, the largest of float32; got "
+                f"{float(size[too_large].max()):.3g}; use another unit"
+            )
+        return tensor.float()
+
+
+def _array(told: Any, what: str) -> np.ndarray:
+    """Return an array of floats or of complex numbers, its own memory."""
+    try:
+        if isinstance(told, (list, tuple)):  # of tensors, perhaps
+            told = [_plain(part) for part in told]
+        array = np.asarray(told)
+        kind = complex if array.dtype.kind == "c" else float
+        if array.dtype.kind in "USmM" or None in array.ravel().tolist():
+            raise TypeError  # "1.5" is no measurement, and None is not NaN
+        return np.array(array, dtype=kind)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"expected {what} as numbers; got {told!r:.80}; pass a number, or an array "
+            "or tensor of them"
+        ) from None
+
+
+def _plain(part: Any) -> Any:
+    return part.detach().cpu().numpy() if isinstance(part, Tensor) else part

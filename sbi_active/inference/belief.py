@@ -23,6 +23,7 @@ __all__ = [
     "information_gained",
     "parameter_dim",
     "require_support",
+    "require_width",
 ]
 
 
@@ -282,3 +283,36 @@ def require_support(prior: Distribution | None) -> Distribution:
             "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
         )
     return prior
+
+
+#: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
+FEWEST_STEPS = 64
+
+
+def require_width(
+    prior: Distribution, names: Sequence[str] | None = None, *, seed: int
+) -> None:
+    """Raise where a prior has no width, or one that float32 cannot hold.
+
+    Args:
+        prior: Of the parameters.
+        names: Of the parameters.
+        seed: Of some draws.
+
+    Raises:
+        ValueError: If draws of a parameter are too few steps of float32 apart.
+    """
+    with forked_generators(seed):
+        draws = prior.sample(torch.Size([256])).reshape(256, -1).float().double()
+    size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
+    steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
+    narrow = (steps < FEWEST_STEPS).nonzero()[:, 0].tolist()
+    if not narrow:
+        return
+    k = narrow[0]
+    raise ValueError(
+        f"expected a prior in which parameters vary; got {names[k] if names else k!r} "
+        f"within [{draws[:, k].min():.9g}, {draws[:, k].max():.9g}], fewer than "
+        f"{FEWEST_STEPS} steps of float32 wide; fix the parameter in the simulator, or "
+        "shift it to deviations from its value"
+    )

@@ -36,6 +36,7 @@ from sbi_active.inference.regions import (
     cover,
     whole_space,
 )
+from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.inference.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
@@ -189,7 +190,7 @@ def _refine(
         fits = [histories.regress(region) for region in regions]
         regressions = [fit for fit in fits if fit is not None]
         if not regressions:
-            raise ValueError(
+            raise UnexplainedOutcomeError(
                 "expected simulations with a measurement, since trials had one; got "
                 f"none or NaN in {histories.num_drawn - int(histories.valid.sum())} of "
                 f"{histories.num_drawn} histories; do check the simulator at the "

@@ -18,10 +18,15 @@ from sbi_active.inference.condition import action_rows, outcome_rows
 __all__ = [
     "Observation",
     "RoundRows",
+    "UnexplainedOutcomeError",
     "check_proposal",
     "require_whole",
     "round_rows",
 ]
+
+
+class UnexplainedOutcomeError(ValueError):
+    """A trial gave a measurement where simulations give none."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ def round_rows(
     present = x.flatten(1).isfinite()
     invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
     if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
-        raise ValueError(
+        raise UnexplainedOutcomeError(
             f"expected at least one simulation with a measurement; got {len(x)} of "
             f"{len(x)} invalid (NaN or inf); do check the simulator at theta = "
             f"{theta[0].tolist()}, action = {action[0].tolist()}"

@@ -1,0 +1,30 @@
+"""A campaign's methods, apart from the state of the process that calls them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+
+from sbi_active.seeding import kept_generators
+
+__all__ = ["isolated"]
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def isolated(method: Method) -> Method:
+    """Return a method that neither needs nor changes what torch keeps globally.
+
+    It trains under ``torch.no_grad`` and ``torch.inference_mode`` too, and restores the
+    global generators: sbi draws from a prior to look at it.
+    """
+
+    @functools.wraps(method)
+    def apart(*arguments: Any, **options: Any) -> Any:
+        with kept_generators(), torch.inference_mode(False), torch.enable_grad():
+            return method(*arguments, **options)
+
+    return apart  # type: ignore[return-value]

@@ -1,0 +1,317 @@
+"""Bad numbers: refused, left out of the belief and named, told again, withdrawn."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    Refinement,
+    SimulatorModel,
+)
+from sbi_active.campaign.unexplained import outlyingness
+from sbi_active.criticism import Effect
+from sbi_active.inference import RatioClassifier
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+OPTIONS = CampaignOptions(
+    num_simulations=300,
+    num_samples=100,
+    num_scored=200,
+    density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
+    refinement=Refinement(num_histories=300, num_particles=1_000),
+)
+RATIOS = RatioClassifier(hidden_features=(16,), num_iterations=50)
+TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6
+
+
+def campaign(method="nsbi", simulator=MODEL, **changes):
+    options = replace(OPTIONS, **changes)
+    if method == "seqbed":
+        options = replace(options, density_estimator=RATIOS)
+    return Campaign(simulator, PRIOR, ACTIONS, method=method, options=options)
+
+
+def tell(c, told=TOLD, **bad):
+    """Tell trials, ``bad`` the outcomes of some by their index."""
+    for i, (action, x) in enumerate(told):
+        c.tell(bad.get(f"x{i}", x), action=[action])
+    return c
+
+
+def draws(c):
+    torch.manual_seed(5)
+    return c.belief.sample((300,))
+
+
+def scores(c):
+    return [
+        (t.surprise, t.log_score, t.misfit, t.outlyingness, t.information_gained)
+        for t in c.history
+    ]
+
+
+@pytest.mark.parametrize("bad", [1e15, -1e30, 62.0])
+@pytest.mark.parametrize(
+    "method",
+    [
+        *["nsbi", "alhi"],
+        *[pytest.param(m, marks=pytest.mark.slow) for m in ("asbi", "nlhi", "seqbed")],
+    ],
+)
+def test_a_number_that_nothing_explains_is_named_and_left_out(method, bad):
+    c = tell(campaign(method), x0=bad)
+    with pytest.warns(UserWarning, match=r"trial 0 at action \[1\]: x = \["):
+        belief = c.update()
+    diagnostics = belief.diagnostics
+    assert diagnostics["trustworthy"] is False
+    text = diagnostics["warnings"][0]
+    assert "trial 0" in text
+    assert "tell(x, trial=0)" in text
+    assert "withdraw(0)" in text
+    # Two measurements of noise .1 at actions .5 and 3.
+    assert float(belief.mean) == pytest.approx(0.6, abs=0.1)
+    assert float(belief.variance.sqrt()) < 0.12
+    assert c.health == "alarm"
+    assert [t.is_explained for t in c.history] == [False, True, True]
+    assert c.ask().status == "pending"
+
+
+@pytest.mark.filterwarnings("ignore:trial 0 at action")
+def test_a_campaign_with_such_a_number_can_be_criticized():
+    c = tell(campaign(), x0=62.0)
+    assert c.criticize([], evaluate=False).verdict
+
+
+def test_the_first_trial_alone_leaves_the_prior_marked():
+    c = campaign()
+    c.tell(1e15, action=[1.0])
+    with pytest.warns(UserWarning, match="trial 0"):
+        belief = c.update()
+    assert belief.diagnostics["trustworthy"] is False
+    theta = torch.linspace(0, 0.99, 5)[:, None]
+    assert torch.equal(belief.log_prob(theta), PRIOR.log_prob(theta))
+    assert c.update() is belief
+    assert c.ask().index == 1
+
+
+def test_a_number_beyond_all_simulations_but_near_stays_and_is_named():
+    c = campaign()
+    c.tell(2.5, action=[1.0])
+    with pytest.warns(UserWarning, match="trial 0"):
+        belief = c.update()
+    assert belief.diagnostics["trustworthy"] is False
+    assert "leaves it out" not in belief.diagnostics["warnings"][0]
+    assert float(belief.mean) > 0.9
+
+
+def test_a_good_campaign_is_not_doubted():
+    c = tell(campaign())
+    c.update()
+    assert [t.outlyingness for t in c.history] == [None] * 3
+    assert c.belief is c._learner.belief
+
+
+def test_a_measurement_where_the_simulator_gives_none():
+    def lost(theta, action):
+        x = theta * action + 0.1 * torch.randn_like(theta)
+        return torch.where(action == 3.0, torch.nan, x)
+
+    c = tell(campaign(simulator=lost))
+    with pytest.warns(UserWarning, match="numbers that no simulation from the prior"):
+        belief = c.update()
+    assert float(belief.mean) == pytest.approx(0.6, abs=0.15)
+    assert c.history[1].outlyingness == float("inf")
+    c.ask()
+
+
+def test_a_measurement_that_is_too_rare_to_simulate():
+    def almost_never(theta, action):
+        x = theta * action + 0.1 * torch.randn_like(theta)
+        return torch.where((action == 3.0) & (theta < 0.985), torch.nan, x)
+
+    c = tell(campaign(simulator=almost_never, num_scored=1_000))
+    with pytest.warns(UserWarning, match="trial 1"):
+        belief = c.update()
+    assert belief.diagnostics["trustworthy"] is False
+    c.ask()
+
+
+@pytest.mark.parametrize("method", ["nsbi", "alhi"])
+@pytest.mark.filterwarnings("ignore:trial 0")
+def test_a_corrected_trial_is_as_if_told_at_once(method):
+    right, wrong = tell(campaign(method)), tell(campaign(method), x0=1e15)
+    right.update(), wrong.update()
+    assert wrong.health == "alarm"
+    told = wrong.tell(TOLD[0][1], trial=0)
+    assert (told.status, told.surprise) == ("ok", None)
+    assert "corrected since" in wrong.belief.diagnostics["warnings"][0]
+    wrong.update()
+    assert torch.equal(draws(right), draws(wrong))
+    assert scores(right) == scores(wrong)
+    assert wrong.health == right.health == "ok"
+    assert wrong.ask().action.equal(right.ask().action)
+    wrong.tell(1.8), right.tell(1.8)
+    assert torch.equal(draws(right), draws(wrong))
+
+
+@pytest.mark.filterwarnings("ignore:trial 1")
+def test_a_withdrawn_trial_is_as_if_missing():
+    missing, wrong = campaign(), tell(campaign(), x1=62.0)
+    for i, (action, x) in enumerate(TOLD):
+        missing.tell(x, action=[action], status="missing" if i == 1 else "ok")
+    missing.update(), wrong.update()
+    withdrawn = wrong.withdraw(1, reason="told in cm")
+    assert (withdrawn.status, withdrawn.reason) == ("withdrawn", "told in cm")
+    missing.update(), wrong.update()
+    assert torch.equal(draws(missing), draws(wrong))
+    assert scores(missing) == scores(wrong)
+    assert [t.index for t in wrong.history] == [0, 1, 2]
+    assert wrong.health == "ok"
+    # And back again, with the right number.
+    assert wrong.tell(TOLD[1][1], trial=1).reason == ""
+    wrong.update()
+    right = tell(campaign())
+    right.update()
+    assert torch.equal(draws(right), draws(wrong))
+
+
+def test_a_pending_trial_can_be_withdrawn():
+    c = campaign()
+    c.withdraw(c.ask())
+    assert c.pending is None
+    assert c.ask().index == 1
+    with pytest.raises(
+        ValueError, match="expected the index of one of 2 trials; got 2"
+    ):
+        c.withdraw(2)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:trial [0-4] at action")
+def test_a_correction_behind_an_adoption():
+    bias = Effect(
+        "bias",
+        hook="observation",
+        prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+        null=0.0,
+        apply=lambda x, phi, action, context: x + phi,
+    )
+    told = [(a, 0.6 * a + 0.8) for a in (1.0, 3.0, 0.5, 3.0, 1.0)]
+    campaigns = [tell(campaign(), told), tell(campaign(), told)]
+    for c in campaigns:
+        report = c.criticize([bias], evaluate=False)
+        assert report.verdict == "bias"
+        c.adopt(report)
+    right, wrong = campaigns
+    wrong.tell(500.0, trial=1)
+    wrong.update()
+    assert wrong.health == "alarm"
+    assert wrong.belief.diagnostics["trustworthy"] is False
+    truth = torch.tensor([0.6, 0.8])
+    assert bool(((wrong.belief.mean - truth).abs() < 0.3).all())
+    wrong.tell(told[1][1], trial=1)
+    wrong.update()
+    assert torch.equal(draws(right), draws(wrong))
+    assert wrong.state.version.misfit == right.state.version.misfit
+    assert [t.version for t in wrong.history] == [None] * 5
+    for c in campaigns:
+        c.tell(1.4, action=[1.0])
+        c.update()
+    assert torch.equal(draws(right), draws(wrong))
+    assert scores(right)[-1] == scores(wrong)[-1]
+
+
+def test_the_last_trial_told_twice():
+    c = campaign()
+    c.ask()
+    told = c.tell(0.5)
+    assert c.tell(0.5) is told
+    with pytest.raises(ValueError, match="expected a pending trial; got none"):
+        c.tell(0.6)
+    assert c.tell(0.5, action=told.action).index == 1  # a further one, by its action
+
+
+@pytest.mark.parametrize(
+    ("x", "text"),
+    [
+        ("abc", "expected the outcome x as numbers; got 'abc'"),
+        (["1.5"], "expected the outcome x as numbers; got"),
+        ([None], "expected the outcome x as numbers; got [None]"),
+        (object(), "expected the outcome x as numbers; got <object"),
+        (10**400, "expected the outcome x as numbers; got 1000"),
+        (1 + 2j, "expected real numbers for the outcome x; got complex ones"),
+        (torch.tensor([1j]), "expected real numbers for the outcome x; got complex"),
+        (np.array([1e39]), "expected the outcome x within 3.4e+38, the largest of"),
+        (-torch.ones(1).double() * 1e300, "expected the outcome x within 3.4e+38"),
+        ([], "expected x of shape (1,)"),
+        (torch.zeros(0, 1), "expected one outcome of shape (1,); got 0"),
+        ([[1.0], [2.0]], "expected one outcome of shape (1,); got 2"),
+    ],
+)
+def test_outcomes_that_are_refused(x, text):
+    c = campaign()
+    c.ask()
+    with pytest.raises(ValueError, match=re.escape(text)):
+        c.tell(x)
+    assert c.pending is not None
+    assert c.history == ()
+
+
+@pytest.mark.parametrize("action", [[np.nan], [np.inf], [1e39], "abc", [1j]])
+def test_actions_that_are_refused(action):
+    c = campaign()
+    with pytest.raises(ValueError, match="expected (a finite|the|real).* action"):
+        c.tell(1.0, action=action)
+    assert c.state.trials == []
+
+
+@pytest.mark.parametrize("make", [np.float32, np.float64, torch.tensor, int, list])
+def test_what_is_told_is_a_copy(make):
+    c = campaign()
+    told = [1.0] if make is list else make(1)
+    array = np.array([0.5], dtype=np.float32)
+    trial = c.tell(told, action=array)
+    array[0] = 7.0
+    assert trial.action.tolist() == [0.5]
+    again = c.tell(array, action=[1.0])
+    array[0] = 9.0
+    assert again.x.tolist() == [7.0]
+    assert (trial.x.tolist(), trial.x.dtype) == ([1.0], torch.float32)
+
+
+def test_a_robot_that_changes_its_action_changes_no_record():
+    c = campaign()
+
+    def real_system(action):
+        action *= 2.0
+        return 0.3 * action
+
+    c.run(real_system, num_rounds=1)
+    assert bool(ACTIONS.contains(c.history[0].action))
+
+
+def test_simulators_without_numbers():
+    with pytest.raises(ValueError, match="expected outcomes with numbers; got x of sh"):
+        campaign(simulator=lambda theta, action: torch.zeros(len(theta), 0))
+
+
+def test_outlyingness_by_the_farthest_number():
+    drawn = torch.stack([torch.linspace(0, 1, 11), torch.zeros(11)], 1)
+    assert outlyingness(torch.tensor([0.5, 0.0]), drawn) == 0
+    assert outlyingness(torch.tensor([-2.0, 0.0]), drawn) == 2
+    assert outlyingness(torch.tensor([torch.nan, 4.0]), drawn[:, 1:].repeat(1, 2)) > 1e9
+    assert outlyingness(torch.tensor([torch.nan, 0.0]), drawn) == 0
+    drawn[:, 1] = torch.nan
+    assert outlyingness(torch.tensor([0.5, 0.0]), drawn) == float("inf")
