@@ -25,6 +25,7 @@ def test_readme(capsys):
     assert len(namespace["campaign"].history) == 3
     assert namespace["report"].verdict == "bias"
     assert "Verdict: bias (P" in printed
+    assert "P holds among the\ndeclared effects alone" in printed
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -13,6 +13,7 @@ from sbi_active.criticism.results import (
     Evidence,
     NextAction,
     Residuals,
+    SevereTest,
     Tracing,
 )
 from sbi_active.criticism.trials import Trials
@@ -30,6 +31,7 @@ __all__ = [
     "NextAction",
     "Report",
     "Residuals",
+    "SevereTest",
     "Tracing",
     "Trials",
     "close_loop",

@@ -245,7 +245,8 @@ class Criticism:
         Args:
             evaluate: Without held-out trials the error costs one verdict a trial; False
                 leaves it out.
-            plan: Name the next action, which takes about as long as the verdict.
+            plan: Name the next action, and those that would test the verdict most,
+                which takes about as long as the verdict.
             designed: The trials' actions were chosen for their information, of which
                 the report then warns.
             exploratory: Library or priors were changed after the data were seen, of
@@ -253,10 +254,11 @@ class Criticism:
         """
         from sbi_active.criticism.psis_loo import leave_one_out
         from sbi_active.criticism.report import build_report
+        from sbi_active.criticism.severe_tests import severe_tests
 
         tracing = self.trace()
         simulator, prior = self.add()
-        skipped = self.actions is None or not plan
+        space = self.actions if plan else None
         after = None
         if tracing.verdict != NONE:
             error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
@@ -271,12 +273,15 @@ class Criticism:
             simulator=simulator,
             prior=prior,
             evaluation=self.evaluate() if evaluate else None,
-            next_action=None if skipped else self.next_action(),
+            next_action=None if space is None else self.next_action(),
             actions=self.actions,
             digest=self.digest,
             designed=designed,
             exploratory=exploratory,
             leave_one_out=leave_one_out(self.rivals, tracing),
+            severe_tests=(
+                () if space is None else severe_tests(self.rivals, tracing, space)
+            ),
             warnings=self._given(),
         )
 

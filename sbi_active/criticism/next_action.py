@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.criticism.candidates import (
+    following,
+    permitted_candidates,
+    simulated,
+)
 from sbi_active.criticism.outside import outside_candidates
 from sbi_active.criticism.predictive import predict
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, NextAction, Tracing
 from sbi_active.criticism.rival_set import RivalSet
-from sbi_active.criticism.trials import Trials
 from sbi_active.design import Design
 from sbi_active.designer import InformationGainDesigner
 from sbi_active.seeding import derive_seed
@@ -30,8 +34,7 @@ NEGLIGIBLE = 0.01
 MAX_RIVALS = 8
 #: Information below which no action is worth a trial, nats.
 NOTHING = 0.02
-MAX_CANDIDATES = 64
-#: The same beyond the permitted range, where the best is not asked for.
+#: Candidates beyond the permitted range, where the best is not asked for.
 MAX_OUTSIDE = 24
 #: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
 #: three quarters fit a density, which needs some tens.
@@ -54,7 +57,7 @@ class PredictedRival:
     ) -> None:
         self.rivals, self.name, self.probability = rivals, name, probability
         self.candidates = candidates
-        self._trials = _following(rivals, candidates)
+        self._trials = following(rivals, candidates)
         self._draws: tuple[tuple[int, int], Tensor] | None = None
 
     def predict(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
@@ -127,11 +130,7 @@ def choose_action(
         actions: The permitted ones.
         beyond: Whether to try others where these separate nothing.
     """
-    if isinstance(actions, DiscreteActions) and len(actions) <= MAX_CANDIDATES:
-        candidates = actions.values
-    else:
-        seed = derive_seed(rivals.seed, "candidates")
-        candidates = actions.sample((MAX_CANDIDATES,), seed=seed)
+    candidates = permitted_candidates(rivals, actions)
     named = [n for n, p in tracing.probabilities.items() if p > NEGLIGIBLE][:MAX_RIVALS]
     gain = np.zeros(len(candidates))
     action = None
@@ -170,7 +169,7 @@ def _look_outside(
     if not groups:
         return found
     others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
-    others = _simulated(rivals, others)
+    others = simulated(rivals, others)
     if len(others) == 0:
         return found
     for group in groups:
@@ -203,38 +202,3 @@ def _select(
     )
     seed = derive_seed(rivals.seed, "next action", *names)
     return designer.select(models, target="model", seed=seed)
-
-
-def _simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
-    """Return the candidates at which the bare model gives numbers.
-
-    Beyond the permitted range a simulator may fail in any way.
-    """
-    kept = []
-    with torch.no_grad():
-        for action in candidates:
-            try:
-                prediction = predict(
-                    rivals,
-                    _following(rivals, action[None]),
-                    num_draws=4,
-                    scored=False,
-                )
-            except Exception:  # noqa: BLE001  (a user's simulator)
-                continue
-            if np.isfinite(prediction.x).all() and prediction.valid.all():
-                kept.append(action)
-    return torch.stack(kept) if kept else candidates[:0]
-
-
-def _following(rivals: RivalSet, candidates: Tensor) -> Trials:
-    """Return each candidate as if it were the next trial."""
-    own, num = rivals.trials, len(candidates)
-    x, times = own.template()
-    return Trials(
-        candidates.double(),
-        x.expand(num, *x.shape),
-        index=torch.full((num,), float(own.index.max()) + 1),
-        sample_times=times,
-        repeat_of=torch.full((num,), -1),
-    )

@@ -8,14 +8,26 @@ import numpy as np
 
 from sbi_active.criticism.figures import METRICS
 from sbi_active.criticism.headline import added, number, with_error
-from sbi_active.criticism.results import NONE, Array, Evaluation, NextAction
-from sbi_active.criticism.section import Section, joined
+from sbi_active.criticism.results import (
+    NONE,
+    SCATTER,
+    UNEXPLAINED,
+    Evaluation,
+    NextAction,
+)
+from sbi_active.criticism.section import Section, joined, setting
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report import Report
 
 __all__ = ["errors", "next_action", "parameters"]
 
+SEVERE = (
+    "The first paragraph names the actions that put the verdict to the test most. The "
+    "free residual is the bare model and a smooth function of the action, both as "
+    "fitted to the trials; the difference is the root mean square over x, in standard "
+    "deviations of the verdict's prediction, noise included."
+)
 FEW_PAIRS = 8  # scored trials below which the pairs stand in place of an interval
 
 
@@ -99,18 +111,30 @@ def next_action(report: Report) -> Section:
     best = float(np.nanmax(chosen.information_gain, initial=0.0))
     if chosen.action is not None:
         question = f" between {joined(chosen.separates)}" if chosen.separates else ""
-        text = [
-            f"{_action(report, chosen.action)}: at least {best:.2f} nats{question} (a "
-            "lower bound)."
-        ]
-    elif len(chosen.separates) == 1:
-        text = [f"Stop: no model but {chosen.separates[0]} is left."]
+        action = setting(report.action_labels, chosen.action)
+        text = [f"{action}: at least {best:.2f} nats{question} (a lower bound)."]
     else:
-        text = [
-            "Stop: no permitted action tells more about which model is right than "
-            f"{max(best, 0.001):.3f} nats."
-        ]
+        text = [_nothing_to_tell(report, chosen, best)]
+    if report.severe_tests:
+        text.append(SEVERE)
     return Section(title, tuple(text), items=tuple(_inseparable(report, chosen)))
+
+
+def _nothing_to_tell(report: Report, chosen: NextAction, best: float) -> str:
+    """Return why no action is chosen; it is the end only where the bare model holds."""
+    found = (
+        "no permitted action tells more about which declared model is right than "
+        f"{max(best, 0.001):.3f} nats."
+    )
+    if len(chosen.separates) == 1:
+        found = f"of the declared models only {chosen.separates[0]} is left."
+    if report.verdict == NONE:
+        return f"Stop: {found}"
+    rest = {
+        UNEXPLAINED: " Declare what else the simulator may lack.",
+        SCATTER: " Repeat an action to see how large it is.",
+    }
+    return found[0].upper() + found[1:] + rest.get(report.verdict, "")
 
 
 def _inseparable(report: Report, chosen: NextAction) -> list[str]:
@@ -124,7 +148,8 @@ def _inseparable(report: Report, chosen: NextAction) -> list[str]:
         item = f"no permitted action separates {_in_words(group)}"
         if group == beyond and chosen.outside is not None:
             item += (
-                f"; {_action(report, chosen.outside)}, which is not permitted, would: "
+                f"; {setting(report.action_labels, chosen.outside)}, which is not "
+                "permitted, would: "
                 f"at least {chosen.outside_gain:.2f} nats"
             )
         items.append(item)
@@ -134,14 +159,6 @@ def _inseparable(report: Report, chosen: NextAction) -> list[str]:
 def _in_words(group: frozenset[str]) -> str:
     *first, last = sorted(group)
     return f"{', '.join(first)} and {last}" if first else last
-
-
-def _action(report: Report, action: Array) -> str:
-    parts = []
-    for label, value in zip(report.action_labels, action, strict=True):
-        name, _, unit = label.partition(" [")
-        parts.append(f"{name} = {value:.4g} {unit.removesuffix(']')}".rstrip())
-    return ", ".join(parts)
 
 
 def _pairs(evaluation: Evaluation) -> list[str]:

@@ -56,6 +56,11 @@ class Prediction:
         each = self.log_likelihood
         return log_sum_exp(each, axis=0) - np.log(len(each))
 
+    def moments(self) -> tuple[Array, Array]:
+        """Return mean and standard deviation of each number, noise included, (N,)."""
+        variance = self.mean.var(0) + (self.sd**2).mean(0)
+        return self.mean.mean(0), np.sqrt(variance)
+
 
 def predict(
     rivals: RivalSet,

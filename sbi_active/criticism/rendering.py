@@ -9,12 +9,13 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from sbi_active.criticism.conditions import first_paragraph
 from sbi_active.criticism.figures import (
     plot_before_after,
     plot_probabilities,
     plot_residuals,
 )
-from sbi_active.criticism.headline import added, summary_sentence, verdict_line
+from sbi_active.criticism.headline import added, verdict_line
 from sbi_active.criticism.section import Section
 from sbi_active.criticism.sections import sections
 
@@ -71,7 +72,7 @@ def figures(report: Report) -> dict[str, Figure]:
 
 def to_text(report: Report) -> str:
     """Return the report as plain text, the verdict in the first line."""
-    lines = [verdict_line(report), *_wrapped(summary_sentence(report))]
+    lines = [verdict_line(report), *_wrapped(first_paragraph(report))]
     for section in sections(report):
         lines += ["", section.title, "-" * len(section.title)]
         for paragraph in section.text:
@@ -86,7 +87,7 @@ def to_text(report: Report) -> str:
 
 def to_markdown(report: Report) -> str:
     """Return the report as Markdown."""
-    lines = [f"# {verdict_line(report)}", "", summary_sentence(report)]
+    lines = [f"# {verdict_line(report)}", "", first_paragraph(report)]
     for section in sections(report):
         lines += ["", f"## {section.title}", ""]
         for paragraph in section.text:
@@ -113,7 +114,7 @@ def to_html(report: Report) -> str:
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f"<title>{title}</title>\n<style>\n{STYLE}\n</style>\n</head>\n<body>",
         f"<h1>{title}</h1>",
-        f"<p>{e(summary_sentence(report))}</p>",
+        f"<p>{e(first_paragraph(report))}</p>",
     ]
     for section in sections(report):
         parts.append(f"<h2>{e(section.title)}</h2>")

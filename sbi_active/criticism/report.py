@@ -24,6 +24,7 @@ from sbi_active.criticism.results import (
     Evaluation,
     NextAction,
     Residuals,
+    SevereTest,
     Tracing,
 )
 from sbi_active.criticism.trials import Trials
@@ -56,6 +57,8 @@ class Report:
         channel_names: One an entry of x's last axis, where known.
         leave_one_out: Of the bare model and of the one that was chosen, where trials
             are independent given their parameters.
+        severe_tests: Where a verdict that names effects would be put to the test most:
+            a permitted action, and one beyond.
     """
 
     residuals: Residuals
@@ -73,6 +76,7 @@ class Report:
     action_labels: tuple[str, ...]
     channel_names: tuple[str, ...] | None
     leave_one_out: tuple[LeaveOneOut, ...] = ()
+    severe_tests: tuple[SevereTest, ...] = ()
 
     def __str__(self) -> str:
         return rendering.to_text(self)
@@ -191,6 +195,7 @@ def build_report(
     exploratory: bool = False,
     designed: bool = False,
     leave_one_out: Sequence[LeaveOneOut] = (),
+    severe_tests: Sequence[SevereTest] = (),
     warnings: Sequence[str] = (),
 ) -> Report:
     """Put the parts together, and find what a reader must be warned of.
@@ -210,6 +215,7 @@ def build_report(
         exploratory: What was frozen was changed afterwards.
         designed: Actions were chosen for their information.
         leave_one_out: Of the bare model and of the one that was chosen.
+        severe_tests: Where the verdict would be put to the test most.
         warnings: Further ones.
 
     Returns:
@@ -249,6 +255,7 @@ def build_report(
         action_labels=tuple(labels),
         channel_names=None if channels is None else tuple(channels),
         leave_one_out=tuple(leave_one_out),
+        severe_tests=tuple(severe_tests),
     )
 
 

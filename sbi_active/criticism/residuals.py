@@ -32,7 +32,7 @@ def find_residuals(
     """
     trials, m = rivals.trials, rivals.measurements
     prediction = predict(rivals, names=names, error=error)
-    mean, sd = _moments(prediction)
+    mean, sd = prediction.moments()
     times = trials.sample_times
     if times is None and rivals.model.sample_times is not None:
         times = rivals.model.sample_times
@@ -62,11 +62,6 @@ def find_residuals(
             else None
         ),
     )
-
-
-def _moments(prediction: Prediction) -> tuple[Array, Array]:
-    variance = prediction.mean.var(0) + (prediction.sd**2).mean(0)
-    return prediction.mean.mean(0), np.sqrt(variance)
 
 
 def _filled(values: Array, position: Array, shape: tuple[int, ...]) -> Array:

@@ -16,6 +16,7 @@ __all__ = [
     "Evidence",
     "NextAction",
     "Residuals",
+    "SevereTest",
     "Tracing",
 ]
 
@@ -274,3 +275,20 @@ class NextAction:
     outside: Array | None = None
     outside_separates: tuple[str, ...] = ()
     outside_gain: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SevereTest:
+    """An action at which a verdict that names effects would be put to the test.
+
+    Attributes:
+        action: Shape (action_dim,).
+        is_permitted: Whether it is among the permitted actions.
+        difference: Between the verdict's prediction and that of a free residual, root
+            mean square over the numbers of x, in standard deviations of the verdict's
+            prediction, noise included.
+    """
+
+    action: Array
+    is_permitted: bool
+    difference: float

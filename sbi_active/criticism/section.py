@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-__all__ = ["Section", "joined"]
+import numpy as np
+
+__all__ = ["Section", "joined", "named_entries", "setting"]
 
 
 @dataclass(frozen=True)
@@ -34,3 +36,23 @@ def joined(names: Sequence[str] | frozenset[str]) -> str:
     if isinstance(names, frozenset):
         return " = ".join(sorted(names))
     return ", ".join(names)
+
+
+def setting(labels: Sequence[str], action: np.ndarray) -> str:
+    """Return an action in words, each entry with its name and unit.
+
+    Example:
+        >>> setting(["speed [m/s]", "tilt"], np.array([2.5, 0.125]))
+        'speed = 2.5 m/s, tilt = 0.125'
+    """
+    return ", ".join(
+        f"{name} = {value:.4g} {unit}".rstrip()
+        for (name, unit), value in zip(named_entries(labels), action, strict=True)
+    )
+
+
+def named_entries(labels: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield name and unit of each entry of the action, "" without a unit."""
+    for label in labels:
+        name, _, unit = label.partition(" [")
+        yield name, unit.removesuffix("]")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.criticism import joint_prior
+from sbi_active.criticism import SevereTest, Trials, joint_prior
 from sbi_active.criticism.cautions import find_warnings
 from sbi_active.criticism.headline import with_error
 from tests.criticism.reports import (
@@ -192,11 +192,117 @@ def test_an_action_that_is_chosen_can_leave_a_group_unseparated():
     assert "- no permitted action separates none and tilt" in text
 
 
-def test_nothing_more_to_do_is_a_stop():
-    worth = "Stop: no permitted action tells more about which model is right than 0.410"
-    assert worth in flat(stopped())
-    assert "Stop: no model but drag is left." in flat(stopped(separates=("drag",)))
+def test_only_a_bare_model_that_holds_is_a_stop():
+    none = {"tracing": tracing("none"), "residuals_after": None}
+    plan = replace(report().next_action, action=None)
+    worth = "no permitted action tells more about which declared model is right than 0"
+    assert f"Stop: {worth}.410" in flat(report(next_action=plan, **none))
+    left = replace(plan, separates=("none",))
+    assert "Stop: of the declared models only none is left." in flat(
+        report(next_action=left, **none)
+    )
     assert "speed = 3 m/s: at least 0.41 nats between drag, tilt" in flat(report())
+
+
+@pytest.mark.parametrize(
+    ("verdict", "advice"),
+    [
+        ("drag", "Of the declared models only drag is left."),
+        ("unexplained", "only unexplained is left. Declare what else the simulator"),
+        ("scatter", "only scatter is left. Repeat an action to see how large it is."),
+    ],
+)
+def test_a_model_that_is_left_is_no_stop(verdict, advice):
+    told = {"tracing": tracing(verdict)}
+    alone = replace(report().next_action, action=None, separates=(verdict,))
+    several = replace(report().next_action, action=None)
+    assert advice in flat(report(next_action=alone, **told))
+    for plan in (alone, several):
+        assert "stop" not in flat(report(next_action=plan, **told)).lower()
+
+
+def first_paragraph(made):
+    return " ".join(str(made).split("\n\n")[0].split())
+
+
+TESTS = (
+    SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),
+    SevereTest(action=np.array([4.5]), is_permitted=False, difference=56.7),
+)
+
+
+def test_a_named_verdict_is_followed_by_what_it_is_conditional_on():
+    first = first_paragraph(report(severe_tests=TESTS))
+    assert "P holds among the declared effects alone" in first
+    assert (
+        "No other action was tried than these 8: speed from -3 to 3 m/s. The verdict "
+        "would be put to the test most at speed = 3 m/s, where its prediction and that "
+        "of a free residual differ by 1.23 of its standard deviations, and beyond the "
+        "permitted range at speed = 4.5 m/s, by 56.7."
+    ) in first
+    for verdict in ("none", "unexplained", "scatter"):
+        other = first_paragraph(report(tracing=tracing(verdict)))
+        assert "P holds among" not in other
+        assert "No other action was tried" not in other
+
+
+def shifted(*shifts):
+    """Return a report whose verdict moves the parameters by so many deviations."""
+    made = tracing()
+    draws = made.evidences["none"].draws
+    draws = (draws - draws.mean(0)) / draws.std(0) * 0.01 + 0.3
+    names = tuple(f"mu_{i + 1}" for i in range(len(shifts)))
+    wide = np.resize(draws[:, :1], (len(draws), 1)).repeat(len(shifts), 1)
+    after = wide + 0.01 * np.array(shifts)
+    none = replace(made.evidences["none"], names=names, draws=wide)
+    drag = replace(
+        made.evidences["drag"],
+        names=(*names, "drag"),
+        draws=np.column_stack([after, draws[:, 0]]),
+    )
+    evidences = {**made.evidences, "none": none, "drag": drag}
+    return first_paragraph(report(tracing=replace(made, evidences=evidences)))
+
+
+def test_parameters_that_the_verdict_moves_are_told_the_farthest_first():
+    assert (
+        "Against the bare fit the verdict moves mu_2 by -0.9 to -0.6 (90 of its "
+        "standard deviations), mu_1 by +0.02 to 0.32 (2 of its standard deviations)."
+    ) in shifted(2.0, -90.0, 0.5)
+    assert "moves mu_5 by +0.08 to 0.38" in shifted(1.0, 1.5, 2.0, 4.0, 8.0)
+    assert "(2 of its standard deviations), and 2 more" in shifted(1.1, 1.5, 2, 4, 8)
+    assert "No parameter moves by more than its standard deviation" in shifted(0.5, 0)
+
+
+def test_a_bare_fit_of_one_draw_has_no_deviation_to_count_in():
+    made = tracing()
+    evidences = dict(made.evidences)
+    evidences["none"] = replace(evidences["none"], draws=np.full((400, 2), 0.1))
+    first = first_paragraph(report(tracing=replace(made, evidences=evidences)))
+    assert "(more than 1000 of its standard deviations)" in first
+    assert "inf" not in first
+    assert "nan" not in first
+
+
+def test_one_action_alone_is_told_as_one():
+    once = replace(residuals(size=6.0), action=np.full((8, 1), 2.0))
+    assert "No other action was tried than speed = 2 m/s." in flat(
+        report(residuals=once)
+    )
+
+
+def test_many_entries_of_an_action_are_not_all_told():
+    action = np.arange(40.0).reshape(8, 5)
+    made = report(
+        residuals=replace(residuals(size=6.0), action=action),
+        trials=Trials(torch.tensor(action), torch.randn(8, 6)),
+        actions=None,
+        next_action=None,
+    )
+    assert (
+        "these 8: action 1 from 0 to 35, action 2 from 1 to 36, action 3 from 2 to "
+        "37, and 2 more entries."
+    ) in flat(made)
 
 
 def test_a_report_of_a_right_model_has_no_warnings():

@@ -1,0 +1,40 @@
+"""Actions beyond the permitted ones."""
+
+import pytest
+import torch
+
+from sbi_active import DiscreteActions
+from sbi_active.criticism.outside import extrapolated
+
+
+@pytest.mark.parametrize(
+    ("values", "farthest"),
+    [
+        ([0.5, 1.0, 3.0], 4.25),  # a speed has no other sign
+        ([-0.5, -1.0, -3.0], -4.25),
+        ([-1.0, 0.0, 1.0], 2.0),
+    ],
+)
+def test_extrapolated_actions_keep_their_sign_where_there_is_one(values, farthest):
+    actions = DiscreteActions(values)
+    found = extrapolated(actions, actions.values, limit=16)[:, 0]
+    assert not bool(actions.contains(found[:, None]).any())
+    assert abs(farthest) == pytest.approx(float(found.abs().max()))
+    if min(values) >= 0:
+        assert float(found.min()) >= 0
+    if max(values) <= 0:
+        assert float(found.max()) <= 0
+
+
+def test_extrapolated_actions_lie_beyond_and_are_few():
+    grid = torch.cartesian_prod(torch.arange(5.0), torch.arange(-2.0, 3.0))
+    actions = DiscreteActions(grid)
+    found = extrapolated(actions, grid, limit=7)
+    assert found.shape == (7, 2)
+    beyond = (found > grid.max(0).values) | (found < grid.min(0).values)
+    assert bool(beyond.any(-1).all())
+
+
+def test_a_single_action_has_nothing_beyond():
+    actions = DiscreteActions([2.0])
+    assert len(extrapolated(actions, actions.values, limit=4)) == 0
