@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
+from sbi_active.criticism.arrays import (
+    copied,
+    padded,
+    repeated,
+    require_labels,
+    root,
+)
 from sbi_active.criticism.tables import read_table
 
 __all__ = ["Role", "Trials"]
@@ -21,8 +28,9 @@ Role = Literal["fit", "held out"]
 class Trials:
     r"""Measured trials.
 
-    Ragged observations are padded with NaN. NaN is masked; a trial of NaN alone is
-    *invalid*: the system ran and gave no measurement.
+    Ragged observations are padded with NaN. NaN is masked, and so is inf, with a
+    warning; a trial of NaN alone is *invalid*: the system ran and gave no measurement.
+    What is given is copied, and may change afterwards.
 
     Args:
         action: As commanded, shape (n, action_dim), or (n,) for scalar actions.
@@ -36,14 +44,15 @@ class Trials:
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
         performed_at: When each trial was executed, in any unit, shape (n,).
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
-            none; None takes trials of equal actions as repeats of the first.
+            none; None takes trials of equal actions as repeats of the first. A repeat
+            of a repeat is one of the first.
         covariates: Further numbers by name, shape (n,) each.
         action_labels: What reports call each entry of the action, with its unit.
         channel_labels: The same of each entry of x's last axis.
 
     Raises:
-        ValueError: If shapes disagree, all trials are invalid, or held-out data have
-            no measurement.
+        ValueError: If shapes disagree, numbers are not real, actions or the index not
+            finite, all trials are invalid, or held-out data have no measurement.
 
     Example:
         >>> trials = Trials(torch.tensor([1.0, 2.0]), torch.tensor([0.3, 0.5]))
@@ -66,12 +75,12 @@ class Trials:
         action_labels: Sequence[str] | None = None,
         channel_labels: Sequence[str] | None = None,
     ) -> None:
-        self.action = _tensor(action)
+        self.action = copied(action)
         if self.action.ndim == 1:
             self.action = self.action[:, None]
-        self.x = _padded(x)
+        self.x = padded(x)
         n = len(self.x)
-        if self.action.ndim != 2 or len(self.action) != n or n == 0:
+        if self.action.ndim != 2 or len(self.action) != n or 0 in self.action.shape:
             raise ValueError(
                 "expected actions (n, action_dim) and x with as many rows; got "
                 f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; do give one "
@@ -84,17 +93,21 @@ class Trials:
             )
         if self.x.ndim == 1:
             self.x = self.x[:, None]
+        if 0 in self.x.shape:
+            raise ValueError(
+                f"expected at least one number in x; got shape {tuple(self.x.shape)}; "
+                "pass what was measured, NaN for a trial without a measurement"
+            )
         if mask is not None:
-            keep = torch.as_tensor(_padded(mask) == 1)
-            if keep.shape != self.x.shape:
-                raise ValueError(
-                    f"expected a mask of shape {tuple(self.x.shape)}, that of x; got "
-                    f"{tuple(keep.shape)}; do give one an entry of x"
-                )
-            self.x = self.x.where(keep, torch.nan)
-        self.x = self.x.where(self.x.isfinite(), torch.nan)
+            self.x = self.x.where(self._kept(mask), torch.nan)
+        self.x = _without_inf(self.x)
         self.role = _roles(role, n)
         self.index = self._rows("index", index, torch.arange(n))
+        if not bool(self.index.isfinite().all()):
+            raise ValueError(
+                f"expected finite places in index; got {self.index.tolist()}; pass the "
+                "place of each trial in the order of execution, or leave index out"
+            )
         self.performed_at = (
             None
             if performed_at is None
@@ -102,16 +115,22 @@ class Trials:
         )
         self.sample_times = self._times(sample_times)
         self.repeat_of = (
-            _repeats(self.action)
+            repeated(self.action)
             if repeat_of is None
-            else self._rows("repeat_of", repeat_of, None).long()
+            else root(self._rows("repeat_of", repeat_of, None))
         )
         self.covariates = {
             name: self._rows(name, value, None)
             for name, value in (covariates or {}).items()
         }
-        self.action_labels = None if action_labels is None else (*action_labels,)
-        self.channel_labels = None if channel_labels is None else (*channel_labels,)
+        self.action_labels = require_labels(
+            "action_labels", action_labels, [self.action.shape[1]]
+        )
+        # A trajectory of one channel has none of its own axis.
+        one = [1] if self.x.ndim == 2 and self.sample_times is not None else []
+        self.channel_labels = require_labels(
+            "channel_labels", channel_labels, [self.x.shape[-1], *one]
+        )
         if not bool(self.valid.any()):
             raise ValueError(
                 f"expected at least one valid trial; got {n} trials without a "
@@ -246,7 +265,12 @@ class Trials:
         at = torch.arange(len(self))[
             positions if isinstance(positions, slice) else torch.as_tensor(positions)
         ].reshape(-1)
-        new = {int(old): i for i, old in enumerate(at)}
+        own = torch.arange(len(self))
+        first = torch.where(self.repeat_of < 0, own, self.repeat_of)[at]
+        # Where the first trial is left out, the others repeat the first that is kept.
+        new = {int(place): i for i, place in reversed([*enumerate(first)])}
+        new |= {int(old): i for i, old in enumerate(at)}
+        repeat_of = torch.tensor([new[int(place)] for place in first])
         times = self.sample_times
         return Trials(
             self.action[at],
@@ -255,7 +279,7 @@ class Trials:
             index=self.index[at],
             sample_times=times if times is None or times.ndim == 1 else times[at],
             performed_at=None if self.performed_at is None else self.performed_at[at],
-            repeat_of=torch.tensor([new.get(int(self.repeat_of[i]), -1) for i in at]),
+            repeat_of=repeat_of,
             covariates={name: v[at] for name, v in self.covariates.items()},
             action_labels=self.action_labels,
             channel_labels=self.channel_labels,
@@ -271,7 +295,7 @@ class Trials:
         return self.select(positions)
 
     def _rows(self, name: str, value: Any, default: Tensor | None) -> Tensor:
-        tensor = _tensor(default if value is None else value)
+        tensor = copied(default if value is None else value)
         if tensor.shape != (len(self),):
             raise ValueError(
                 f"expected {name} of shape ({len(self)},), one a trial; got "
@@ -279,10 +303,28 @@ class Trials:
             )
         return tensor
 
+    def _kept(self, mask: Any) -> Tensor:
+        """Return where x is a measurement; what pads a ragged mask is none."""
+        keep = padded(mask)
+        if keep.ndim == 1 and self.x.shape[1:] == (1,):
+            keep = keep[:, None]
+        if keep.shape != self.x.shape:
+            raise ValueError(
+                f"expected a mask of shape {tuple(self.x.shape)}, that of x; got "
+                f"{tuple(keep.shape)}; do give one an entry of x"
+            )
+        if not bool(((keep == 0) | (keep == 1) | keep.isnan()).all()):
+            wrong = float(keep[(keep != 0) & (keep != 1) & ~keep.isnan()][0])
+            raise ValueError(
+                f"expected a mask of True and False, or 1 and 0; got {wrong:g}; pass "
+                "True where x is a measurement"
+            )
+        return keep == 1
+
     def _times(self, times: Any) -> Tensor | None:
         if times is None:
             return None
-        tensor = _padded(times)
+        tensor = padded(times)
         k = self.x.shape[1]
         if tensor.shape not in ((k,), (len(self), k)):
             raise ValueError(
@@ -309,30 +351,6 @@ class Trials:
         return tensor
 
 
-def _tensor(value: Any) -> Tensor:
-    """Return numbers in float64 that their owner cannot change afterwards."""
-    return torch.as_tensor(np.asarray(value), dtype=torch.float64).clone()
-
-
-def _padded(value: Any) -> Tensor:
-    """Return arrays stacked, shorter ones padded with NaN at their end."""
-    if isinstance(value, (Tensor, np.ndarray)) or np.isscalar(value):
-        return _tensor(value)
-    rows = [_tensor(row) for row in value]
-    if len({row.shape for row in rows}) <= 1:
-        return torch.stack(rows) if rows else torch.empty(0)
-    if len({row.shape[1:] for row in rows}) > 1 or any(r.ndim == 0 for r in rows):
-        raise ValueError(
-            "expected observations that differ in their first axis alone; got shapes "
-            f"{[tuple(row.shape) for row in rows]}; do give the same channels in each"
-        )
-    longest = max(len(row) for row in rows)
-    x = torch.full((len(rows), longest, *rows[0].shape[1:]), torch.nan).double()
-    for i, row in enumerate(rows):
-        x[i, : len(row)] = row
-    return x
-
-
 def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
     roles: list[Role] = ["fit"] * n if role is None else [*role]
     if len(roles) != n or not {*roles} <= {"fit", "held out"}:
@@ -343,8 +361,12 @@ def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
     return roles
 
 
-def _repeats(action: Tensor) -> Tensor:
-    """Return the position of the first trial of the same action, -1 for itself."""
-    same = (action[:, None] == action[None]).all(-1)
-    first = same.int().argmax(-1)
-    return first.where(first != torch.arange(len(action)), torch.tensor(-1))
+def _without_inf(x: Tensor) -> Tensor:
+    """Return x with NaN for inf, and say so: no sensor measures it."""
+    lost = x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
+    if lost:
+        warnings.warn(
+            f"x is inf in trials {lost}: taken as not measured, as NaN is",
+            stacklevel=3,
+        )
+    return x.where(x.isfinite(), torch.nan)

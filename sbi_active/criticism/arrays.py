@@ -1,0 +1,139 @@
+"""Measured numbers as they come, as tensors that nobody else holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["copied", "padded", "repeated", "require_labels", "root"]
+
+
+def copied(value: Any) -> Tensor:
+    """Return a copy in float64 that keeps nothing of what was given.
+
+    Args:
+        value: A tensor, an array, or nested sequences of numbers; what a masked array
+            masks is NaN.
+
+    Raises:
+        ValueError: If it is complex, text, dates, or no numbers at all.
+    """
+    if isinstance(value, Sequence) and any(torch.is_tensor(part) for part in value):
+        return torch.stack([copied(part) for part in value])
+    if torch.is_tensor(value):
+        _require_real(value.is_complex(), value.dtype)
+        return value.detach().to("cpu", torch.float64, copy=True)
+    array = np.asanyarray(value)
+    _require_real(array.dtype.kind not in "biufO", array.dtype)
+    if np.ma.isMaskedArray(array):
+        array = np.ma.filled(array.astype(np.float64), np.nan)
+    try:
+        return torch.from_numpy(np.array(array, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"expected real numbers; got {type(value).__name__} of {array.dtype} with "
+            f"an entry that is none ({error}); pass floats, NaN where nothing was "
+            "measured"
+        ) from error
+
+
+def _require_real(wrong: bool, dtype: Any) -> None:
+    if wrong:
+        raise ValueError(
+            f"expected real numbers; got {dtype}; pass floats, those of a complex "
+            "number as two channels"
+        )
+
+
+def padded(value: Any) -> Tensor:
+    """Return copies of arrays stacked, shorter ones padded with NaN at their end."""
+    if _is_stacked(value):
+        return copied(value)
+    rows = [copied(row) for row in value]
+    if len({row.shape for row in rows}) <= 1:
+        return torch.stack(rows) if rows else torch.empty(0)
+    if len({row.shape[1:] for row in rows}) > 1 or any(r.ndim == 0 for r in rows):
+        raise ValueError(
+            "expected observations that differ in their first axis alone; got shapes "
+            f"{[tuple(row.shape) for row in rows]}; do give the same channels in each"
+        )
+    longest = max(len(row) for row in rows)
+    x = torch.full((len(rows), longest, *rows[0].shape[1:]), torch.nan).double()
+    for i, row in enumerate(rows):
+        x[i, : len(row)] = row
+    return x
+
+
+def _is_stacked(value: Any) -> bool:
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return all(np.ndim(row) == 0 for row in value.flat)
+    return isinstance(value, Tensor | np.ndarray) or bool(np.isscalar(value))
+
+
+def repeated(action: Tensor) -> Tensor:
+    """Return the position of the first trial of the same action, -1 for itself."""
+    same = (action[:, None] == action[None]).all(-1)
+    first = same.int().argmax(-1)
+    return first.where(first != torch.arange(len(action)), torch.tensor(-1))
+
+
+def root(repeat_of: Tensor) -> Tensor:
+    """Return the first trial that each repeats, through repeats of repeats.
+
+    Args:
+        repeat_of: Position of the trial that each one repeats, shape (n,), -1 or its
+            own for none.
+
+    Returns:
+        The same with positions that repeat nothing themselves, -1 for none.
+
+    Raises:
+        ValueError: If a position is no trial, or trials repeat each other in a circle.
+
+    Example:
+        >>> root(torch.tensor([-1, 0, 1, 3])).tolist()
+        [-1, 0, 0, -1]
+    """
+    num = len(repeat_of)
+    own = torch.arange(num)
+    inside = (repeat_of >= -1) & (repeat_of < num) & (repeat_of == repeat_of.round())
+    if not bool(inside.all()):
+        raise ValueError(
+            f"expected repeat_of among the positions 0 to {num - 1}, or -1 for none; "
+            f"got {repeat_of.tolist()}; pass the position of the trial it repeats"
+        )
+    before = torch.where(repeat_of < 0, own, repeat_of.long())
+    first = before
+    for _ in range(num):
+        first = before[first]
+    if not bool((before[first] == first).all()):
+        raise ValueError(
+            "expected repeats that lead back to a first trial; got "
+            f"{repeat_of.tolist()}, which runs in a circle; pass -1 for the first"
+        )
+    return first.where(first != own, torch.tensor(-1))
+
+
+def require_labels(
+    name: str, labels: Sequence[str] | None, sizes: Sequence[int]
+) -> tuple[str, ...] | None:
+    """Return labels as a tuple, or raise where they are not one text an entry.
+
+    Args:
+        name: Of the argument.
+        labels: None for none.
+        sizes: How many there may be.
+    """
+    if labels is None:
+        return None
+    found = () if isinstance(labels, str) else (*labels,)
+    if len(found) not in sizes or not all(isinstance(each, str) for each in found):
+        raise ValueError(
+            f"expected {name} of {sizes[0]} strings, one an entry; got {labels!r}; "
+            "pass a list of as many"
+        )
+    return found
