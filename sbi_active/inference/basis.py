@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +39,12 @@ class Basis:
         rng = np.random.default_rng(7)  # any fixed directions will do
         frequency = rng.standard_normal((dim, num)) / length
         return Basis(2, frequency, rng.uniform(0, 2 * np.pi, num))
+
+    @property
+    def num_features(self) -> int:
+        """Number p of features."""
+        dim, num_waves = self.frequency.shape
+        return math.comb(dim + self.degree, self.degree) + num_waves
 
     def __call__(self, u: Array) -> Array:
         """Return features, shape (n, p), of coordinates, shape (n, d)."""

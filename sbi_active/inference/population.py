@@ -25,7 +25,8 @@ INFLATION = 1.4  # of their covariance
 SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
 SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
-NUM_FITTED = 800  # particles a mixture is fitted to
+NUM_FITTED = 800  # particles a mixture is fitted to, at least
+FITTED = 12  # of them for each number in a covariance
 
 
 class Proposal(Protocol):
@@ -116,15 +117,13 @@ class GaussianMixture:
         whitening = spread[:, None] * root
         z = np.linalg.solve(whitening, (points - center).T).T
         n, d = z.shape
-        k = max(1, min(num_components, n // (2 * d + 2)))
+        k = max(1, min(num_components, n // max(2 * d + 2, _num_moments(d))))
         share = _spread_responsibility(z, k, rng)
         previous = -np.inf
         for _ in range(num_iterations if k > 1 else 1):
             count = share.sum(0) + 1e-12
             mean = (share.T @ z) / count[:, None]
-            second = ((share[:, :, None] * z[:, None, :]).reshape(n, -1).T @ z).reshape(
-                k, d, d
-            )
+            second = (share.T[:, None] * z.T) @ z
             covariance = (
                 second / count[:, None, None] - mean[:, :, None] * mean[:, None]
             )
@@ -265,10 +264,16 @@ def population_monte_carlo(
             share = max(0.7 * share, 0.02)
         tempered = _tempered(log_base, log_target, log_q, beta)
         weight = np.exp(tempered - logsumexp(tempered))
-        points = z[_systematic(weight, NUM_FITTED, rng)]
+        num_fitted = max(NUM_FITTED, FITTED * _num_moments(z.shape[1]))
+        points = z[_systematic(weight, num_fitted, rng)]
         mixture = GaussianMixture.fit(points, num_components, rng)
         proposal = StudentProposal(mixture, base)
     return (particles if best is None else best), step + 1
+
+
+def _num_moments(dim: int) -> int:
+    """Return the numbers in a mean and a covariance."""
+    return dim * (dim + 3) // 2
 
 
 def _tempered(log_base: Array, log_target: Array, log_q: Array, beta: float) -> Array:

@@ -53,6 +53,7 @@ __all__ = ["Refinement", "refine"]
 Array = NDArray[Any]
 
 HALF = 0.5  # of the budget, after which misfit is taken to stay
+MANY = 6  # parameters beyond which a covariance needs more particles
 MIN_STAGE = 60  # histories below which another stage adds nothing
 
 
@@ -201,7 +202,7 @@ def _refine(
             surrogate.log_joint,
             base,
             rng,
-            num_particles=settings.num_particles,
+            num_particles=_num_particles(settings, coordinates.dim),
             first=first,
             num_components=6 if len(regressions) <= 4 else 10,
         )
@@ -287,6 +288,10 @@ def _stage_size(settings: Refinement, used: int) -> int:
     return left if left < size + MIN_STAGE else size
 
 
+def _num_particles(settings: Refinement, dim: int) -> int:
+    return int(settings.num_particles * max(1.0, dim / MANY))
+
+
 def _simulate_stage(
     histories: Histories,
     regions: list[Region],
@@ -311,6 +316,8 @@ def _simulate_stage(
         if missing <= 0:
             continue
         z = rng.permutation(region.sample_inside(missing, histories.coordinates, rng))
+        if len(z) == 0:  # none of it lies in the support
+            continue
         num_replicates = missing * (size - num_places) // num_places
         histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
 

@@ -36,7 +36,8 @@ class Refinement:
         replicate_share: Share of a stage simulated twice, which tells noise from
             misfit.
         num_particles: Of the importance sample of the surrogate, which costs no
-            simulations; its effective number bounds the error of the normalizer.
+            simulations; its effective number bounds the error of the normalizer. More
+            are taken beyond six parameters, in proportion to these.
         max_regions: Ellipsoids at most, but for splits against misfit.
         check_order: Refine a second time, with the trials in reverse and new
             simulations, and report the divergence between the two: what the order and

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
-from scipy.stats import chi2
+from scipy.stats import chi, chi2
 
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.population import GaussianMixture, Particles
@@ -91,14 +91,28 @@ class Region:
         kept: list[Array] = []
         missing = num_samples
         for _ in range(20):  # a region may touch the support in a sliver only
-            normal = rng.standard_normal((2 * missing + 20, len(self.center)))
-            normal = normal[(normal**2).sum(1) < SPREAD**2]
-            z = self.center + (self.radius / SPREAD * normal) @ self.factor.T
+            z = self._rays(2 * missing + 20, rng)
             kept.append(z[coordinates.inside(z)][:missing])
             missing -= len(kept[-1])
             if missing == 0:
                 break
+        if missing > 0:  # as where a box of many sides cuts each ray
+            z = coordinates.pulled_inside(self.center, self._rays(missing, rng), rng)
+            kept.append(z[coordinates.inside(z)])
         return np.concatenate(kept)
+
+    def _rays(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return normal draws cut at the edge, shape (n, d): a direction and a length.
+
+        The length's distribution is inverted, since of twenty normal numbers hardly
+        any fall within the edge.
+        """
+        d = len(self.center)
+        normal = rng.standard_normal((num_samples, d))
+        direction = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        level = rng.random((num_samples, 1)) * chi.cdf(SPREAD, d)
+        length = self.radius / SPREAD * chi.ppf(level, d)
+        return self.center + (length * direction) @ self.factor.T
 
 
 def whole_space(dim: int) -> Region:

@@ -22,6 +22,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -154,10 +155,10 @@ class LocalRegression:
             is_wave = basis.phase.size > 0
             if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
                 break  # a cubic will do, or another stage makes it do
-            features = basis(u)
-            p = features.shape[1]
+            p = basis.num_features
             if n < p + max(20, p // 2):
                 continue
+            features = basis(u)
             ridge = np.diag(np.full(p, 1e-4 if is_wave else 1e-9))
             orthogonal, triangular = np.linalg.qr(np.concatenate([features, ridge]))
             root = np.linalg.inv(triangular)
@@ -213,6 +214,16 @@ class LocalRegression:
         leverage = ((features @ self.root) ** 2).sum(1)
         return features @ self.coefficient, 1 + leverage
 
+    @cached_property
+    def compact(self) -> Array:
+        """Fewest numbers whose squares add up to those of the outcomes, (p, min(p, q)).
+
+        An orthogonal map of the whitened outcomes, many of which are linear in others
+        where there are more outcomes than features.
+        """
+        p, q = self.coefficient.shape
+        return self.coefficient if q <= p else np.linalg.qr(self.coefficient.T)[1].T
+
     @property
     def caution(self) -> float:
         """Factor of the variance that keeps what the misfit would wrongly exclude.
@@ -234,9 +245,11 @@ class LocalRegression:
             z: Shape (n, d).
             caution: Factor of the variance.
         """
-        error, widening = self.whitened(z)
+        features = self.basis(self.region.scaled(z))
+        widening = 1 + ((features @ self.root) ** 2).sum(1)
         q = int(self.used.sum())
-        square = (error**2).sum(1) * self.precision / (widening * caution)
+        square = ((features @ self.compact) ** 2).sum(1)
+        square = square * self.precision / (widening * caution)
         log_volume = self.log_volume + 0.5 * q * np.log(2 * np.pi * widening * caution)
         log_likelihood = -0.5 * square - log_volume
         for outcome in self.outcomes:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform, MultipleIndependent
+from scipy.stats import chi
 from torch.distributions import (
     Gamma,
     Independent,
@@ -19,6 +20,7 @@ from torch.distributions import (
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.population import Particles
 from sbi_active.inference.regions import (
+    SPREAD,
     PriorProposal,
     Region,
     RegionsProposal,
@@ -105,3 +107,30 @@ def test_cover_holds_each_mode(num_modes: int):
     assert (nearest_region(regions, z) >= 0).mean() > 0.999
     # Between the modes lies nothing: the ellipsoids are much smaller than the box.
     assert sum(math.exp(region.log_volume) for region in regions) < 0.1
+
+
+@pytest.mark.parametrize("dim", [1, 2, 6, 10, 20])
+def test_simulations_fill_a_region_of_any_dimension(dim: int):
+    rng = np.random.default_rng(0)
+    prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
+    coordinates = PriorCoordinates(prior, rng)
+    region = Region(np.full(dim, 0.1), 0.2 * np.eye(dim), 3.0)
+    z = region.sample_inside(2_000, coordinates, rng)
+    assert len(z) == 2_000
+    # Normal numbers of deviation R / 2.2 on each axis, where the length is below R.
+    kept = chi.cdf(SPREAD, dim + 2) / chi.cdf(SPREAD, dim)
+    expected = 0.2 * 3.0 / SPREAD * kept**0.5
+    assert region.distance(z).max() <= 1
+    assert z.std() == pytest.approx(expected, rel=4 * (2 * 2_000 * dim) ** -0.5 + 0.01)
+
+
+def test_simulations_fill_what_a_box_of_many_sides_leaves_of_a_region():
+    rng = np.random.default_rng(0)
+    dim = 20
+    coordinates = PriorCoordinates(BoxUniform(-torch.ones(dim), torch.ones(dim)), rng)
+    region = Region(np.full(dim, 0.3), np.eye(dim), 7.0)  # one draw in 1e6 is inside
+    z = region.sample_inside(500, coordinates, rng)
+    assert len(z) == 500
+    assert region.distance(z).max() <= 1
+    assert coordinates.inside(z).all()
+    assert z.std(0).min() > 0.3  # a uniform draw has .58 on each axis
