@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from sbi_active.criticism.effects import Effect, require_distinct
+from sbi_active.seeding import kept_generators
 
 __all__ = ["JointPrior", "joint_prior"]
 
@@ -62,7 +63,9 @@ class JointPrior(Distribution):
         rows = value.reshape(-1, sum(self.sizes))
         theta, *phi = rows.split(self.sizes, -1)
         inside = _rows(self.prior.support.check(theta))  # type: ignore[union-attr]
-        safe = torch.where(inside[:, None], theta, self.prior.sample(torch.Size([1])))
+        with kept_generators():  # any place in the support will do
+            place = self.prior.sample(torch.Size([1]))
+        safe = torch.where(inside[:, None], theta, place)
         total = self.prior.log_prob(safe)[:, None].flatten(1).sum(-1)
         for effect, part in zip(self.effects, phi, strict=True):
             total = total + effect.log_prob(part).to(total.dtype)

@@ -34,6 +34,7 @@ from sbi_active.inference.train_arguments import (
     given_arguments,
 )
 from sbi_active.inference.training import train_mixture_density
+from sbi_active.seeding import kept_generators
 from sbi_active.threads import single_thread
 
 __all__ = ["ActionNPE"]
@@ -288,7 +289,8 @@ class ActionNPE(ActionRounds, NPE_C):
             self._require_trained()
         if prior is None:
             arguments["prior"] = self._round_belief
-        packed = super().build_posterior(**arguments)
+        with kept_generators():  # sbi draws from the prior to look at it
+            packed = super().build_posterior(**arguments)
         assert self._action_dim is not None
         assert self._outcome_shape is not None
         return ActionPosterior(packed, self._outcome_shape, self._action_dim)

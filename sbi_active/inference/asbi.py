@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from copy import deepcopy
 from typing import Any
 
@@ -12,6 +13,7 @@ from sbi.neural_nets.estimators.base import (
     ConditionalDensityEstimator,
 )
 from torch import Tensor
+from torch.distributions import Distribution
 
 from sbi_active.inference.action_npe import ActionNPE
 from sbi_active.inference.belief import (
@@ -26,8 +28,11 @@ from sbi_active.inference.mixture_density import MixtureDensityNetwork
 from sbi_active.inference.refine import Refinement, refine
 from sbi_active.inference.refined_belief import RefinedBelief
 from sbi_active.inference.rounds import Observation
+from sbi_active.seeding import forked_generators, kept_generators
 
 __all__ = ["ASBI"]
+
+NUM_PROBES = 64  # draws of the prior, at one of which a network has a finite density
 
 
 class ASBI(ActionNPE):
@@ -116,7 +121,8 @@ class ASBI(ActionNPE):
             ValueError: If shapes do not fit.
         """
         trial = self._observation(x_o, action)
-        chained = self._chained(trial, required=simulator is None)
+        with nullcontext() if seed is None else kept_generators():
+            chained = self._chained(trial, required=simulator is None)
         if simulator is None:
             assert chained is not None
             belief: Belief = chained
@@ -163,17 +169,20 @@ class ASBI(ActionNPE):
             return None
         condition = pack(trial.x[None], trial.action[None]).to(self._device)
         prior = require_support(self._prior)
-        if not _knows(network, condition):
+        fault = _fault(network, condition, prior)
+        if fault:
             if not required:
                 return None
             warnings.warn(
-                f"the network has never seen an outcome like {trial.x.tolist()}: no "
-                "simulation it was trained on lacks these numbers, so the belief is "
-                "left unchanged. Refine with the simulator, simulate such outcomes as "
-                "NaN, or leave the trial out where a fault caused them.",
+                f"the network has never seen an outcome like {trial.x.tolist()}: "
+                f"{fault}, so the belief is left unchanged. Refine with the simulator, "
+                "simulate such outcomes as NaN, or leave the trial out where a fault "
+                "caused them.",
                 stacklevel=3,
             )
-            return UnchangedBelief(prior, previous)
+            unchanged = UnchangedBelief(prior, previous)
+            unchanged.diagnostics |= {"trustworthy": False, "warnings": [fault]}
+            return unchanged
         with warnings.catch_warnings():
             if not required:  # refinement repairs what the network misses
                 warnings.simplefilter("ignore")
@@ -210,8 +219,18 @@ class ASBI(ActionNPE):
         return belief
 
 
-def _knows(network: ConditionalDensityEstimator, condition: Tensor) -> bool:
-    """Return whether rows like the condition, shape (1, c), were trained on."""
+def _fault(
+    network: ConditionalDensityEstimator, condition: Tensor, prior: Distribution
+) -> str:
+    """Return why a network cannot say anything at a condition, shape (1, c); or ""."""
     if isinstance(network, MixtureDensityNetwork):
-        return network.knows(condition)
-    return bool(condition.isfinite().all())  # sbi's networks take no NaN
+        knows = network.knows(condition)
+    else:
+        knows = bool(condition.isfinite().all())  # sbi's networks take no NaN
+    if not knows:
+        return "no simulation it was trained on lacks these numbers"
+    with forked_generators(0), torch.no_grad():
+        theta = prior.sample(torch.Size([NUM_PROBES])).to(condition)
+        density = network.log_prob(theta[:, None], condition)
+    # Beyond 1e19, float32 has no squares.
+    return "" if bool(density.isfinite().any()) else "its density is finite nowhere"

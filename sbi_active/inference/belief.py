@@ -292,7 +292,7 @@ FEWEST_STEPS = 64
 def require_width(
     prior: Distribution, names: Sequence[str] | None = None, *, seed: int
 ) -> None:
-    """Raise where a prior has no width, or one that float32 cannot hold.
+    """Raise where a prior is empty, or has no width that float32 can hold.
 
     Args:
         prior: Of the parameters.
@@ -300,18 +300,27 @@ def require_width(
         seed: Of some draws.
 
     Raises:
-        ValueError: If draws of a parameter are too few steps of float32 apart.
+        ValueError: If draws of a parameter are not in the support, or too few steps of
+            float32 apart.
     """
     with forked_generators(seed):
-        draws = prior.sample(torch.Size([256])).reshape(256, -1).float().double()
+        draws = prior.sample(torch.Size([256])).reshape(256, -1).float()
+    inside = within_support(prior, draws)
+    if not bool(inside.any()):
+        raise ValueError(
+            f"expected a prior with draws in its support; got {draws[0].tolist()} "
+            "outside; pass finite bounds, the lower one below the upper one"
+        )
+    draws = draws.double()
     size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
     steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
     narrow = (steps < FEWEST_STEPS).nonzero()[:, 0].tolist()
     if not narrow:
         return
     k = narrow[0]
+    name = f"parameter {k}" if names is None else names[k]
     raise ValueError(
-        f"expected a prior in which parameters vary; got {names[k] if names else k!r} "
+        f"expected a prior in which parameters vary; got {name} "
         f"within [{draws[:, k].min():.9g}, {draws[:, k].max():.9g}], fewer than "
         f"{FEWEST_STEPS} steps of float32 wide; fix the parameter in the simulator, or "
         "shift it to deviations from its value"

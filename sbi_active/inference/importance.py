@@ -33,7 +33,7 @@ from scipy.special import logsumexp
 
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.kernels import EitherProposal, KernelProposal
-from sbi_active.inference.population import Proposal
+from sbi_active.inference.population import Proposal, normalized
 from sbi_active.inference.simulated_likelihood import SimulatedLikelihood
 
 __all__ = ["WeightedPool", "importance_sample"]
@@ -101,7 +101,7 @@ class WeightedPool:
     @property
     def weight(self) -> Array:
         """Normalized weights, shape (n,)."""
-        return np.exp(self.log_weight - logsumexp(self.log_weight))
+        return normalized(self.log_weight)
 
     @property
     def effective_sample_size(self) -> float:
@@ -224,7 +224,7 @@ def importance_sample(
             pool.restart()
             reached = power
         log_weight = pool.log_mixture_weight - (1 - power) * log_new
-        weight = np.exp(log_weight - np.asarray(logsumexp(log_weight)))
+        weight = normalized(log_weight)
         kernels = EitherProposal(
             KernelProposal.around(pool.z, weight, base, rng),
             KernelProposal.around(pool.z, _flattened(pool), base, rng),
@@ -248,7 +248,7 @@ def _flattened(pool: WeightedPool) -> Array:
     log_rest = pool.log_prior - pool.log_mixture
     power = _largest_power(log_rest, pool.log_likelihood, needed=BROAD)
     log_weight = log_rest + power * pool.log_likelihood
-    return np.exp(log_weight - np.asarray(logsumexp(log_weight)))
+    return normalized(log_weight)
 
 
 def _largest_power(log_rest: Array, log_new: Array, needed: float = FEWEST) -> float:

@@ -15,6 +15,7 @@ __all__ = [
     "Particles",
     "Proposal",
     "StudentProposal",
+    "normalized",
     "population_monte_carlo",
 ]
 
@@ -27,6 +28,20 @@ SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
 FITTED = 12  # of them for each number in a covariance
+
+
+def normalized(log_weight: Array) -> Array:
+    """Return weights that sum to one, shape (n,), whatever their size.
+
+    Args:
+        log_weight: Shape (n,). Beyond 1e16 a sum of several is lost in the rounding of
+            its logarithm; where none is finite, all count the same.
+    """
+    if not np.isfinite(log_weight).any():
+        return np.full(len(log_weight), 1 / len(log_weight))
+    weight = np.exp(log_weight - np.asarray(logsumexp(log_weight)))
+    total = weight.sum()
+    return weight if abs(total - 1) < 1e-9 else weight / total
 
 
 class Proposal(Protocol):
@@ -58,7 +73,7 @@ class Particles:
     @property
     def weight(self) -> Array:
         """Normalized weights, shape (n,)."""
-        return np.exp(self.log_weight - logsumexp(self.log_weight))
+        return normalized(self.log_weight)
 
     @property
     def log_normalizer(self) -> float:
@@ -263,7 +278,7 @@ def population_monte_carlo(
             num_components = min(num_components + 2, MAX_COMPONENTS)
             share = max(0.7 * share, 0.02)
         tempered = _tempered(log_base, log_target, log_q, beta)
-        weight = np.exp(tempered - logsumexp(tempered))
+        weight = normalized(tempered)
         num_fitted = max(NUM_FITTED, FITTED * _num_moments(z.shape[1]))
         points = z[_systematic(weight, num_fitted, rng)]
         mixture = GaussianMixture.fit(points, num_components, rng)

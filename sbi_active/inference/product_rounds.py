@@ -39,6 +39,7 @@ SAMPLERS = ("importance", "kde", *MARKOV_CHAINS)
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
 NUM_KERNELS = 2_000
 NUM_HINTS = 1_000
+NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 
 
 class ProductRounds(ActionRounds):
@@ -283,10 +284,16 @@ class ProductRounds(ActionRounds):
             region = TrainedRegion.of(coordinates.to_z(rows), rng)
             hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
         chained = self._sampler == "kde"
+        learned = self._learned()
+        counted = [
+            t
+            for t in (trials[-1:] if chained else trials)
+            if _says_something(learned, t, prior)
+        ]
         product = Product(
             coordinates,
-            self._learned(),
-            trials[-1:] if chained else trials,
+            learned,
+            counted,
             region,
             previous if chained and previous is not prior else None,
         )
@@ -298,13 +305,21 @@ class ProductRounds(ActionRounds):
             num_particles=settings.num_particles,
             defensive=settings.defensive,
         )
+        sampled: Belief = belief
         if chained:
             with forked_generators(seed, "kernels"):
                 draws = belief.sample(torch.Size([NUM_KERNELS]))
-            return KernelBelief(prior, draws, bandwidth=self._bandwidth)
-        if self._sampler in MARKOV_CHAINS:
-            return ChainBelief(belief, product, self._sampler)
-        return belief
+            sampled = KernelBelief(prior, draws, bandwidth=self._bandwidth)
+        elif self._sampler in MARKOV_CHAINS:
+            sampled = ChainBelief(belief, product, self._sampler)
+        num_lost = len(trials[-1:] if chained else trials) - len(counted)
+        if num_lost:
+            sampled.diagnostics["trustworthy"] = False
+            sampled.diagnostics.setdefault("warnings", []).append(
+                f"{num_lost} trials are left out, at which the network's density is "
+                "finite nowhere: a measurement is wrong, or the simulator lacks much"
+            )
+        return sampled
 
     def _round_parameters(self) -> Tensor:
         """Return the parameters of this round's rows, shape (n, theta_dim)."""
@@ -318,3 +333,14 @@ class ProductRounds(ActionRounds):
         ]
         prior = require_support(self._prior)
         return torch.cat(rows)[:, : prior.event_shape[-1]].cpu()
+
+
+def _says_something(
+    learned: ActionFactor, trial: Observation, prior: Distribution
+) -> bool:
+    """Return whether a factor is finite anywhere: float32 has no squares of 1e20."""
+    with forked_generators(0), torch.no_grad():
+        theta = prior.sample(torch.Size([NUM_PROBES])).float()
+        rows = trial.x.expand(NUM_PROBES, *trial.x.shape)
+        action = trial.action.expand(NUM_PROBES, -1)
+        return bool(learned.log_factor(theta, rows, action).isfinite().any())

@@ -316,8 +316,8 @@ def _simulate_stage(
         if missing <= 0:
             continue
         z = rng.permutation(region.sample_inside(missing, histories.coordinates, rng))
-        if len(z) == 0:  # none of it lies in the support
-            continue
+        if len(z) == 0:  # it lies beside the support, as of an outcome far away
+            z = histories.coordinates.sample_prior(missing, rng)
         num_replicates = missing * (size - num_places) // num_places
         histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
 

@@ -329,11 +329,21 @@ class SeqBED:
             )
         n = len(particles)
         rows = trial.x.expand(n, *trial.x.shape), action.expand(n, -1)
-        weight = model.log_ratio(particles, *rows).softmax(0)
+        log_ratio = model.log_ratio(particles, *rows)
+        says_nothing = not bool(log_ratio.isfinite().any())
+        if says_nothing:  # beyond 1e19 float32 has no squares
+            log_ratio = torch.zeros_like(log_ratio)
+        weight = log_ratio.nan_to_num(-torch.inf).softmax(0)
         belief = KernelBelief(self._prior, particles, weight, bandwidth=self._bandwidth)
         belief.label = "weighted particles"
         effective = belief.diagnostics["effective_sample_size"]
         belief.diagnostics |= {"num_particles": n, **spent}
+        if says_nothing:
+            belief.diagnostics["trustworthy"] = False
+            belief.diagnostics["warnings"].append(
+                "the ratios are finite nowhere at the last trial, which is left out: a "
+                "measurement is wrong, or the simulator lacks much"
+            )
         if effective < 0.1 * n:
             belief.diagnostics["warnings"].append(
                 f"{effective:.1f} of {n} particles are effective: the belief is as "

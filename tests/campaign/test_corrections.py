@@ -303,7 +303,7 @@ def test_a_robot_that_changes_its_action_changes_no_record():
 
 
 def test_simulators_without_numbers():
-    with pytest.raises(ValueError, match="expected outcomes with numbers; got x of sh"):
+    with pytest.raises(ValueError, match="expected at least one number a row of x"):
         campaign(simulator=lambda theta, action: torch.zeros(len(theta), 0))
 
 

@@ -1,0 +1,99 @@
+"""Outcomes as far away as float32 reaches, told to the trainers themselves."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import ALHI, ASBI, GaussianNoise, Refinement, SeqBED, SimulatorModel
+from sbi_active.inference import SeqBED_C
+from sbi_active.inference.population import normalized
+from sbi_active.inference.refine import refine
+from tests.campaign.test_corrections import OPTIONS, RATIOS
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+SETTINGS = Refinement(num_histories=300, num_particles=1_000)
+SIZES = (1e15, 1e30, -3e38)
+
+
+JUMPS = SimulatorModel(
+    lambda theta, action: (7 * theta).floor() * action, noise=GaussianNoise(0.1)
+)
+
+
+def trained(make):
+    torch.manual_seed(0)
+    theta, action = PRIOR.sample((300,)), torch.ones(300, 1)
+    if make is SeqBED:
+        trainer = SeqBED(PRIOR)
+        theta, action = trainer.arrange(theta, action)
+    else:
+        network = RATIOS if make is SeqBED_C else OPTIONS.density_estimator
+        trainer = make(PRIOR, network, show_progress_bars=False)
+    x = theta * action + 0.1 * torch.randn_like(theta)
+    trainer.append_simulations(theta, x, action=action).train()
+    return trainer
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("x", SIZES)
+@pytest.mark.parametrize(
+    ("make", "simulator"),
+    [
+        *[(make, None) for make in (ASBI, ALHI, SeqBED_C, SeqBED)],
+        (ASBI, MODEL),
+        *[pytest.param(m, MODEL, marks=pytest.mark.slow) for m in (SeqBED_C, SeqBED)],
+        pytest.param(ALHI, MODEL, marks=pytest.mark.slow),
+    ],
+)
+def test_updates_give_a_belief_to_go_on_from(make, simulator, x):
+    trainer = trained(make)
+    told = {"simulator": simulator, "refinement": SETTINGS, "seed": 1}
+    belief = trainer.update(torch.tensor([x]), action=torch.ones(1), **told)
+    assert bool(belief.sample((50,)).isfinite().all())
+    assert not bool(belief.log_prob(PRIOR.sample((50,))).isnan().any())
+    if simulator is not None:
+        after = trainer.update(torch.tensor([0.6]), action=torch.ones(1), **told)
+        assert bool(after.sample((50,)).isfinite().all())
+
+
+@pytest.mark.parametrize("x", SIZES)
+def test_what_the_network_cannot_say_changes_nothing(x):
+    trainer = trained(ASBI)
+    if x == 1e15:  # squares still fit: coarse, and said to be
+        with pytest.warns(UserWarning, match="lies within the prior's support"):
+            trainer.update(torch.tensor([x]), action=torch.ones(1))
+        return
+    with pytest.warns(UserWarning, match="its density is finite nowhere"):
+        belief = trainer.update(torch.tensor([x]), action=torch.ones(1))
+    assert belief.diagnostics["trustworthy"] is False
+    theta = torch.tensor([[0.2], [0.7]])
+    assert torch.equal(belief.log_prob(theta), PRIOR.log_prob(theta))
+
+
+@pytest.mark.parametrize("x", SIZES)
+@pytest.mark.parametrize("model", [MODEL, JUMPS])
+def test_refinement_says_that_it_is_not_to_be_trusted(model, x):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        belief = refine(
+            model,
+            PRIOR,
+            torch.tensor([[1.0], [1.0]]),
+            torch.tensor([[x], [0.6]]),
+            settings=SETTINGS,
+            seed=0,
+        )
+    assert belief.diagnostics["trustworthy"] is False
+    assert bool(belief.sample((50,)).isfinite().all())
+
+
+def test_weights_of_any_size_sum_to_one():
+    ordinary = np.log(np.arange(1.0, 6.0))
+    assert np.allclose(normalized(ordinary), np.arange(1, 6) / 15)
+    assert normalized(-1e30 + np.zeros(4)).tolist() == [0.25] * 4
+    assert normalized(np.full(4, -np.inf)).tolist() == [0.25] * 4
+    assert normalized(np.array([0.0, -np.inf])).tolist() == [1.0, 0.0]

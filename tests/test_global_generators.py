@@ -1,0 +1,181 @@
+"""Who leaves the global generators of torch and NumPy as they were: see seeding."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import (
+    ALHI,
+    ASBI,
+    Campaign,
+    DiscreteActions,
+    GaussianNoise,
+    InformationGainDesigner,
+    RandomDesigner,
+    SeqBED,
+    SimulatorModel,
+    simulate,
+    to_inference_data,
+)
+from sbi_active.actions import BoxActions, MixedActions
+from sbi_active.criticism import Trials, close_loop
+from sbi_active.inference import SeqBED_C
+from sbi_active.inference.refine import refine
+from sbi_active.inference.rounds import Observation
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation import check_simulator, estimate_noise
+from tests.campaign.test_corrections import OPTIONS, RATIOS
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+THETA = torch.linspace(0.1, 0.9, 300)[:, None]
+ACTION = ACTIONS.sample((300,), seed=0)
+X = simulate(MODEL, THETA, ACTION, seed=0).x
+REAL = torch.tensor([[1.0], [3.0], [0.5]]), torch.tensor([[0.6], [1.8], [0.3]])
+
+
+def noisy(theta, action):
+    return theta * action + 0.1 * torch.randn_like(theta)
+
+
+def by_numpy(theta, action):
+    return (theta * action).numpy() + 0.1 * np.random.randn(*theta.shape)
+
+
+class Kept:
+    """Checks that calls leave both generators as they were; counts them."""
+
+    def __init__(self):
+        self.changed = []
+
+    def __call__(self, name, call):
+        before, numpy_before = torch.get_rng_state(), np.random.get_state()
+        result = call()
+        kept = torch.equal(before, torch.get_rng_state())
+        after = np.random.get_state()
+        kept &= (numpy_before[1] == after[1]).all() and numpy_before[2] == after[2]
+        if not kept:
+            self.changed.append(name)
+        return result
+
+
+@pytest.fixture
+def kept():
+    kept = Kept()
+    yield kept
+    assert kept.changed == []
+
+
+@pytest.mark.parametrize("simulator", [MODEL, noisy, by_numpy])
+@pytest.mark.parametrize(
+    "method",
+    [
+        *["asbi", "alhi"],
+        *[pytest.param(m, marks=pytest.mark.slow) for m in ("nsbi", "nlhi", "seqbed")],
+    ],
+)
+def test_a_campaign(kept, method, simulator):
+    options = OPTIONS
+    if method == "seqbed":
+        options = type(OPTIONS)(num_simulations=300, density_estimator=RATIOS)
+    c = kept(
+        "Campaign",
+        lambda: Campaign(simulator, PRIOR, ACTIONS, method=method, options=options),
+    )
+    for _ in range(2):
+        trial = kept("ask", c.ask)
+        kept("tell", lambda trial=trial: c.tell(0.6 * trial.action))
+        belief = kept("update", c.update)
+        kept("health", lambda: c.health)
+        kept("stop_reason", lambda: c.stop_reason)
+        kept("mean", lambda belief=belief: (belief.mean, belief.variance, repr(belief)))
+        kept("log_prob", lambda belief=belief: belief.log_prob(THETA))
+    kept("criticize", lambda: c.criticize([], evaluate=False))
+    kept("to_inference_data", lambda: to_inference_data(c, num_samples=20))
+    kept("withdraw", lambda: c.withdraw(0))
+    kept("again", c.update)
+    kept("run", lambda: c.run(lambda action: 0.6 * action, num_rounds=1))
+
+
+def trained(trainer):
+    return trainer.append_simulations(THETA, X, action=ACTION, belief=PRIOR)
+
+
+@pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED_C])
+def test_a_trainer_after_training(kept, make):
+    network = RATIOS if make is SeqBED_C else OPTIONS.density_estimator
+    trainer = trained(make(PRIOR, network, show_progress_bars=False))
+    trainer.train()
+    model = kept("build_posterior", trainer.build_posterior)
+    for designer in (InformationGainDesigner(ACTIONS, num_samples=100),):
+        kept("select", lambda d=designer: d.select(model, MODEL, belief=PRIOR, seed=1))
+    settings = OPTIONS.refinement
+    told = {"simulator": MODEL, "refinement": settings, "seed": 3}
+    belief = kept(
+        "update", lambda: trainer.update(REAL[1][0], action=REAL[0][0], **told)
+    )
+    kept("log_prob", lambda: belief.log_prob(THETA))
+    trials = [Observation(*pair) for pair in zip(*REAL, strict=True)]
+    kept(
+        "update_all",
+        lambda: trainer.update_all(trials, MODEL, refinement=settings, seed=3),
+    )
+
+
+def test_designers_and_refinement(kept):
+    box = BoxActions([0.1], [3.0])
+    kept("actions", lambda: [a.sample((3,), seed=1) for a in (ACTIONS, box)])
+    mixed = kept(
+        "MixedActions", lambda: MixedActions(ACTIONS, BoxActions([0.0], [1.0]))
+    )
+    kept("mixed", lambda: mixed.sample((3,), seed=1))
+    for actions in (ACTIONS, box):
+        random = kept("RandomDesigner", lambda a=actions: RandomDesigner(a))
+        kept("random", lambda d=random: d.select(None, MODEL, belief=PRIOR, seed=1))
+    designer = kept(
+        "designer", lambda: InformationGainDesigner(ACTIONS, num_samples=50)
+    )
+    kept("select", lambda: designer.select(None, noisy, belief=PRIOR, seed=1))
+    settings = OPTIONS.refinement
+    belief = kept(
+        "refine", lambda: refine(noisy, PRIOR, *REAL, settings=settings, seed=1)
+    )
+    kept("mean", lambda: (belief.mean, belief.diagnostics, repr(belief)))
+
+
+def test_simulators_and_noise(kept):
+    for function in (noisy, by_numpy):
+        model = kept("SimulatorModel", lambda f=function: SimulatorModel(f))
+        kept("simulate", lambda m=model: simulate(m, THETA, ACTION, seed=0))
+    kept("workers", lambda: simulate(MODEL, THETA, ACTION, seed=0, num_workers=2))
+    seeds = torch.arange(len(THETA))
+    kept("model", lambda: MODEL(THETA, ACTION, seeds=seeds))
+    kept("mean", lambda: MODEL.mean(THETA, ACTION))
+    kept("sample", lambda: GaussianNoise(0.1).sample(X, seeds))
+    kept("derive_seed", lambda: derive_seed(0, "key"))
+    kept("estimate_noise", lambda: estimate_noise(X[:40].reshape(4, 10, 1)))
+    kept("check_simulator", lambda: check_simulator(noisy, PRIOR, ACTIONS, seed=0))
+
+
+def test_a_report(kept):
+    report = kept("close_loop", lambda: close_loop(MODEL, PRIOR, Trials(*REAL), seed=0))
+    kept("str", lambda: str(report))
+
+
+def test_what_draws_as_in_sbi_and_torch():
+    """The exceptions that seeding names; a seed would be a change of their meaning."""
+    campaign = Campaign(MODEL, PRIOR, ACTIONS, method="nsbi", options=OPTIONS)
+    campaign.tell(0.6, action=[1.0])
+    belief = campaign.update()
+    for call in (
+        lambda: ASBI(PRIOR, show_progress_bars=False),
+        lambda: belief.sample((3,)),
+        lambda: MODEL(THETA, ACTION),
+        lambda: ACTIONS.sample((3,)),
+        lambda: SeqBED(PRIOR) and RandomDesigner(ACTIONS).select(None, belief=PRIOR),
+    ):
+        before = torch.get_rng_state()
+        call()
+        assert not torch.equal(before, torch.get_rng_state())
