@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from sbi_active.simulation.simulator import own_tensor, single_precision
+from sbi_active.simulation.simulator import own_tensor
 
 __all__ = ["ActionEmbedding", "action_rows", "outcome_rows", "pack", "unpack"]
 
@@ -79,7 +79,7 @@ def outcome_rows(x: Tensor, x_shape: Sequence[int]) -> Tensor:
         ValueError: If the shape does not fit, or a number is complex or beyond float32.
     """
     shape = torch.Size(x_shape)
-    rows = single_precision(own_tensor(x))
+    rows = own_tensor(x, torch.float32)
     if rows.shape == shape or (rows.ndim == 0 and shape.numel() == 1):
         return rows.reshape(1, *shape)
     if rows.shape[1:] == shape:

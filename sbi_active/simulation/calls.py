@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
-from sbi_active.simulation.simulator import outcome_tensor, single_precision
+from sbi_active.simulation.simulator import outcome_tensor
 
 __all__ = ["BLOCK", "Call", "Fault", "Reply", "answer"]
 
@@ -128,28 +128,25 @@ def answer(
 
 
 def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
+    # A simulator may change its arguments in place; those of the call are tried again.
+    theta, action, seeds = call.theta.clone(), call.action.clone(), call.seeds.clone()
     if call.draws == "seeds":
-        return _run(simulator, call, has_seeds=True)
+        return _own_outcome(simulator(theta, action, seeds=seeds), theta)
     parts = []
     kind = "block" if call.draws == "blocks" else "row"
     has_seeds = isinstance(simulator, SimulatorModel)
     for rows in call.blocks():
-        part = call.part(rows)
-        with _GENERATORS, forked_generators(call.seed, kind, int(part.rows[0])):
-            parts.append(_run(simulator, part, has_seeds=has_seeds))
+        own = {"seeds": seeds[rows]} if has_seeds else {}
+        part = theta[rows], action[rows]
+        first = int(call.rows[rows.start])
+        with _GENERATORS, forked_generators(call.seed, kind, first):
+            parts.append(_own_outcome(simulator(*part, **own), part[0]))
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
-def _run(simulator: Callable[..., Any], call: Call, *, has_seeds: bool) -> Tensor:
-    """Call the simulator, whose arguments and output it shares with nobody.
-
-    It may change the arguments in place, and return a buffer that it fills again.
-    """
-    theta, action = call.theta.clone(), call.action.clone()
-    seeds = {"seeds": call.seeds.clone()} if has_seeds else {}
-    return single_precision(
-        outcome_tensor(simulator(theta, action, **seeds), len(call))
-    )
+def _own_outcome(x: Any, theta: Tensor) -> Tensor:
+    """Return x as it is now, before the simulator fills its buffer again."""
+    return outcome_tensor(x, len(theta), dtype=torch.float32)
 
 
 def _is_of_the_interface(error: BaseException) -> bool:

@@ -280,18 +280,21 @@ class SimulatorModel:
         thetas = theta.detach().cpu().double().numpy()
         actions = action.detach().cpu().double().numpy()
         arrays = {k: np.asarray(v, dtype=np.float64) for k, v in effects.items()}
-        rows: list[np.ndarray] = []
+        rows: np.ndarray | None = None
         for i, seed in enumerate(seeds.tolist()):
             own = {k: v[i].copy() if v.ndim else float(v) for k, v in arrays.items()}
             rng = np.random.default_rng(seed)
             x = self.fn(thetas[i].copy(), actions[i].copy(), rng, **own, **keywords)
-            rows.append(outcome_array(x))
-            if rows[i].shape != rows[0].shape:
+            row = outcome_array(x)
+            if rows is None:
+                rows = np.empty((len(theta), *row.shape))
+            if row.shape != rows.shape[1:]:
                 raise ValueError(
-                    f"expected rows of one shape, {rows[0].shape}; got "
-                    f"{rows[i].shape} in row {i}; do fill what is missing with NaN"
+                    f"expected rows of one shape, {rows.shape[1:]}; got "
+                    f"{row.shape} in row {i}; do fill what is missing with NaN"
                 )
-        return np.stack(rows) if rows else np.empty((0, 1))
+            rows[i] = row  # a copy: x may be the view of what the next row changes
+        return np.empty((0, 1)) if rows is None else rows
 
     def _context(self) -> Any:
         key = os.getpid(), self._token

@@ -15,6 +15,7 @@ from sbi_active.simulation.calls import BLOCK, Call, Reply
 from sbi_active.simulation.outcomes import Outcome, SimulationError
 from sbi_active.simulation.pace import Pace
 from sbi_active.simulation.pools import Pool
+from sbi_active.simulation.simulator import all_finite
 
 __all__ = ["Schedule"]
 
@@ -238,11 +239,13 @@ class Schedule:
         self._next = 0
 
     def _take(self, call: Call, x: Tensor) -> None:
-        finite = x.isfinite()
-        if not bool(finite.all()):
+        if all_finite(x):
+            status = torch.full((len(x),), Outcome.OK, dtype=torch.int8)
+        else:
+            finite = x.isfinite()
             x = x.masked_fill(~finite, torch.nan)
-        measured = finite.flatten(1).any(-1).cpu()
-        status = torch.where(measured, Outcome.OK, Outcome.INVALID).to(torch.int8)
+            measured = finite.flatten(1).any(-1).cpu()
+            status = torch.where(measured, Outcome.OK, Outcome.INVALID).to(torch.int8)
         index = torch.from_numpy(call.rows)
         fresh = self.status[index] == _UNFINISHED
         if not bool(fresh.all()):

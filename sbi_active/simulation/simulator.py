@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,11 +11,11 @@ from torch import Tensor
 
 __all__ = [
     "Simulator",
+    "all_finite",
     "outcome_array",
     "outcome_tensor",
     "own_tensor",
     "require_noise",
-    "single_precision",
 ]
 
 
@@ -35,15 +36,23 @@ class Simulator(Protocol):
         ...
 
 
-def outcome_tensor(x: Any, num_rows: int) -> Tensor:
+def outcome_tensor(
+    x: Any, num_rows: int, *, dtype: torch.dtype | None = None
+) -> Tensor:
     """Return a simulator's output as a tensor with one row a parameter set.
 
     It has memory of its own: a simulator may return the buffer that it works in.
 
+    Args:
+        x: What the simulator returned.
+        num_rows: Rows that it was given.
+        dtype: Floating type to return; None keeps that of x.
+
     Raises:
-        ValueError: If the output does not have ``num_rows`` rows of real numbers.
+        ValueError: If the output does not have ``num_rows`` rows of real numbers, or
+            has a finite one beyond ``dtype``.
     """
-    x = own_tensor(x)
+    x = own_tensor(x, dtype)
     if x.ndim == 0 or x.shape[0] != num_rows:
         raise ValueError(
             f"expected x with one row a parameter set, shape ({num_rows}, ...); got "
@@ -56,52 +65,41 @@ def outcome_tensor(x: Any, num_rows: int) -> Tensor:
             f"expected at least one number a row of x; got shape {tuple(x.shape)}; "
             "return what was measured, and NaN where there is no measurement"
         )
-    return x if x.is_floating_point() else x.to(torch.get_default_dtype())
-
-
-def own_tensor(x: Any) -> Tensor:
-    """Return real numbers as a tensor that shares no memory with x.
-
-    Raises:
-        ValueError: If a number is complex.
-    """
-    x = _filled(x)
-    first = x[0] if isinstance(x, list | tuple) and x else None
-    if isinstance(x, Tensor):
-        tensor = x.clone()
-    elif isinstance(first, Tensor):
-        tensor = torch.stack(list(x))
-    elif isinstance(first, np.ndarray) or hasattr(x, "__array__"):
-        tensor = _from_numpy(np.array(x, order="C"))
-    else:
-        tensor = torch.as_tensor(x)
-        if tensor.is_floating_point():  # of Python's numbers, which have 64 bits
-            _require_in_range(torch.as_tensor(x, dtype=torch.float64), tensor)
-    _require_real(tensor.dtype, tensor.is_complex())
-    return tensor
+    return x
 
 
 def outcome_array(x: Any) -> np.ndarray:
-    """Return the outcome of one row as float64, in memory of its own.
+    """Return the outcome of one row as float64, which may share the memory of x.
 
     Raises:
         ValueError: If a number is complex.
     """
-    array = np.array(_filled(x))
+    if type(x) is np.ndarray and x.dtype == np.float64:
+        return x
+    array = np.asarray(_filled(x))
     _require_real(array.dtype, array.dtype.kind == "c")
     return array.astype(np.float64, copy=False)
 
 
-def single_precision(x: Tensor) -> Tensor:
-    """Return real numbers in float32.
+def own_tensor(x: Any, dtype: torch.dtype | None = None) -> Tensor:
+    """Return real numbers as floating ones, in a tensor that shares no memory with x.
+
+    Args:
+        x: Anything that torch or NumPy takes for an array.
+        dtype: Of the result; None keeps a floating one.
 
     Raises:
-        ValueError: If one is finite but beyond float32.
+        ValueError: If a number is complex, or finite but beyond ``dtype``.
     """
-    rounded = x.to(torch.float32)
-    if x.dtype == torch.float64:
-        _require_in_range(x, rounded)
-    return rounded
+    tensor = x if isinstance(x, Tensor) else _converted(x)
+    _require_real(tensor.dtype, tensor.is_complex())
+    if dtype is None:
+        is_floating = tensor.is_floating_point()
+        dtype = tensor.dtype if is_floating else torch.get_default_dtype()
+    own = tensor.to(dtype, copy=tensor is x)
+    if tensor.dtype == torch.float64 != dtype:
+        _require_in_range(tensor, own)
+    return own
 
 
 def _require_real(dtype: Any, is_complex: bool) -> None:
@@ -113,8 +111,8 @@ def _require_real(dtype: Any, is_complex: bool) -> None:
 
 
 def _require_in_range(x: Tensor, rounded: Tensor) -> None:
-    """Raise where rounding to float32 made a measurement infinite."""
-    if bool(rounded.isfinite().all()):
+    """Raise where rounding made a measurement infinite."""
+    if all_finite(rounded):
         return
     beyond = x.isfinite() & ~rounded.isfinite()
     if bool(beyond.any()):
@@ -123,6 +121,28 @@ def _require_in_range(x: Tensor, rounded: Tensor) -> None:
             f"{x[beyond][0].item():g}, which would count as no measurement; return x "
             "in other units, or NaN where there is no measurement"
         )
+
+
+def all_finite(x: Tensor) -> bool:
+    """Return whether no number is NaN or infinite.
+
+    A sum, several times as fast as asking each number, is finite only then.
+    """
+    return math.isfinite(x.sum()) or bool(x.isfinite().all())
+
+
+def _converted(x: Any) -> Tensor:
+    """Return numbers that are no tensor as one, in memory of its own."""
+    x = _filled(x)
+    first = x[0] if isinstance(x, list | tuple) and x else None
+    if isinstance(first, Tensor):
+        return torch.stack(list(x))
+    if isinstance(first, np.ndarray) or hasattr(x, "__array__"):
+        return _from_numpy(np.array(x, order="C"))
+    tensor = torch.as_tensor(x)
+    if tensor.is_floating_point():  # of Python's numbers, which have 64 bits
+        _require_in_range(torch.as_tensor(x, dtype=torch.float64), tensor)
+    return tensor
 
 
 def _filled(x: Any) -> Any:

@@ -34,7 +34,7 @@ def x_of(function, **options):
         lambda t: list(t),
         lambda t: tuple(t.numpy()),
         lambda t: t[:, 0],
-        lambda t: np.broadcast_to(t.numpy(), (4, 1)),  # not writable
+        lambda t: np.broadcast_to(t.numpy(), t.shape),  # not writable
         lambda t: np.asfortranarray(t.numpy()),
     ],
 )
@@ -58,16 +58,20 @@ def model_of(function):
 BEYOND = [
     lambda t: t.double() + 1e39,
     lambda t: t.double().numpy() - 1e200,
-    lambda t: [1e39, 0.0, 0.0, 0.0],
+    lambda t: [1e39] * len(t),
     lambda t: torch.where(t == 2, 1e39, t.double()),
 ]
 COMPLEX = [
     lambda t: t + 1j,
     lambda t: t.numpy() + 1j,
-    lambda t: [1j, 0, 0, 0],
+    lambda t: [1j] * len(t),
     lambda t: np.fft.fft(t.numpy(), axis=0),
 ]
-EMPTY = [lambda t: t[:, :0], lambda t: torch.zeros(4, 3, 0), lambda t: [[]] * 4]
+EMPTY = [
+    lambda t: t[:, :0],
+    lambda t: torch.zeros(len(t), 3, 0),
+    lambda t: [[]] * len(t),
+]
 
 
 @pytest.mark.parametrize("num_workers", [1, 2])
