@@ -41,6 +41,10 @@ class Planner:
     def __init__(
         self, limits: Limits, state: CampaignState, effects: Sequence[Effect]
     ) -> None:
+        from sbi_active.criticism.declarations import require_distinct, require_nested
+
+        require_distinct(effects)
+        require_nested(effects)
         self._limits, self._state, self.effects = limits, state, (*effects,)
         options, actions = state.options, limits.actions
         self._designs = find_method(state.method).designs

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_active.criticism.effects import Context, Effect, require_distinct
+from sbi_active.criticism.application import applied
+from sbi_active.criticism.declarations import require_distinct
+from sbi_active.criticism.effects import Context, Effect
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.model import NOISE_STREAM
@@ -71,7 +73,7 @@ class AugmentedSimulator(SimulatorModel):
         self.base: SimulatorModel = base
         self.takes_times = takes_times(base)
         self.effects = [*before, *effects]
-        require_distinct(self.effects)
+        require_distinct(self.effects, base.parameter_names or ())
         self.next_index = next_index
         times = getattr(model, "sample_times", None)
         times = times if sample_times is None else sample_times
@@ -150,7 +152,7 @@ class AugmentedSimulator(SimulatorModel):
         """
         context = self._row_context(action, index, times)
         for effect in self._active("noise", phi):
-            sd = effect.apply(sd, phi[effect.name], action, context)
+            sd = applied(effect, sd, phi[effect.name], action, context)
         return sd
 
     def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
@@ -246,19 +248,19 @@ class AugmentedSimulator(SimulatorModel):
             seeds = torch.zeros(len(theta), dtype=torch.int64)
         commanded = action
         for effect in self._active("parameter", phi):
-            theta = effect.apply(theta, phi[effect.name], commanded, context)
+            theta = applied(effect, theta, phi[effect.name], commanded, context)
         for effect in self._active("action", phi):
-            action = effect.apply(action, phi[effect.name], commanded, context)
+            action = applied(effect, action, phi[effect.name], commanded, context)
         changed: dict[str, Any] = {**(keywords or {})}
         if self.takes_times and context.times is not None:
             # The simulator is read where the trial was, not on a grid of its own.
             changed.setdefault("times", context.times.expand(len(theta), -1))
         for effect in self._active("dynamics", phi):
-            changed = effect.apply(changed, phi[effect.name], commanded, context)
+            changed = applied(effect, changed, phi[effect.name], commanded, context)
         run = self._run_merged if merge else self.base._run
         x = run(theta, action, seeds, changed)
         for effect in self._active("observation", phi):
-            x = effect.apply(x, phi[effect.name], commanded, context)
+            x = applied(effect, x, phi[effect.name], commanded, context)
         return x
 
     def _run_merged(
@@ -289,6 +291,10 @@ class AugmentedSimulator(SimulatorModel):
         """Raise where an effect at its null changes x."""
         context = self._row_context(action, None, None)
         x = self._seeded(theta, {}, action, context)
+        if len(x) in x.shape[1:] and len(x) > 1:
+            # As many rows as entries hide phi that is spread over the wrong axis.
+            self._check_null(theta[:-1], action[:-1])
+            return
         finite = x[x.isfinite()]
         spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
         scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
@@ -297,7 +303,9 @@ class AugmentedSimulator(SimulatorModel):
                 one = torch.ones_like(x)
                 difference = _difference(
                     one,
-                    lambda null, e=effect, one=one: e.apply(one, null, action, context),
+                    lambda null, e=effect, one=one: applied(
+                        e, one, null, action, context
+                    ),
                     effect,
                 )
                 allowed = TOLERANCE
@@ -317,6 +325,8 @@ class AugmentedSimulator(SimulatorModel):
                     f"{effect.null}; got {changed} changed by up to "
                     f"{difference:.3g}; do correct apply or null"
                 )
+            if effect.hook == "noise":
+                _require_positive(effect, torch.ones_like(x), action, context)
         self._unchecked = []
 
     def _seeded(
@@ -339,6 +349,23 @@ def _difference(reference: Tensor, at_null: Any, effect: Effect) -> float:
         if bool(gap.isfinite().all()):
             difference = min(difference, float(gap.max()))
     return difference
+
+
+def _require_positive(
+    effect: Effect, one: Tensor, action: Tensor, context: Context
+) -> None:
+    """Raise where an effect on the noise makes a deviation that is none."""
+    with forked_generators(0, "noise of an effect"):
+        phi = effect.sample(len(one)).to(one.dtype)
+    sd = applied(effect, one, phi, action, context)
+    wrong = ~(sd > 0) & ~one.isnan()
+    if bool(wrong.any()):
+        row = int(wrong.flatten(1).any(1).nonzero()[0])
+        raise ValueError(
+            f"expected effect {effect.name!r} to keep the noise positive; got "
+            f"{float(sd[row].min()):.3g} times its size at phi = {phi[row].tolist()}; "
+            "pass a prior without such phi, or another apply"
+        )
 
 
 def takes_times(model: SimulatorModel) -> bool:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+
+from sbi_active.criticism.declarations import (
+    require_finite_draws,
+    require_parts,
+    sound_null,
+)
 
 __all__ = ["Context", "Effect", "Hook"]
 
@@ -55,8 +61,8 @@ class Effect:
         describe: A sentence for the report.
 
     Raises:
-        ValueError: If the hook or scope is unknown, or null and prior have different
-            sizes.
+        ValueError: If the hook or scope is unknown, a part is of another type, null and
+            prior have different sizes, the null is NaN, or draws of phi are not finite.
 
     Example:
         >>> from torch.distributions import Normal
@@ -79,11 +85,7 @@ class Effect:
     describe: str | None = None
 
     def __post_init__(self) -> None:
-        if not self.name or " + " in self.name:
-            raise ValueError(
-                f"expected a name without ' + ', which joins names; got {self.name!r}; "
-                "do choose another"
-            )
+        require_parts(self)
         if self.hook not in get_args(Hook):
             raise ValueError(
                 f"expected a hook of {', '.join(get_args(Hook))}; got {self.hook!r}; "
@@ -94,12 +96,8 @@ class Effect:
                 f"expected scope 'campaign' or 'trial'; got {self.scope!r}; do choose "
                 "one"
             )
-        null = torch.as_tensor(self.null, dtype=torch.float64)
-        if null.numel() not in (1, self.phi_dim):
-            raise ValueError(
-                f"expected a null of shape ({self.phi_dim},), the shape of a draw of "
-                f"effect {self.name!r}; got {tuple(null.shape)}; do give one each"
-            )
+        object.__setattr__(self, "null", sound_null(self))
+        require_finite_draws(self)
         if self.family is None:
             object.__setattr__(self, "family", self.hook)
 
@@ -183,14 +181,3 @@ class _Keywords:
         self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
     ) -> dict[str, Any]:
         return {**value, **dict(zip(self.names, phi.unbind(-1), strict=True))}
-
-
-def require_distinct(effects: Sequence[Effect]) -> None:
-    """Raise where two effects have one name."""
-    names = [effect.name for effect in effects]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(
-            f"expected effects with distinct names; got {', '.join(twice)} more than "
-            "once; do rename one of them"
-        )

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from sbi_active.criticism.effects import Effect, require_distinct
+from sbi_active.criticism.declarations import require_distinct
+from sbi_active.criticism.effects import Effect
 from sbi_active.seeding import kept_generators
 
 __all__ = ["JointPrior", "joint_prior"]

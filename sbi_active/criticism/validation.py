@@ -13,7 +13,8 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.augmented import AugmentedSimulator, takes_times
-from sbi_active.criticism.effects import Effect, require_distinct
+from sbi_active.criticism.declarations import require_distinct, require_nested
+from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import forked_generators
@@ -77,7 +78,10 @@ def require_fitting(
     actions: ActionSpace | None,
 ) -> None:
     """Raise where the parts of a loop do not fit together."""
-    require_distinct(effects)
+    own = model.parameter_names
+    default = [f"theta_{i + 1}" for i in range(prior.event_shape[0])]
+    require_distinct(effects, default if own is None else own)
+    require_nested(effects)
     reserved = (NONE, UNEXPLAINED, SCATTER)
     taken = [e.name for e in effects if e.name in reserved]
     if taken:

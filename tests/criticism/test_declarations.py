@@ -1,0 +1,249 @@
+"""What a declared effect must be: its parts, its null, its prior, what apply gives."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import (
+    Gamma,
+    HalfNormal,
+    LogNormal,
+    Normal,
+    TransformedDistribution,
+    Uniform,
+)
+from torch.distributions.transforms import PowerTransform
+
+from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import (
+    AugmentedSimulator,
+    Criticism,
+    Effect,
+    Trials,
+    generic_effects,
+    joint_prior,
+)
+from sbi_active.criticism.declarations import require_nested
+
+NAN = float("nan")
+PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
+SPEED = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.5])
+STOP = 0.7 * SPEED + 0.1 * torch.tensor([0.3, -1.2, 0.8, 0.1, -0.4])
+MODEL = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
+ACTIONS = DiscreteActions([1.0, 1.5, 2.0, 3.0])
+
+
+def effect(name="bias", **changes):
+    parts = {
+        "hook": "observation",
+        "prior": Normal(0.0, 1.0),
+        "null": 0.0,
+        "apply": lambda value, phi, action, context: value + phi,
+    }
+    return Effect(name, **(parts | changes))
+
+
+def loop(*effects, model=MODEL):
+    return Criticism(model, PRIOR, Trials(SPEED, STOP), effects=effects)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
+        ({"null": torch.tensor([NAN])}, "expected a null of effect 'bias'; got NaN"),
+        ({"null": "0"}, "expected a null of effect 'bias' in numbers; got '0'"),
+        ({"null": None}, "expected a null of effect 'bias' in numbers; got None"),
+        ({"null": [0.0, 0.0]}, r"expected a null of shape \(1,\)"),
+        (
+            {"prior": Normal(torch.zeros(2), torch.ones(2)), "null": torch.zeros(3)},
+            r"expected a null of shape \(2,\).*got \(3,\)",
+        ),
+        ({"name": 3}, "expected name of an effect as text; got 3"),
+        ({"name": ""}, "expected a name without"),
+        ({"units": 3}, "expected units of an effect as text; got 3"),
+        ({"units": None}, "expected units of an effect as text; got None"),
+        ({"family": 3}, "expected family of an effect as text; got 3"),
+        ({"describe": b"drag"}, "expected describe of an effect as text"),
+        ({"apply": None}, "expected apply of effect 'bias' as a function"),
+        ({"prior": 1.0}, "expected a torch distribution as prior of effect 'bias'"),
+        (
+            {"prior": TransformedDistribution(Normal(0.0, 1.0), [PowerTransform(0.5)])},
+            "expected finite draws from the prior of effect 'bias'; got NaN or inf",
+        ),
+    ],
+)
+def test_parts_that_are_none_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        effect(**changes)
+
+
+@pytest.mark.parametrize(
+    ("prior", "null"),
+    [
+        (Uniform(1.0, 2.0), 0.0),
+        (HalfNormal(1.0), -0.5),
+        (Uniform(torch.zeros(2), torch.ones(2)), torch.tensor([0.0, 1.5])),
+    ],
+)
+def test_a_prior_that_excludes_its_null_is_refused_where_it_is_declared(prior, null):
+    def apply(value, phi, action, context):
+        return value + (phi - torch.as_tensor(null)).sum(-1, keepdim=True)
+
+    outside = effect(prior=prior, null=null, apply=apply)
+    message = "expected a prior of effect 'bias' that allows its null"
+    with pytest.raises(ValueError, match=message):
+        loop(outside)
+    with pytest.raises(ValueError, match=message):
+        Campaign(MODEL, PRIOR, ACTIONS, effects=[outside])
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        Normal(0.0, 1.0),
+        HalfNormal(1.0),
+        Uniform(0.0, 1.0),
+        Uniform(-1.0, 0.0),
+        LogNormal(0.0, 1.0),  # zero is where its support ends
+        Gamma(2.0, 1.0),
+        BoxUniform(torch.zeros(1), torch.ones(1)),
+    ],
+)
+def test_a_null_within_or_on_the_edge_of_the_support_is_taken(prior):
+    require_nested([effect(prior=prior)])
+
+
+def test_infinite_nulls_and_nuisances_need_no_prior_that_allows_them():
+    require_nested(generic_effects(MODEL, ACTIONS, prior=PRIOR))
+    require_nested([effect(prior=Uniform(1.0, 2.0), scope="trial")])
+
+
+def test_a_null_that_is_kept_may_change_afterwards():
+    for null in (torch.zeros(1), np.zeros(1)):
+        made = effect(null=null)
+        null[0] = 5.0
+        assert float(made.null_phi(1)) == 0.0
+
+
+def test_an_effect_named_like_a_parameter_would_share_its_row():
+    message = "expected effects named unlike parameters.*got {} more than once"
+    with pytest.raises(ValueError, match=message.format("theta_1")):
+        loop(effect("theta_1"))
+    named = SimulatorModel(MODEL.fn, noise=MODEL.noise, parameter_names=["mass"])
+    with pytest.raises(ValueError, match=message.format("mass")):
+        AugmentedSimulator(named, [effect("mass")])
+    two = effect(
+        "drag",
+        prior=Normal(torch.zeros(2), torch.ones(2)),
+        apply=lambda x, phi, action, context: x + phi.sum(-1, keepdim=True),
+    )
+    with pytest.raises(ValueError, match=message.format("drag_1")):
+        joint_prior(PRIOR, [two, effect("drag_1")])
+
+
+def no_change(value, phi, action, context):
+    return None
+
+
+@pytest.mark.parametrize(
+    ("hook", "apply", "message"),
+    [
+        ("observation", no_change, r"observation of shape \(16, 1\); got NoneType"),
+        ("observation", lambda v, phi, a, c: v + phi[:, 0], r"got \(16, 16\)"),
+        ("observation", lambda v, phi, a, c: 0.0, r"got \(\)"),
+        ("observation", lambda v, phi, a, c: v + phi > 0, "got torch.bool"),
+        ("observation", lambda v, phi, a, c: v + phi + 0j, "got torch.complex64"),
+        ("action", lambda v, phi, a, c: (v + phi)[:, 0], r"got \(16,\)"),
+        ("parameter", lambda v, phi, a, c: torch.cat([v, v], 1), r"got \(16, 2\)"),
+        ("noise", lambda v, phi, a, c: phi, "vanish at its null"),
+        (
+            "noise",
+            lambda v, phi, a, c: v[:1],
+            r"noise of shape \(16, 1\); got \(1, 1\)",
+        ),
+        ("dynamics", no_change, "return a dict of keyword arguments; got NoneType"),
+    ],
+)
+def test_apply_that_returns_something_else_is_named(hook, apply, message):
+    with pytest.raises(ValueError, match=f"(?s)effect 'bias'.*{message}"):
+        loop(effect(hook=hook, apply=apply))
+
+
+def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
+    wide = SimulatorModel(
+        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
+    )
+    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
+    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
+    with pytest.raises(RuntimeError, match="must match"):
+        Criticism(wide, PRIOR, trials, effects=[wrong])
+
+
+def test_a_standard_deviation_that_is_not_positive_is_refused():
+    def apply(sd, phi, action, context):
+        return sd * (1 + phi)
+
+    with pytest.raises(ValueError, match="'bias' to keep the noise positive; got -"):
+        loop(effect(hook="noise", prior=Normal(0.0, 2.0), apply=apply))
+    loop(effect(hook="noise", prior=HalfNormal(2.0), apply=apply))
+
+
+def in_place(value, phi, action, context):
+    value += phi
+    phi.zero_()
+    action.zero_()
+    context.index.zero_()
+    return value
+
+
+@pytest.mark.parametrize("hook", ["action", "parameter", "observation", "noise"])
+def test_apply_may_change_what_it_gets(hook):
+    prior = HalfNormal(1.0)
+    second = effect("slope", apply=lambda x, phi, action, context: x + phi * action)
+    names = {"bias": 0.3, "slope": 0.2}
+    given = [torch.full((4, 1), 0.5), torch.full((4, 1), 2.0), torch.ones(4)]
+    phi = {name: torch.full((4, 1), value) for name, value in names.items()}
+    x = {}
+    for apply in (in_place, lambda v, phi, action, context: v + phi):
+        model = AugmentedSimulator(
+            MODEL, [effect(hook=hook, prior=prior, apply=apply), second]
+        )
+        x[apply] = model.evaluate(given[0], phi, given[1], index=given[2])
+        scale = model.noise_scale(phi, given[1], torch.ones(4, 1), index=given[2])
+        assert float(scale[0, 0]) == pytest.approx(1.3 if hook == "noise" else 1.0)
+    assert torch.equal(*x.values())
+    assert [float(v[0]) for v in given] == pytest.approx([0.5, 2.0, 1.0])
+    assert float(phi["bias"][0]) == pytest.approx(0.3)
+
+
+def test_a_wrong_null_shows_where_noise_is_changed_in_place():
+    def apply(sd, phi, action, context):
+        sd *= 1.5 + phi
+        return sd
+
+    with pytest.raises(ValueError, match=r"the noise changed by up to 0\.5"):
+        loop(effect(hook="noise", prior=HalfNormal(1.0), apply=apply))
+
+
+def test_apply_may_return_a_view_of_what_it_keeps():
+    kept = torch.zeros(100, 1)
+
+    def apply(x, phi, action, context):
+        kept[: len(x)] = x + phi
+        return kept[: len(x)]
+
+    model = AugmentedSimulator(MODEL, [effect(apply=apply)])
+    theta, action = torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
+    first = model.mean(theta, action)
+    model.mean(2 * theta, action)
+    assert float(first) == pytest.approx(1.5)
+
+
+def test_apply_may_return_numpy():
+    made = effect(apply=lambda x, phi, a, c: x.numpy() + phi.numpy().astype(float))
+    x = AugmentedSimulator(MODEL, [made]).mean(
+        torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
+    )
+    assert x.dtype == torch.float32
+    assert float(x) == pytest.approx(1.5)
