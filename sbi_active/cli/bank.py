@@ -159,20 +159,27 @@ def _inspect(arguments: argparse.Namespace) -> int:
         print("\n".join(["checksums: NOT ok", *problems]))
         return 1
     header = bank.header
-    print(f"simulator: {bank.simulator_name} {header['version']}".rstrip())
-    print(f"created: {header['created'] or 'not noted'}")
+    simulator = f"{_shown(bank.simulator_name)} {_shown(header['version'])}"
+    print(f"simulator: {simulator}".rstrip())
+    print(f"created: {_shown(header['created'] or 'not noted')}")
     for name, shape in (header["shapes"] or {}).items():
         print(f"{name}: {' x '.join(map(str, shape))} a row")
-    print(f"parameters: {', '.join(header['parameter_names'] or ['not named'])}")
+    names = map(_shown, header["parameter_names"] or ["not named"])
+    print(f"parameters: {', '.join(names)}")
     print(f"rows: {len(bank)}; on disk: {bank.num_bytes / 2**20:.2f} MiB")
     print("checksums: ok")
     if len(bank):
         column = bank.columns("action", "status", "label")
         for code, label in enumerate(bank.labels):
             count = int((column["label"] == code).sum())
-            print(f"drawn from {label or 'an unknown proposal'}: {count}")
+            print(f"drawn from {_shown(label) or 'an unknown proposal'}: {count}")
         print(_outcomes(column["action"], column["status"]))
     return 0
+
+
+def _shown(text: str) -> str:
+    """Return a text from a file so that it cannot steer the terminal."""
+    return text if text.isprintable() else ascii(text)
 
 
 def _outcomes(action: Tensor, status: Tensor) -> str:

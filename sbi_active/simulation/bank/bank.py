@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.simulation.bank.fingerprint import fingerprint
+from sbi_active.simulation.bank.damage import CorruptSegmentError
+from sbi_active.simulation.bank.fingerprint import fingerprint, simulator_name
 from sbi_active.simulation.bank.header import (
     has_header,
     make_folder,
@@ -22,7 +24,8 @@ from sbi_active.simulation.bank.header import (
 )
 from sbi_active.simulation.bank.labeled import LabeledStore
 from sbi_active.simulation.bank.lock import WriterLock
-from sbi_active.simulation.bank.shelf import Shelf
+from sbi_active.simulation.bank.positions import positions
+from sbi_active.simulation.bank.shelf import COLUMN_NAMES, Shelf
 from sbi_active.simulation.bank.stored_index import StoredIndex
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.store import run_digest
@@ -50,11 +53,12 @@ class Bank:
 
     Attributes:
         path: The folder.
-        header: Format, simulator, shapes and names.
 
     Raises:
         ValueError: If the folder holds no bank, one of another format, or one of
             another simulator.
+        CorruptSegmentError: Here and wherever rows are read, if a file does not hold
+            what was written, or is not there.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -81,10 +85,9 @@ class Bank:
         self.path = Path(path)
         self._writable = simulator is not None
         self._stored: StoredIndex | None = None  # of the run being written
-        self._shelf = Shelf(self.path / "segments")
         self._lock = WriterLock(self.path)
         if simulator is None:
-            self.header = read_header(self.path)
+            self._shelf = Shelf(self.path / "segments", read_header(self.path))
             return
         if parameter_names is None:
             parameter_names = getattr(simulator, "parameter_names", None)
@@ -97,7 +100,7 @@ class Bank:
             with self._lock:
                 if not has_header(self.path):  # nobody was faster
                     write_header(self.path, header)
-        self.header = read_header(self.path)
+        self._shelf = Shelf(self.path / "segments", read_header(self.path))
         require_same_simulator(self.path, self.header, header)
 
     def __len__(self) -> int:
@@ -110,24 +113,27 @@ class Bank:
         self.close()
 
     def __repr__(self) -> str:
-        return f"Bank({str(self.path)!r}: {len(self)} rows)"
+        try:
+            return f"Bank({str(self.path)!r}: {len(self)} rows)"
+        except CorruptSegmentError as error:
+            return f"Bank({str(self.path)!r}: {error.reason})"
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """Format, simulator, shapes and names, as last read."""
+        return dict(self._shelf.header)
 
     @property
     def simulator_name(self) -> str:
         """Qualified name of the simulator, and of the function that it wraps."""
-        simulator = self.header["simulator"]
-        inner = simulator.get("fn", simulator.get("function"))
-        names = [simulator.get("name"), inner and inner.get("name")]
-        return " of ".join(name for name in names if name)
+        return simulator_name(self.header)
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of rows by outcome."""
         segments = self._shelf.segments()
-        return {
-            o.name.lower(): sum(segment.meta["counts"][o] for segment in segments)
-            for o in Outcome
-        }
+        counts = {o: sum(s.meta["counts"][o] for s in segments) for o in Outcome}
+        return {outcome.name.lower(): count for outcome, count in counts.items()}
 
     @property
     def labels(self) -> list[str]:
@@ -270,7 +276,7 @@ class Bank:
                 over all rows. None reads everything into memory.
         """
         names = ["theta", "action", "x", "status"]
-        columns = self._shelf.gather(names, self._positions(rows))
+        columns = self._shelf.gather(names, positions(rows, len(self)))
         theta, action, x, status = (torch.from_numpy(columns[n]) for n in names)
         return Simulations(theta, action, x, status)
 
@@ -280,6 +286,8 @@ class Bank:
         Memory holds one segment, 64 MiB, and what is yielded. Rows added meanwhile are
         not seen.
         """
+        if size < 1:
+            raise ValueError(f"expected size >= 1; got {size}; pass 10_000")
         total = len(self)
         for start in range(0, total, size):
             yield self.read(slice(start, min(start + size, total)))
@@ -293,6 +301,11 @@ class Bank:
                 ``row_seeds(seed, 1, first=index)``), ``log_proposal``, ``log_action``
                 and ``label`` (an index into :attr:`labels`).
         """
+        if unknown := {*names} - COLUMN_NAMES:
+            raise ValueError(
+                f"expected columns among {sorted(COLUMN_NAMES)}; got "
+                f"{sorted(unknown)}; name those"
+            )
         columns = self._shelf.gather([*names], None)
         return {name: torch.from_numpy(columns[name]) for name in names}
 
@@ -312,28 +325,38 @@ class Bank:
         self._require_lock()
         self._shelf.compact()
 
+    def repair(self) -> list[str]:
+        """Give up files that are damaged or lost, so that the others count again.
+
+        Damaged ones are renamed to end in ".damaged". The rows after those that are
+        lost move up; ``simulate(..., store=bank)`` simulates lost ones again. Returns
+        what was wrong, as :meth:`verify` does; raises as :meth:`compact` does.
+        """
+        self._require_lock(clean=False)
+        problems = self.verify()
+        self._shelf.set_aside()
+        self._note(num_segments=self._shelf.last_number())
+        self._note(lost=self._shelf.lost())
+        self._stored = None
+        return problems
+
     def close(self) -> None:
         """Let others write. Reading goes on to work."""
-        self._lock.release()
+        if self._lock.held:
+            # From now on it is noticed if the last of them are not there.
+            number = max(self._shelf.last_number(), self.header["num_segments"])
+            with suppress(OSError):  # a full disk must not keep the lock
+                self._note(num_segments=number)
+            self._lock.release()
 
-    def _positions(self, rows: Any) -> np.ndarray | None:
-        if rows is None:
-            return None
-        total = len(self)
-        if isinstance(rows, slice):
-            return np.arange(*rows.indices(total))
-        positions = np.asarray(rows)
-        if positions.dtype == bool and positions.shape == (total,):
-            return np.flatnonzero(positions)
-        whole = positions.ndim == 1 and positions.dtype.kind in "iu"
-        if not whole or (len(positions) and not _within(positions, total)):
-            raise ValueError(
-                f"expected positions of rows within [0, {total}), or a mask of "
-                f"{total}; got {rows!r}; do use what columns() is indexed by"
-            )
-        return positions
+    def _note(self, **entries: Any) -> None:
+        """Change entries of the header, here and on the disk."""
+        header = {**self._shelf.header, **entries}
+        if header != self._shelf.header:
+            write_header(self.path, header)
+            self._shelf.header = header
 
-    def _require_lock(self) -> None:
+    def _require_lock(self, *, clean: bool = True) -> None:
         if not self._writable:
             raise ValueError(
                 f"expected a bank opened with its simulator, to write to; got "
@@ -344,8 +367,9 @@ class Bank:
             self._lock.acquire()
             # Others may have written meanwhile.
             self._stored = None
-            self.header = read_header(self.path)
-            self._shelf.clean()
+            self._shelf.header = read_header(self.path)
+            if clean:
+                self._shelf.clean()
 
     def store(self, run: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
         """Write those rows of a run that are not there; see :meth:`save`."""
@@ -366,14 +390,9 @@ class Bank:
         if self.header["shapes"] == shapes:
             return
         if self.header["shapes"] is None or not len(self):
-            self.header = {**self.header, "shapes": shapes}
-            write_header(self.path, self.header)
+            self._note(shapes=shapes)
             return
         raise ValueError(
             f"expected rows of shapes {self.header['shapes']}, as in the bank "
             f"{self.path}; got {shapes}; do make a bank of its own for them"
         )
-
-
-def _within(positions: np.ndarray, total: int) -> bool:
-    return bool(positions.min() >= 0 and positions.max() < total)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["differences", "fingerprint"]
+__all__ = ["differences", "fingerprint", "simulator_name"]
 
 #: Arrays up to this size are kept as numbers, so that a difference can be shown.
 SMALL = 16
@@ -47,6 +47,16 @@ def differences(expected: Mapping[str, Any], got: Mapping[str, Any]) -> list[str
         return [f"version {expected['version']!r} there, {got['version']!r} here"]
     lines = _compare("simulator", expected["simulator"], got["simulator"])
     return [line for line in lines if not (got["version"] and ".source " in line)]
+
+
+def simulator_name(identity: Mapping[str, Any]) -> str:
+    """Return the name of a simulator, and of the function that it wraps."""
+    simulator = identity["simulator"]
+    if not isinstance(simulator, dict):  # a class is described by its name
+        return str(simulator)
+    inner = simulator.get("fn", simulator.get("function"))
+    names = [d.get("name") for d in (simulator, inner) if isinstance(d, dict)]
+    return " of ".join(str(name) for name in names if name)
 
 
 def _compare(path: str, expected: Any, got: Any) -> Iterator[str]:

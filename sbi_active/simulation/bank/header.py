@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import uuid
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sbi_active.simulation.bank.fingerprint import differences
-from sbi_active.simulation.bank.segments import (
-    TEMPORARY,
-    CorruptSegmentError,
-    write_file,
+from sbi_active.simulation.bank.damage import (
+    is_count,
+    parsed,
+    regular_size,
+    require,
 )
+from sbi_active.simulation.bank.fingerprint import differences
+from sbi_active.simulation.bank.segments import TEMPORARY, write_file
 
 __all__ = [
     "has_header",
@@ -42,10 +45,13 @@ def new_header(
     """
     return {
         "format": FORMAT,
+        "id": uuid.uuid4().hex,  # tells its segments from those of other banks
         "created": created,
         **identity,
         "parameter_names": names,
         "shapes": None,
+        "num_segments": 0,  # as of the last time that a writer closed the bank
+        "lost": [],  # numbers, first to last, of segments that were given up
     }
 
 
@@ -89,24 +95,63 @@ def read_header(folder: Path) -> dict[str, Any]:
 
     Raises:
         ValueError: If there is none, or one of another format.
-        CorruptSegmentError: If it cannot be read.
+        CorruptSegmentError: If it is not what a bank writes.
     """
     path = folder / HEADER
     try:
-        header = json.loads(path.read_text())
-        found = header["format"]
+        regular_size(path)
+        header = parsed(path, path.read_bytes())
     except (FileNotFoundError, NotADirectoryError) as error:
         raise ValueError(
             f"expected a bank; got no {path}; do give simulator= to make one"
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise CorruptSegmentError(path, f"no header ({error})") from error
+    found = header.get("format")
+    require(path, type(found) is int, "no header (it tells no format)")
     if found != FORMAT:
         raise ValueError(
-            f"expected a bank of format {FORMAT}; got {found} in {path}; do use the "
+            f"expected a bank of format {FORMAT}; got {found} in {path}; use the "
             "release of sbi-active that wrote it, or make a new bank"
         )
+    header = {"id": None, "num_segments": 0, "lost": [], **header}  # older ones lack it
+    for name, is_valid in _ENTRIES.items():
+        require(path, name in header, f"no entry {name!r}")
+        require(path, is_valid(header[name]), f"an entry {name!r} that none writes")
     return header
+
+
+def _is_text(value: Any) -> bool:
+    return value is None or isinstance(value, str)
+
+
+def _are_names(value: Any) -> bool:
+    is_list = isinstance(value, list)
+    return value is None or (is_list and all(isinstance(v, str) for v in value))
+
+
+def _are_shapes(value: Any) -> bool:
+    return value is None or (
+        isinstance(value, dict)
+        and value.keys() == {"theta", "action", "x"}
+        and all(isinstance(v, list) and all(map(is_count, v)) for v in value.values())
+    )
+
+
+def _are_ranges(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(v, list) and len(v) == 2 and all(map(is_count, v)) for v in value
+    )
+
+
+_ENTRIES: dict[str, Callable[[Any], bool]] = {
+    "id": _is_text,
+    "created": _is_text,
+    "version": lambda value: isinstance(value, str),
+    "simulator": lambda value: isinstance(value, dict | str),
+    "parameter_names": _are_names,
+    "shapes": _are_shapes,
+    "num_segments": is_count,
+    "lost": _are_ranges,
+}
 
 
 def require_same_simulator(

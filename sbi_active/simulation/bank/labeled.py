@@ -49,6 +49,8 @@ class LabeledStore:
                 f"expected {len(index)} rows, one an index; got {lengths}; do give "
                 "columns of one length"
             )
+        for name in ("theta", "action", "x"):
+            _require_storable(name, rows[name])
         log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
         if self._proposal is not None:
             log_proposal = log_density(self._proposal, theta)
@@ -69,6 +71,21 @@ class LabeledStore:
             "log_action": log_action.expand(len(index)),
         }
         self._bank.store(
-            {"digest": run, "seed": seed, "label": self._label},
+            {"digest": run, "seed": int(seed), "label": self._label},
             {name: c.detach().cpu().numpy() for name, c in columns.items()},
+        )
+
+
+def _require_storable(name: str, column: Tensor) -> None:
+    """Raise where float32 loses more than digits."""
+    if column.is_complex():
+        raise ValueError(
+            f"expected real {name}; got {column.dtype}; pass real and imaginary parts "
+            "as numbers of their own"
+        )
+    if bool((column.isfinite() & ~column.float().isfinite()).any()):
+        raise ValueError(
+            f"expected {name} within float32, up to 3.4e38; got "
+            f"{float(column.abs().nan_to_num(posinf=0.0).max()):.3g}; pass other units "
+            "or its logarithm"
         )

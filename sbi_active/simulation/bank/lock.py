@@ -84,6 +84,6 @@ class WriterLock:
     def _read_holder(self) -> tuple[int | None, str]:
         try:
             holder = json.loads(self._holder.read_text())
-            return holder["pid"], holder["host"]
-        except (OSError, ValueError, KeyError):  # it locked a moment ago
+            return int(holder["pid"]), str(holder["host"])
+        except Exception:  # it locked a moment ago, or somebody else wrote the file
             return None, platform.node()

@@ -19,27 +19,35 @@ from typing import Any
 import h5py
 import numpy as np
 
-__all__ = ["CorruptSegmentError", "read_segment", "write_file", "write_segment"]
+from sbi_active.simulation.bank.damage import (
+    CorruptSegmentError,
+    is_count,
+    parsed,
+    regular_size,
+    require,
+)
+from sbi_active.simulation.outcomes import Outcome
+
+__all__ = ["read_segment", "write_file", "write_segment"]
 
 TEMPORARY = ".writing-"
 
 #: Compare with ``meta`` in the file, which holds the checksums of all columns.
 META, CHECKSUM = "meta", "sha256"
 
+COLUMNS = {
+    "index": np.dtype(np.int64),
+    "theta": np.dtype(np.float32),
+    "action": np.dtype(np.float32),
+    "x": np.dtype(np.float32),
+    "status": np.dtype(np.int8),
+    "log_proposal": np.dtype(np.float64),
+    "log_action": np.dtype(np.float64),
+    "run": np.dtype(np.int32),
+}
 
-class CorruptSegmentError(OSError):
-    """A file of a bank that does not hold what was written to it.
-
-    Attributes:
-        path: The file.
-    """
-
-    def __init__(self, path: Path, reason: str) -> None:
-        self.path, self.reason = path, reason
-        super().__init__(
-            f"expected {path} as it was written; got {reason}; do restore it from a "
-            "copy, or delete it: its rows can be simulated again"
-        )
+#: Bytes of a segment of several rows that are read at most; none is written as large.
+LARGEST = 2**30
 
 
 def write_segment(
@@ -71,32 +79,113 @@ def read_segment(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return columns, each compared with its checksum, and the meta data.
 
+    A file made by somebody else is read without harm: it can name no other file and
+    no filter to load, and takes no more memory than its size.
+
     Args:
         path: A segment.
         names: Columns to read; None reads all.
+
+    Returns:
+        The columns, and the meta data with the ``shapes`` of theta, action and x.
 
     Raises:
         FileNotFoundError: If there is no such file.
         CorruptSegmentError: If the file is not what was written.
     """
+    size = regular_size(path)
     try:
         # HDF5 looks its path up more than once, and the file may be gone by then.
         with open(path, "rb") as opened, h5py.File(opened, "r") as file:
-            text = _dataset(file, META).tobytes()
-            if hashlib.sha256(text).hexdigest() != file.attrs[CHECKSUM]:
-                raise CorruptSegmentError(path, "meta data with another checksum")
-            meta = json.loads(text)
-            names = [*meta["checksums"]] if names is None else names
-            columns = {name: _dataset(file, name) for name in names}
+            meta = _meta(path, file, size)
+            datasets = {name: _dataset(path, file, name, size) for name in COLUMNS}
+            _require_rows(path, datasets, meta)
+            meta["shapes"] = {
+                name: [*datasets[name].shape[1:]] for name in ("theta", "action", "x")
+            }
+            wanted = COLUMNS if names is None else names
+            columns = {name: datasets[name][()] for name in wanted}
     except (FileNotFoundError, CorruptSegmentError):
         raise
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
-        reason = f"a file that HDF5 cannot read ({error})"
+    except Exception as error:  # HDF5 has many
+        reason = f"a file that HDF5 cannot read ({error or type(error).__name__})"
         raise CorruptSegmentError(path, reason) from error
     for name, array in columns.items():
-        if _checksum(array) != meta["checksums"][name]:
-            raise CorruptSegmentError(path, f"{name!r} with another checksum")
+        same = _checksum(array) == meta["checksums"][name]
+        require(path, same, f"{name!r} with another checksum")
+        require(path, _is_possible(name, array, meta), f"{name!r} that no bank holds")
     return columns, meta
+
+
+def _meta(path: Path, file: h5py.File, size: int) -> dict[str, Any]:
+    text = _dataset(path, file, META, size)[()].tobytes()
+    same = hashlib.sha256(text).hexdigest() == str(file.attrs[CHECKSUM])
+    require(path, same, "meta data with another checksum")
+    meta = parsed(path, text)
+    keys = meta.keys() >= {"num_rows", "counts", "runs", "checksums"}
+    require(path, keys and _is_meta(meta), "meta data that no bank writes")
+    return meta
+
+
+def _is_meta(meta: Mapping[str, Any]) -> bool:
+    counts, runs, checksums = meta["counts"], meta["runs"], meta["checksums"]
+    numbers = meta.get("numbers", [])
+    return (
+        all(isinstance(value, list) for value in (counts, runs, numbers))
+        and all(map(is_count, [*counts, *numbers, meta["num_rows"]]))
+        and len(counts) == len(Outcome)
+        and sum(counts) == meta["num_rows"]
+        and all(isinstance(run, dict) and _is_run(run) for run in runs)
+        and isinstance(checksums, dict)
+        and checksums.keys() == COLUMNS.keys()
+    )
+
+
+def _is_run(run: Mapping[str, Any]) -> bool:
+    named = all(isinstance(run.get(name), str) for name in ("digest", "label"))
+    seed = run.get("seed")
+    return named and type(seed) is int and -(2**63) <= seed < 2**63
+
+
+def _dataset(path: Path, file: h5py.File, name: str, size: int) -> h5py.Dataset:
+    """Return a dataset without reading it: plain numbers within this very file."""
+    link = file.get(name, getlink=True)
+    require(path, isinstance(link, h5py.HardLink), f"{name!r} in another place")
+    dataset = file[name]
+    assert isinstance(dataset, h5py.Dataset)
+    kind = COLUMNS.get(name, np.dtype(np.uint8))
+    plan = dataset.id.get_create_plist()
+    is_plain = (
+        dataset.dtype == kind
+        and plan.get_layout() in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT)
+        and not plan.get_external_count()
+        and not plan.get_nfilters()
+        and dataset.shape is not None
+    )
+    require(path, is_plain, f"{name!r} of another kind")
+    num_rows = dataset.shape[0] if dataset.shape else 0
+    few = dataset.nbytes <= (size if num_rows <= 1 else min(size, LARGEST))
+    require(path, few, f"{name!r} of {dataset.nbytes} bytes")
+    return dataset
+
+
+def _require_rows(
+    path: Path, datasets: Mapping[str, h5py.Dataset], meta: Mapping[str, Any]
+) -> None:
+    for name, dataset in datasets.items():
+        is_table = name in ("theta", "action", "x")
+        long = dataset.shape[:1] == (meta["num_rows"],)
+        fits = long and (is_table or len(dataset.shape) == 1)
+        require(path, fits, f"{name!r} of shape {dataset.shape}")
+
+
+def _is_possible(name: str, array: np.ndarray, meta: Mapping[str, Any]) -> bool:
+    if name == "status":
+        counts = [int((array == outcome).sum()) for outcome in Outcome]
+        return counts == meta["counts"]
+    if name == "run":
+        return bool(((array >= 0) & (array < len(meta["runs"]))).all())
+    return name != "index" or bool((array >= 0).all())
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -139,12 +228,6 @@ def synchronize(folder: Path) -> None:
 def leftovers(folder: Path) -> Iterator[Path]:
     """Yield files of writers that died while writing."""
     yield from folder.glob(f"{TEMPORARY}*")
-
-
-def _dataset(file: h5py.File, name: str) -> np.ndarray:
-    dataset = file[name]
-    assert isinstance(dataset, h5py.Dataset)
-    return dataset[()]
 
 
 def _checksum(array: np.ndarray) -> str:

@@ -2,20 +2,28 @@
 
 A segment is named after the numbers that it covers, ``00000004-00000009.h5`` being
 what 4 to 9 were merged into. One that is covered by another no longer counts, so a
-merger is complete when its result has its name, whatever dies thereafter.
+merger is complete when its result has its name, whatever dies thereafter. The numbers
+that count follow each other without a gap, since the position of a row does not change.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sbi_active.simulation.bank.segments import (
+from sbi_active.simulation.bank.damage import (
     CorruptSegmentError,
+    regular_size,
+    require,
+)
+from sbi_active.simulation.bank.segments import (
+    COLUMNS,
     leftovers,
     read_segment,
     synchronize,
@@ -31,6 +39,9 @@ SEGMENT_BYTES = 64 * 2**20
 #: Small segments that are merged by themselves.
 MANY = 64
 
+#: What can be read; the last two are those of a row's run.
+COLUMN_NAMES = {*COLUMNS} - {"run"} | {"seed", "label"}
+
 NAME = re.compile(r"(\d{8})-(\d{8})\.h5")
 
 
@@ -40,7 +51,8 @@ class Segment:
 
     Attributes:
         path: The file.
-        meta: Number of rows, counts by outcome, and the runs that rows belong to.
+        meta: Number of rows, counts by outcome, the runs that rows belong to, and the
+            shapes of theta, action and x.
         num_bytes: Size of the file.
     """
 
@@ -68,10 +80,15 @@ class Shelf:
 
     Args:
         folder: Need not exist to be read as empty.
+        header: Of the bank: which segments are its own, and which are known as lost.
+
+    Attributes:
+        header: The latest that is known.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
         self._folder = folder
+        self.header = header
         self._meta: dict[tuple[str, int, int], dict[str, Any]] = {}
         self._small = 0
         self._last: tuple[Path | None, dict[str, np.ndarray]] = (None, {})
@@ -80,7 +97,8 @@ class Shelf:
         """Return the segments as they are on the disk now.
 
         Raises:
-            CorruptSegmentError: If one cannot be read.
+            CorruptSegmentError: If one is not there, cannot be read, or is not of this
+                bank and place.
         """
         while True:
             try:
@@ -106,7 +124,7 @@ class Shelf:
         for start in range(0, len(columns["index"]), size):
             part = {name: c[start : start + size] for name, c in columns.items()}
             part["run"] = np.zeros(len(part["index"]), np.int32)
-            number = max((_numbers(path)[1] for path in self._paths()), default=0) + 1
+            number = self.last_number() + 1
             self._write(number, number, part, [run])
             self._small += 1
         if self._small > MANY:
@@ -118,10 +136,11 @@ class Shelf:
         size = 0
         for path in self._paths():
             added = path.stat().st_size
-            if size + added > SEGMENT_BYTES or not self._sound(path):
+            is_sound = self._damage(path, whole=False) is None
+            if size + added > SEGMENT_BYTES or not is_sound:
                 self._merge(group)
                 group, size = [], 0
-            if self._sound(path) and added <= SEGMENT_BYTES / 2:
+            if is_sound and added <= SEGMENT_BYTES / 2:
                 group.append(path)
                 size += added
         self._merge(group)
@@ -129,31 +148,68 @@ class Shelf:
 
     def clean(self) -> None:
         """Remove what a writer that died left; for the writer alone."""
-        paths = {*self._paths()}
+        paths = self._paths()
         for path in [*leftovers(self._folder), *leftovers(self._folder.parent)]:
             path.unlink(missing_ok=True)
-        for path in {*self._list()} - paths:
-            path.unlink()
+        # What a merger was made from goes once its result is seen to be whole.
+        covered = {*self._list()} - {*paths}
+        if covered and not self.verify():
+            for path in covered:
+                path.unlink()
         self._small = sum(p.stat().st_size <= SEGMENT_BYTES / 2 for p in paths)
 
     def verify(self) -> list[str]:
         """Return what is wrong, one line each."""
-        problems, expected = [], 1
-        for path in self._paths():
-            first, last = _numbers(path)
-            if first != expected:
-                problems.append(
-                    f"{self._folder}: segments {expected} to {first - 1} are not there"
-                )
-            expected = last + 1
-            try:
-                read_segment(path, None)
-            except CorruptSegmentError as error:
-                problems.append(f"{path}: {error.reason}")
-        return problems
+        paths = self._covering()
+        problems = [f"{e.path}: {e.reason}" for e in self._errors(paths)]
+        return problems + [f"{p}: {e.reason}" for p in paths if (e := self._damage(p))]
+
+    def set_aside(self) -> None:
+        """Rename files that are damaged, so that they do not count."""
+        for path in self._covering():
+            if self._damage(path):
+                path.rename(path.with_name(f"{path.name}.damaged"))
+
+    def last_number(self) -> int:
+        """Return the highest number of a segment there; 0 where there is none."""
+        return max((_numbers(path)[1] for path in self._covering()), default=0)
+
+    def lost(self, paths: list[Path] | None = None) -> list[list[int]]:
+        """Return the numbers that are not there, first to last."""
+        paths = self._covering() if paths is None else paths
+        spans = [_numbers(path) for path in paths]
+        ends = [0, *(last for _, last in spans)]
+        end = max(self.header["num_segments"], ends[-1]) + 1
+        starts = [*(first for first, _ in spans), end]
+        gaps = zip(ends, starts, strict=True)
+        return [[end + 1, start - 1] for end, start in gaps if start > end + 1]
 
     def _paths(self) -> list[Path]:
-        """Return the files that count, in order."""
+        """Return the files that count, in order.
+
+        Raises:
+            CorruptSegmentError: If their numbers do not follow each other.
+        """
+        paths = self._covering()
+        if not any(self._errors(paths)):
+            return paths
+        paths = self._covering()  # in case of mergers during the first look
+        for error in self._errors(paths):
+            raise error
+        return paths
+
+    def _errors(self, paths: list[Path]) -> Iterator[CorruptSegmentError]:
+        """Yield where the numbers of files do not follow each other."""
+        for path, following in pairwise(paths):
+            if _numbers(following)[0] <= _numbers(path)[1]:
+                yield CorruptSegmentError(following, f"rows of {path.name} in it")
+        for first, last in self.lost(paths):
+            if not any(a <= first and last <= b for a, b in self.header["lost"]):
+                reason = f"a gap: segments {first} to {last} are not there"
+                yield CorruptSegmentError(self._folder, reason)
+
+    def _covering(self) -> list[Path]:
+        """Return the files that no other one covers, in order."""
         found = self._list()
         # A file that is renamed while a folder is listed may not be seen, and what it
         # was merged from may be gone already.
@@ -169,22 +225,39 @@ class Shelf:
         return paths
 
     def _list(self) -> list[Path]:
-        paths = self._folder.glob("*.h5")
-        return sorted(path for path in paths if NAME.fullmatch(path.name))
+        paths = [p for p in self._folder.glob("*.h5") if NAME.fullmatch(p.name)]
+        return sorted(p for p in paths if 1 <= _numbers(p)[0] <= _numbers(p)[1])
 
     def _open(self, path: Path) -> Segment:
+        regular_size(path)
         state = path.stat()
         key = (path.name, state.st_mtime_ns, state.st_size)
         if key not in self._meta:
-            self._meta[key] = read_segment(path, [])[1]
+            meta = read_segment(path, [])[1]
+            self._require_in_place(path, meta)
+            self._meta[key] = meta
         return Segment(path, self._meta[key], state.st_size)
 
-    def _sound(self, path: Path) -> bool:
+    def _require_in_place(self, path: Path, meta: dict[str, Any]) -> None:
+        numbers, shapes = meta.get("numbers", []), meta["shapes"]  # older ones lack it
+        here = numbers in ([], [*_numbers(path)])
+        require(path, here, f"segments {numbers} under another name")
+        own = meta.get("bank") in (None, self.header["id"])
+        require(path, own, "a segment of another bank")
+        expected = self.header["shapes"]
+        same = expected in (None, shapes)
+        require(path, same, f"rows of shapes {shapes} among those of {expected}")
+        if expected is None:  # another process wrote the first rows a moment ago
+            self.header = {**self.header, "shapes": shapes}
+
+    def _damage(self, path: Path, *, whole: bool = True) -> CorruptSegmentError | None:
         try:
             self._open(path)
-        except CorruptSegmentError:
-            return False
-        return True
+            if whole:
+                read_segment(path, None)
+        except CorruptSegmentError as error:
+            return error
+        return None
 
     def _gather(
         self, segments: list[Segment], names: list[str], rows: np.ndarray | None
@@ -269,8 +342,11 @@ class Shelf:
             "num_rows": len(columns["index"]),
             "counts": [int((columns["status"] == o).sum()) for o in Outcome],
             "runs": runs,
+            "numbers": [first, last],
+            "bank": self.header["id"],
         }
         path = self._folder / f"{first:08d}-{last:08d}.h5"
+        require(path, NAME.fullmatch(path.name) is not None, "no more room for numbers")
         write_segment(path, columns, meta)
 
 

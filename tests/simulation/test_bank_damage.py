@@ -1,0 +1,417 @@
+"""Damaged, crafted, old and misplaced files of a bank: one error names them."""
+
+import copy
+import hashlib
+import json
+import os
+import shutil
+from contextlib import suppress
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from sbi_active import Bank, Simulations
+from sbi_active.cli import main
+from sbi_active.simulation import reuse
+from sbi_active.simulation.bank import CorruptSegmentError
+from sbi_active.simulation.bank.segments import read_segment, write_segment
+
+
+def simulator(theta, action):
+    return theta
+
+
+def prior():
+    return torch.distributions.MultivariateNormal(torch.zeros(2), torch.eye(2))
+
+
+def fill(bank, seeds=(0, 1, 2, 3)):
+    for seed in seeds:
+        theta = torch.full((5, 2), float(seed))
+        rows = Simulations(theta, theta[:, :1], theta)
+        bank.append(rows, seed=seed, proposal=prior(), label="prior")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        fill(bank)
+    return bank.path
+
+
+def segment(folder, first, last=None):
+    return folder / "segments" / f"{first:08d}-{last or first:08d}.h5"
+
+
+def appended(folder):
+    with Bank(folder, simulator=simulator) as bank:
+        fill(bank, (9,))
+
+
+READERS = {
+    "len": lambda folder: len(Bank(folder)),
+    "read": lambda folder: Bank(folder).read([0]),
+    "chunks": lambda folder: [*Bank(folder).chunks(3)],
+    "columns": lambda folder: Bank(folder).columns("x"),
+    "counts": lambda folder: Bank(folder).counts,
+    "labels": lambda folder: Bank(folder).labels,
+    "load": lambda folder: Bank(folder).load("run"),
+    "reuse": lambda folder: reuse(Bank(folder), prior()),
+    "append": appended,
+    "compact": lambda folder: Bank(folder, simulator=simulator).compact(),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_gap_is_told_by_every_reader(folder, reader):
+    segment(folder, 2).unlink()
+    text = r"expected .*segments as it was written; got a gap: segments 2 to 2 are not"
+    with pytest.raises(CorruptSegmentError, match=text):
+        READERS[reader](folder)
+
+
+def rename_to_another_name(folder):
+    segment(folder, 2).rename(segment(folder, 2).with_name("2.h5"))
+
+
+def swap(folder):
+    spare = folder / "spare"
+    segment(folder, 2).rename(spare)
+    segment(folder, 3).rename(segment(folder, 2))
+    spare.rename(segment(folder, 3))
+
+
+def duplicate_at_the_end(folder):
+    shutil.copy(segment(folder, 2), segment(folder, 5))
+
+
+def duplicate_in_place_of_another(folder):
+    shutil.copy(segment(folder, 2), segment(folder, 3))
+
+
+def stretch(folder):
+    segment(folder, 2).rename(segment(folder, 1, 4))
+
+
+def overlap(folder):
+    segment(folder, 4).rename(segment(folder, 3, 5))
+
+
+def close_the_gap_by_hand(folder):
+    segment(folder, 2).unlink()
+    segment(folder, 3).rename(segment(folder, 2))
+    segment(folder, 4).rename(segment(folder, 3))
+
+
+def take_from_another_bank(folder):
+    with Bank(folder.parent / "other", simulator=simulator) as other:
+        fill(other)
+    shutil.copy(segment(other.path, 2), segment(folder, 2))
+
+
+def take_the_header_of_another_bank(folder):
+    with Bank(folder.parent / "other", simulator=simulator) as other:
+        fill(other)
+    shutil.copy(other.path / "bank.json", folder / "bank.json")
+
+
+def lose_the_last(folder):
+    segment(folder, 4).unlink()
+
+
+def lose_all(folder):
+    shutil.rmtree(folder / "segments")
+
+
+def link_to_nothing(folder):
+    segment(folder, 2).unlink()
+    segment(folder, 2).symlink_to("nowhere")
+
+
+def put_a_pipe(folder):
+    segment(folder, 2).unlink()
+    os.mkfifo(segment(folder, 2))
+
+
+def put_a_folder(folder):
+    segment(folder, 2).unlink()
+    segment(folder, 2).mkdir()
+
+
+@pytest.mark.parametrize(
+    "misplace",
+    [
+        rename_to_another_name,
+        swap,
+        duplicate_at_the_end,
+        duplicate_in_place_of_another,
+        stretch,
+        overlap,
+        close_the_gap_by_hand,
+        take_from_another_bank,
+        take_the_header_of_another_bank,
+        lose_the_last,
+        lose_all,
+        link_to_nothing,
+        put_a_pipe,
+        put_a_folder,
+    ],
+)
+def test_misplaced_segments_are_named(folder, misplace, capsys):
+    misplace(folder)
+    with pytest.raises(CorruptSegmentError, match=str(folder / "segments")):
+        Bank(folder).read()
+    assert Bank(folder).verify()
+    assert main(["bank", "inspect", str(folder)]) == 1
+    assert capsys.readouterr().out.startswith("checksums: NOT ok")
+    before = sorted(p.name for p in folder.glob("segments/*"))
+    with pytest.raises(CorruptSegmentError):
+        appended(folder)
+    assert sorted(p.name for p in folder.glob("segments/*")) == before
+    with pytest.raises(CorruptSegmentError):  # still
+        Bank(folder).read()
+
+
+def test_repair_gives_up_what_is_lost_and_no_more(folder):
+    segment(folder, 2).unlink()
+    segment(folder, 3).write_bytes(b"half")
+    with Bank(folder, simulator=simulator) as bank:
+        assert len(bank.repair()) == 2
+        assert bank.read().theta[:, 0].tolist() == [0.0] * 5 + [3.0] * 5
+        assert bank.verify() == []
+        fill(bank, (1, 2))  # simulated again
+        bank.compact()
+    again = Bank(folder)
+    assert again.columns("seed")["seed"][::5].tolist() == [0, 3, 1, 2]
+    assert segment(folder, 3).with_suffix(".h5.damaged").read_bytes() == b"half"
+    segment(folder, 1, 6).unlink()
+    with pytest.raises(CorruptSegmentError, match="segments 1 to 6 are not there"):
+        again.read()
+
+
+def test_banks_written_before_segments_had_a_place_are_read(folder):
+    header = json.loads((folder / "bank.json").read_text())
+    for name in ("id", "num_segments", "lost"):
+        del header[name]
+    (folder / "bank.json").write_text(json.dumps(header))
+    for number in range(1, 5):
+        columns, meta = read_segment(segment(folder, number), None)
+        meta = {k: meta[k] for k in ("num_rows", "counts", "runs")}
+        write_segment(segment(folder, number), columns, meta)
+    appended(folder)
+    bank = Bank(folder)
+    assert bank.read().theta[::5, 0].tolist() == [0, 1, 2, 3, 9]
+    assert bank.verify() == []
+    segment(folder, 2).unlink()
+    with pytest.raises(CorruptSegmentError, match="segments 2 to 2 are not there"):
+        bank.read()
+
+
+HEADERS = {
+    "deep": b"[" * 100_000 + b"]" * 100_000,
+    "deep in simulator": b'{"format": 1, "simulator": ' + b'{"a":' * 500 + b"1",
+    "list": b"[]",
+    "null": b"null",
+    "empty": b"",
+    "bytes": bytes(range(256)),
+    "large number": b'{"format": ' + b"1" * 5_000 + b"}",
+    "infinite": b'{"format": Infinity}',
+    "text": b'{"format": "1"}',
+    "true": b'{"format": true}',
+    "only the format": b'{"format": 1}',
+}
+
+
+@pytest.mark.parametrize("content", HEADERS.values(), ids=HEADERS.keys())
+def test_crafted_headers(folder, content):
+    (folder / "bank.json").write_bytes(content)
+    with pytest.raises(CorruptSegmentError, match=r"bank\.json as it was written"):
+        Bank(folder)
+    assert main(["bank", "inspect", str(folder)]) == 2
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "version",
+        "simulator",
+        "parameter_names",
+        "shapes",
+        "created",
+        "num_segments",
+        "lost",
+        "id",
+    ],
+)
+def test_entries_of_other_types(folder, name):
+    header = json.loads((folder / "bank.json").read_text())
+    for value in (-1, float("nan"), [1], {"theta": 3}):
+        if (name, value) == ("simulator", {"theta": 3}):
+            continue  # any object describes a simulator
+        (folder / "bank.json").write_text(json.dumps({**header, name: value}))
+        with pytest.raises(CorruptSegmentError, match=r"bank\.json"):
+            Bank(folder)
+
+
+def crafted(path, change):
+    """Write a segment again with changed meta data and the right checksums."""
+    columns, meta = read_segment(path, None)
+    meta = {key: meta[key] for key in meta.keys() - {"shapes", "checksums"}}
+    meta = change(columns, copy.deepcopy(meta)) or meta
+    write_segment(path, columns, meta)
+
+
+def _set(key, value):
+    return lambda columns, meta: {**meta, key: value}
+
+
+def _put(column, value):
+    def change(columns, meta):
+        columns[column][0] = value
+
+    return change
+
+
+def _replace(column, value):
+    def change(columns, meta):
+        columns[column] = value
+
+    return change
+
+
+SEGMENTS = {
+    "negative rows": _set("num_rows", -5),
+    "many rows": _set("num_rows", 10**18),
+    "rows as a text": _set("num_rows", "5"),
+    "no runs": _set("runs", []),
+    "a run of nothing": _set("runs", [{}]),
+    "a run as a number": _set("runs", 3),
+    "a seed of 100 digits": _set("runs", [{"digest": "", "seed": 10**99, "label": ""}]),
+    "other counts": _set("counts", [0, 5, 0]),
+    "negative counts": _set("counts", [10, -5, 0]),
+    "four counts": _set("counts", [5, 0, 0, 0]),
+    "nested": _set("numbers", json.loads("[" * 300 + "]" * 300)),
+    "an outcome of 7": _put("status", 7),
+    "a run of -1": _put("run", -1),
+    "an index of -1": _put("index", -1),
+    "a short column": _replace("x", np.zeros((2, 2), np.float32)),
+    "a column of float64": _replace("x", np.zeros((5, 2))),
+    "a wide column": _replace("x", np.zeros((5, 1), np.float32)),
+    "a number": _replace("x", np.float32(3)),
+    "a text": _replace("x", np.array([b"abc"] * 5)),
+}
+
+
+@pytest.mark.parametrize("change", SEGMENTS.values(), ids=SEGMENTS.keys())
+def test_crafted_segments(folder, change):
+    path = segment(folder, 2)
+    crafted(path, change)
+    with pytest.raises(CorruptSegmentError, match=str(path)):
+        Bank(folder).columns("x", "status", "seed", "index")
+    assert any(str(path) in line for line in Bank(folder).verify())
+
+
+def _dataset(**options):
+    def change(file):
+        del file["x"]
+        file.create_dataset("x", **options)
+
+    return change
+
+
+def _link(link):
+    def change(file):
+        del file["x"]
+        file["x"] = link(file)
+
+    return change
+
+
+def _huge(file):
+    del file["x"]
+    file.create_dataset("x", shape=(5, 10**15), dtype="f4", chunks=(1, 10**4))
+
+
+def _meta_of(text):
+    def change(file):
+        del file["meta"]
+        file.create_dataset("meta", data=np.frombuffer(text, np.uint8))
+        file.attrs["sha256"] = hashlib.sha256(text).hexdigest()
+
+    return change
+
+
+FILES = {
+    "another file": _link(lambda file: h5py.ExternalLink("/etc/passwd", "/x")),
+    "itself": _link(lambda file: h5py.SoftLink("/x")),
+    "a name within": _link(lambda file: h5py.SoftLink("/theta")),
+    "a group": lambda file: (file.__delitem__("x"), file.create_group("x")),
+    "outside": _dataset(
+        shape=(5, 2), dtype="f4", external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)]
+    ),
+    "compressed": _dataset(data=np.zeros((5, 2), "f4"), compression="gzip"),
+    "objects": _dataset(data=[["a", "b"]] * 5, dtype=h5py.string_dtype()),
+    "nothing": _dataset(data=h5py.Empty("f4")),
+    "huge": _huge,
+    "deep": _meta_of(b"[" * 100_000 + b"]" * 100_000),
+    "infinite": _meta_of(b'{"num_rows": Infinity}'),
+    "no JSON": _meta_of(b"\xff\xfe"),
+    "checksum of numbers": lambda file: file.attrs.__setitem__("sha256", [1, 2]),
+    "no checksum": lambda file: file.attrs.__delitem__("sha256"),
+}
+
+
+@pytest.mark.parametrize("change", FILES.values(), ids=FILES.keys())
+def test_files_that_only_hdf5_can_make(folder, change):
+    path = segment(folder, 2)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    with pytest.raises(CorruptSegmentError, match=str(path)):
+        Bank(folder).columns("x")
+    assert any(str(path) in line for line in Bank(folder).verify())
+
+
+def test_a_flipped_bit_or_a_cut_gives_the_rows_or_the_error(folder):
+    path = segment(folder, 2)
+    expected, content = Bank(folder).read(), path.read_bytes()
+    for place in range(3, len(content), 997):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << place % 8
+        for damaged in (bytes(flipped), content[:place]):
+            path.write_bytes(damaged)
+            with suppress(CorruptSegmentError):
+                assert torch.equal(Bank(folder).read().x, expected.x)
+
+
+def test_control_characters_do_not_reach_the_terminal(folder, capsys):
+    header = json.loads((folder / "bank.json").read_text())
+    header["created"] = "\x1b[2J\ud800"
+    (folder / "bank.json").write_text(json.dumps(header))
+    assert main(["bank", "inspect", str(folder)]) == 0
+    assert r"created: '\x1b[2J\ud800'" in capsys.readouterr().out
+
+
+def test_columns_and_sizes_that_are_none(folder):
+    bank = Bank(folder)
+    with pytest.raises(ValueError, match=r"expected columns among .*got \['thetas'\]"):
+        bank.columns("thetas")
+    with pytest.raises(ValueError, match="expected size >= 1; got 0"):
+        next(bank.chunks(0))
+
+
+def test_numbers_that_float32_cannot_hold(folder):
+    rows = torch.ones(3, 2)
+    with Bank(folder, simulator=simulator) as bank:
+        large = Simulations(rows, rows[:, :1], rows.double() * 1e39)
+        with pytest.raises(ValueError, match=r"expected x within float32.*got 1e\+39"):
+            bank.append(large, seed=0)
+        with pytest.raises(ValueError, match=r"expected real x; got torch.complex64"):
+            bank.append(
+                Simulations(rows, rows[:, :1], rows + 1j, torch.zeros(3)), seed=0
+            )
+        eight: Any = np.int64(8)
+        assert bank.append(Simulations(rows, rows[:, :1], rows), seed=eight) == 3
+    assert len(Bank(folder)) == 23
