@@ -104,7 +104,8 @@ def refine(
 
     Raises:
         ValueError: If shapes do not fit, there is no trial, the simulator is
-            deterministic, or it almost never gives a measurement that a trial gave.
+            deterministic, it almost never gives a measurement that a trial gave, or an
+            outcome is so far away that no parameters have a likelihood.
 
     References:
         Wood, Nature 2010; Price et al., J. Comp. Graph. Stat. 2018 (synthetic
@@ -206,6 +207,12 @@ def _refine(
             first=first,
             num_components=6 if len(regressions) <= 4 else 10,
         )
+        if not np.isfinite(particles.log_normalizer):
+            raise UnexplainedOutcomeError(
+                "expected outcomes that some parameters may explain; got none with a "
+                f"likelihood, at x of up to {np.abs(histories.observed).max():.3g}; "
+                "correct the outcome, or leave the trial out"
+            )
         stage = Stage.of(surrogate, particles, settings.defensive, rng)
         course.append(stage)
         if is_last or course.is_settled:
