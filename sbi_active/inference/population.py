@@ -27,7 +27,7 @@ SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
 SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
-FITTED = 12  # of them for each number in a covariance
+FITTED = 8  # of them for each number in a covariance
 
 
 def normalized(log_weight: Array) -> Array:

@@ -36,6 +36,7 @@ from sbi_active.inference.regions import (
     cover,
     whole_space,
 )
+from sbi_active.inference.regression_error import SMALL, widened
 from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.inference.simulated_likelihood import (
     MeanTable,
@@ -53,7 +54,7 @@ __all__ = ["Refinement", "refine"]
 Array = NDArray[Any]
 
 HALF = 0.5  # of the budget, after which misfit is taken to stay
-MANY = 6  # parameters beyond which a covariance needs more particles
+MANY = 6  # parameters beyond which each covariance needs more particles
 MIN_STAGE = 60  # histories below which another stage adds nothing
 
 
@@ -199,21 +200,10 @@ def _refine(
                 "executed actions, or the prior"
             )
         surrogate = Surrogate(coordinates, regressions, not is_last)
-        particles, _ = population_monte_carlo(
-            surrogate.log_joint,
-            base,
-            rng,
-            num_particles=_num_particles(settings, coordinates.dim),
-            first=first,
-            num_components=6 if len(regressions) <= 4 else 10,
-        )
-        if not np.isfinite(particles.log_normalizer):
-            raise UnexplainedOutcomeError(
-                "expected outcomes that some parameters may explain; got none with a "
-                f"likelihood, at x of up to {np.abs(histories.observed).max():.3g}; "
-                "correct the outcome, or leave the trial out"
-            )
-        stage = Stage.of(surrogate, particles, settings.defensive, rng)
+        stage = _sampled(surrogate, base, first, settings, rng)
+        if stage.error > SMALL and len(course.stages) > 0:
+            stage = _with_more(stage, histories, base, settings, rng)
+        regressions, particles = stage.surrogate.regressions, stage.particles
         course.append(stage)
         if is_last or course.is_settled:
             break
@@ -295,8 +285,51 @@ def _stage_size(settings: Refinement, used: int) -> int:
     return left if left < size + MIN_STAGE else size
 
 
-def _num_particles(settings: Refinement, dim: int) -> int:
-    return int(settings.num_particles * max(1.0, dim / MANY))
+def _sampled(
+    surrogate: Surrogate,
+    base: Proposal,
+    first: Proposal | None,
+    settings: Refinement,
+    rng: np.random.Generator,
+) -> Stage:
+    """Return the stage of a surrogate, its density sampled.
+
+    Raises:
+        UnexplainedOutcomeError: If no parameters have a likelihood.
+    """
+    many = max(1.0, surrogate.coordinates.dim / MANY)
+    num_components = 6 if len(surrogate.regressions) <= 4 else 10
+    particles, _ = population_monte_carlo(
+        surrogate.log_joint,
+        base,
+        rng,
+        num_particles=int(many * settings.num_particles),
+        first=first,
+        num_components=num_components if many == 1 else num_components // 2,
+    )
+    if not np.isfinite(particles.log_normalizer):
+        raise UnexplainedOutcomeError(
+            "expected outcomes that some parameters may explain; got none with a "
+            "likelihood; correct the outcome, or leave the trial out"
+        )
+    return Stage.of(surrogate, particles, settings.defensive, rng)
+
+
+def _with_more(
+    stage: Stage,
+    histories: Histories,
+    base: Proposal,
+    settings: Refinement,
+    rng: np.random.Generator,
+) -> Stage:
+    """Return the stage with simulations from further off, where they are of use."""
+    surrogate, error = widened(
+        histories, stage.surrogate, stage.error, stage.draws, rng
+    )
+    if surrogate is stage.surrogate:
+        return stage
+    wide = _sampled(surrogate, base, stage.particles.proposal, settings, rng)
+    return replace(wide, error=error)
 
 
 def _simulate_stage(

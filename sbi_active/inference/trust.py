@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
 from sbi_active.inference.population import Particles
+from sbi_active.inference.regression_error import SMALL, expected_error
 from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
 from sbi_active.inference.tails import tail_probability
 
@@ -19,7 +20,7 @@ Array = NDArray[Any]
 
 SETTLED = 0.03  # nats a dimension that the last stage may have changed
 LIVE = 0.01  # mass below which a region is left out of the checks
-MAX_DIM = 6
+LARGE = 0.2  # nats that the belief is off
 MIN_EFFECTIVE = 0.05  # share of the particles
 ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
 HARD_NOISE = 0.03  # nats a number that a Gaussian loses on the noise
@@ -43,6 +44,7 @@ class Stage:
         excess: Worst misfit of a region with mass.
         mass: Of each region, shape (k,).
         entropy: Of the density, in nats.
+        error: Expected divergence in nats, as the simulations are finite in number.
     """
 
     surrogate: Surrogate
@@ -52,6 +54,7 @@ class Stage:
     excess: float
     mass: Array
     entropy: float
+    error: float
 
     @staticmethod
     def of(
@@ -71,11 +74,16 @@ class Stage:
             if share > LIVE
         ]
         stage = Stage(
-            surrogate, particles, defensive, draws, max(live, default=np.inf), mass, 0.0
+            surrogate,
+            particles,
+            defensive,
+            draws,
+            excess=max(live, default=np.inf),
+            mass=mass,
+            entropy=0.0,
+            error=expected_error(surrogate, draws, rng),
         )
-        entropy = -float(stage.log_prob(draws).mean())
-        object.__setattr__(stage, "entropy", entropy)
-        return stage
+        return replace(stage, entropy=-float(stage.log_prob(draws).mean()))
 
     def log_prob(self, z: Array) -> Array:
         """Return the log density of the belief at this stage, shape (n,)."""
@@ -114,6 +122,7 @@ class Course:
             stage.excess <= MISFIT
             and self.divergence < SETTLED * d
             and self.shrinkage < 0.1 * d
+            and stage.error <= SMALL
         )
 
     @property
@@ -202,11 +211,11 @@ def diagnose(
             "likelihood is a product over trials; do check how the simulator seeds "
             "its noise",
         ),
-        "few_parameters": (
-            dim <= MAX_DIM,
-            float(dim),
-            "there are {:.0f} parameters, and local polynomials are known to serve up "
-            "to 6; do check against a belief of a trained network",
+        "small_error": (
+            last.error <= LARGE,
+            last.error,
+            "the belief is off by about {:.2g} nats, since its regressions rest on few "
+            "simulations for so many parameters and numbers; raise num_histories",
         ),
     }
     warnings = [
@@ -229,6 +238,7 @@ def diagnose(
         "effective_sample_size": float(last.particles.effective_sample_size),
         "residual_to_noise": float(ratio),
         "num_regions": len(fits),
+        "error_nats": last.error,
         "region_mass": [float(mass) for mass in last.mass],
         "prior_edge_mass": edge_mass,
         "tail_probability": joint,

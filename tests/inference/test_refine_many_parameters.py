@@ -21,7 +21,7 @@ def refined(dim: int, num: int, seed: int, num_histories: int):
         return theta @ weight.T + 0.5 * torch.randn(len(theta), num)
 
     prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
-    settings = Refinement(num_histories=num_histories)
+    settings = Refinement(num_histories=num_histories, num_particles=3_000)
     belief = refine(
         simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=seed
     )
@@ -35,7 +35,15 @@ def refined(dim: int, num: int, seed: int, num_histories: int):
     return float(log_ratio.mean()), belief
 
 
-@pytest.mark.parametrize("dim", [10, 20])
-def test_ten_and_twenty_parameters(dim: int):
-    divergence, _ = refined(dim, 4, seed=0, num_histories=600)
+@pytest.mark.parametrize(("dim", "num_histories"), [(10, 600), (20, 200)])
+def test_ten_and_twenty_parameters(dim: int, num_histories: int):
+    divergence, _ = refined(dim, 2, seed=0, num_histories=num_histories)
     assert -0.02 < divergence < 0.3
+
+
+@pytest.mark.parametrize(("num", "num_histories"), [(2, 600), (80, 200)])
+def test_trust_follows_the_error_and_not_the_dimension(num: int, num_histories: int):
+    divergence, belief = refined(10, num, seed=1, num_histories=num_histories)
+    diagnostics = belief.diagnostics
+    assert diagnostics["error_nats"] == pytest.approx(divergence, rel=0.7, abs=0.05)
+    assert diagnostics["trustworthy"] == (divergence < 0.2)

@@ -1,0 +1,255 @@
+r"""Linear-Gaussian problems with a closed form: the error of a belief and what it says.
+
+    python -m benchmarks.robustness.exact
+    python -m benchmarks.robustness.exact --prior box
+    python -m benchmarks.robustness.exact --summary
+
+Three trials of
+
+.. math::
+    x = (A_0 + \xi A_1) \theta + e, \qquad e \sim \mathcal N(0, .5^2 I),
+
+each passed to ``ASBI.update`` with the simulator, at 2 to 20 parameters and 2 to 200
+numbers. The prior is standard normal, so that the posterior is Gaussian; or a box
+(``--prior box``) wide enough for the posterior to be the Gaussian of the likelihood,
+which takes at least as many numbers as parameters. Columns of ``results/exact.csv``:
+
+- ``kl``: KL(exact || belief) in nats, by 4,000 draws of the exact posterior;
+  ``kl_error`` is its standard error;
+- ``kl_reverse``: KL(belief || exact), by as many draws of the belief;
+- ``kl_gaussian``: KL between the exact posterior and the Gaussian of the belief's
+  draws, free of the noise of ``log_prob`` but not of the moments' (d (d + 3) / 16,000);
+- ``error_nats``: the library's own estimate of the first, where it gives one;
+- ``trustworthy``, ``assumptions`` (those that do not hold), ``cpu_seconds``.
+
+Seeds from 100 on served to calibrate the diagnostics; the table is of seeds 0 to 4.
+Resumable: a problem that has a row is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+from torch.distributions import Distribution, MultivariateNormal
+
+from sbi_active import ASBI
+from sbi_active.inference.belief import Belief
+from sbi_active.seeding import derive_seed, forked_generators
+
+DIMS = (2, 4, 6, 8, 10, 15, 20)
+SIZES = (2, 10, 30, 80, 200)
+SEEDS = range(5)
+ACTIONS = ((-1.0,), (0.0,), (1.0,))
+SD = 0.5
+NUM_DRAWS = 4_000
+BEYOND = 8.0  # posterior deviations from the middle to the edge of a box prior
+RESULTS = Path(__file__).parent / "results" / "exact.csv"
+COLUMNS = [
+    "prior",
+    "dim",
+    "size",
+    "seed",
+    "kl",
+    "kl_error",
+    "kl_reverse",
+    "kl_gaussian",
+    "error_nats",
+    "effective_sample_size",
+    "trustworthy",
+    "assumptions",
+    "cpu_seconds",
+    "failure",
+]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Three trials and their exact posterior.
+
+    Attributes:
+        simulator: ``simulator(theta, action)``, theta (n, d) to x (n, size).
+        prior: Of theta.
+        action: Shape (3, 1).
+        x: Shape (3, size).
+        exact: The posterior of all three.
+    """
+
+    simulator: Callable[[Tensor, Tensor], Tensor]
+    prior: Distribution
+    action: Tensor
+    x: Tensor
+    exact: MultivariateNormal
+
+    @staticmethod
+    def draw(prior: str, dim: int, size: int, seed: int) -> Problem:
+        """Return the problem of a seed; prior is "gaussian" or "box"."""
+        with forked_generators(derive_seed(seed, "exact", dim, size)):
+            base, slope = torch.randn(2, size, dim).double() / dim**0.5
+            truth = torch.randn(1, dim).double()
+            action = torch.tensor(ACTIONS)
+
+            def simulator(theta: Tensor, action: Tensor) -> Tensor:
+                # One product for each action: in batches of any size the same numbers.
+                wide = theta.double()
+                mean = wide @ base.T + action.double() * (wide @ slope.T)
+                return mean + SD * torch.randn_like(mean)
+
+            x = simulator(truth.expand(len(action), -1), action)
+        design = torch.cat([base + a * slope for a in action.double()])
+        precision = design.T @ design / SD**2
+        if prior == "gaussian":
+            precision = precision + torch.eye(dim).double()
+        covariance = torch.linalg.inv(precision)
+        covariance = 0.5 * (covariance + covariance.T)
+        mean = covariance @ design.T @ x.flatten() / SD**2
+        exact = MultivariateNormal(mean, covariance)
+        if prior == "box":
+            reach = (BEYOND * exact.stddev).clamp_min(2.0)
+            box = BoxUniform((mean - reach).float(), (mean + reach).float())
+            return Problem(simulator, box, action, x, exact)
+        normal = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
+        return Problem(simulator, normal, action, x, exact)
+
+    def infer(self, seed: int) -> Belief:
+        """Return the belief after the trials, one update each."""
+        inference = ASBI(self.prior, show_progress_bars=False)
+        trials = list(zip(self.action, self.x, strict=True))
+        for k, (action, x) in enumerate(trials):
+            belief = inference.update(
+                x.float(),
+                action=action,
+                simulator=self.simulator,
+                seed=derive_seed(seed, k),
+            )
+        return belief
+
+    def divergence(self, belief: Belief) -> dict[str, float]:
+        """Return the Kullback-Leibler divergences in nats, by their columns."""
+        with forked_generators(0, "divergence"):
+            theta = self.exact.sample(torch.Size([NUM_DRAWS]))
+            drawn = belief.sample((NUM_DRAWS,)).double()
+        ratio = self.exact.log_prob(theta) - belief.log_prob(theta.float()).double()
+        reverse = belief.log_prob(drawn.float()).double() - self.exact.log_prob(drawn)
+        fitted = MultivariateNormal(drawn.mean(0), torch.cov(drawn.T))
+        gaussian = torch.distributions.kl_divergence(self.exact, fitted)
+        return {
+            "kl": float(ratio.mean()),
+            "kl_error": float(ratio.std()) / NUM_DRAWS**0.5,
+            "kl_reverse": float(reverse.mean()),
+            "kl_gaussian": float(gaussian),
+        }
+
+
+def row_of(prior: str, dim: int, size: int, seed: int) -> dict[str, object]:
+    """Return the row of a problem; an error becomes the row's failure."""
+    start = time.process_time()
+    row: dict[str, object] = {"prior": prior, "dim": dim, "size": size, "seed": seed}
+    problem = Problem.draw(prior, dim, size, seed)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            belief = problem.infer(seed)
+    except Exception as error:  # a crash is a result
+        return row | {"failure": f"{type(error).__name__}: {error}"[:200]}
+    seconds = time.process_time() - start
+    diagnostics = belief.diagnostics
+    broken = [name for name, a in diagnostics["assumptions"].items() if not a["holds"]]
+    figures = problem.divergence(belief) | {
+        "error_nats": diagnostics.get("error_nats", float("nan")),
+        "effective_sample_size": diagnostics["effective_sample_size"],
+    }
+    return (
+        row
+        | {name: f"{figure:.4g}" for name, figure in figures.items()}
+        | {
+            "trustworthy": diagnostics["trustworthy"],
+            "assumptions": " ".join(broken),
+            "cpu_seconds": f"{seconds:.1f}",
+        }
+    )
+
+
+def rows() -> list[dict[str, str]]:
+    """Return the rows so far."""
+    if not RESULTS.exists():
+        return []
+    with RESULTS.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def problems(prior: str, seeds: range) -> Iterator[tuple[int, int, int]]:
+    """Yield parameters, numbers and seeds; a box needs numbers for each parameter."""
+    for dim in DIMS:
+        for size in SIZES:
+            for seed in seeds:
+                if prior == "gaussian" or size >= dim:
+                    yield dim, size, seed
+
+
+def run(prior: str, seeds: range) -> None:
+    """Run the problems that have no row yet."""
+    done = {(r["prior"], int(r["dim"]), int(r["size"]), int(r["seed"])) for r in rows()}
+    is_new = not RESULTS.exists()
+    RESULTS.parent.mkdir(exist_ok=True)
+    with RESULTS.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        if is_new:
+            writer.writeheader()
+        for dim, size, seed in problems(prior, seeds):
+            if (prior, dim, size, seed) in done:
+                continue
+            row = row_of(prior, dim, size, seed)
+            writer.writerow(row)
+            file.flush()
+            print(" ".join(str(value) for value in row.values()), flush=True)
+
+
+def summary(found: list[dict[str, str]]) -> Iterator[str]:
+    """Yield the table of median and largest KL, then what the flag says of it."""
+    crashed = [row for row in found if row["failure"]]
+    ended = [row for row in found if not row["failure"]]
+    yield f"problems {len(found)}, crashes {len(crashed)}"
+    yield f"{'KL: median (largest)':<20}" + "".join(
+        f"{f'{n} numbers':>18}" for n in SIZES
+    )
+    for dim in DIMS:
+        cells = []
+        for size in SIZES:
+            at = [r for r in ended if (r["dim"], r["size"]) == (str(dim), str(size))]
+            kl = [float(row["kl"]) for row in at]
+            cells.append(f"{np.median(kl):.3f} ({max(kl):.3f})" if kl else "-")
+        yield f"{f'{dim} parameters':<20}" + "".join(f"{cell:>18}" for cell in cells)
+    for name, low, high, said in (
+        ("KL > .5", 0.5, np.inf, "False"),
+        ("KL < .1", -np.inf, 0.1, "True"),
+        ("KL between", 0.1, 0.5, "True"),
+    ):
+        among = [row for row in ended if low < float(row["kl"]) < high]
+        agree = [row for row in among if row["trustworthy"] == said]
+        yield f"{name}: trustworthy is {said} in {len(agree)} of {len(among)}"
+
+
+def main() -> None:
+    """Run what is missing and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--prior", choices=("gaussian", "box"), default="gaussian")
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+    if not arguments.summary:
+        run(arguments.prior, SEEDS)
+    found = [row for row in rows() if row["prior"] == arguments.prior]
+    print("\n".join(summary(found)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""What few simulations cost a belief, against what they do cost it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from sbi_active.inference.coordinates import PriorCoordinates
+from sbi_active.inference.histories import Histories
+from sbi_active.inference.regions import Region, whole_space
+from sbi_active.inference.regression_error import expected_error, widened
+from sbi_active.inference.surrogate import LocalRegression, Surrogate, estimate_noise
+
+DIM = 3
+PRIOR = MultivariateNormal(torch.zeros(DIM), torch.eye(DIM))
+
+
+def surrogate_of(q: int, num: int, seed: int):
+    """Return the surrogate of x = A z + e at x = 0, and the exact precision."""
+    rng = np.random.default_rng(seed)
+    coordinates = PriorCoordinates(PRIOR, np.random.default_rng(0))
+    weight = np.random.default_rng(q).standard_normal((DIM, q))
+    z = coordinates.sample_prior(num, rng)
+    x = z @ weight + rng.standard_normal((num, q))
+    pairs = rng.standard_normal((2, 100, q))
+    noise = estimate_noise(pairs[0], pairs[1], np.ones(q))
+    fit = LocalRegression.fit(whole_space(DIM), z, x, noise=noise, num_trials=1)
+    assert fit is not None
+    precision = weight @ weight.T + np.diag(coordinates._scale**2)
+    return Surrogate(coordinates, [fit]), precision
+
+
+@pytest.mark.parametrize(("q", "num"), [(4, 100), (60, 300)])
+def test_expected_error_is_the_mean_divergence(q: int, num: int):
+    expected, actual = [], []
+    for seed in range(40):
+        surrogate, precision = surrogate_of(q, num, seed)
+        rng = np.random.default_rng(1_000 + seed)
+        factor = np.linalg.cholesky(np.linalg.inv(precision))
+        draws = rng.standard_normal((2_000, DIM)) @ factor.T
+        expected.append(expected_error(surrogate, draws, rng))
+        # KL(exact || belief), the normalizer by importance sampling from the exact.
+        ratio = surrogate.log_joint(draws) + 0.5 * ((draws @ precision) * draws).sum(1)
+        top = ratio.max()
+        actual.append(np.log(np.exp(ratio - top).mean()) + top - ratio.mean())
+    error = np.std(actual) / len(actual) ** 0.5
+    assert np.mean(expected) == pytest.approx(np.mean(actual), rel=0.2, abs=3 * error)
+
+
+def histories_of(curve) -> Histories:
+    """Return histories over the prior and near the truth, and twenty numbers each."""
+    rng = np.random.default_rng(0)
+    coordinates = PriorCoordinates(PRIOR, rng)
+    weight = torch.from_numpy(rng.standard_normal((DIM, 20))).float()
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return curve(theta) @ weight + 0.3 * torch.randn(len(theta), 20)
+
+    x = curve(torch.full((1, DIM), 0.2)) @ weight
+    histories = Histories(
+        simulator, torch.zeros(1, 1), x.double().numpy(), coordinates, 0
+    )
+    histories.add(coordinates.sample_prior(400, rng), 60, is_overview=True)
+    near = coordinates.to_z(torch.full((1, DIM), 0.2))
+    histories.add(near + 0.05 * rng.standard_normal((150, DIM)), 30)
+    return histories
+
+
+@pytest.mark.parametrize("is_linear", [True, False])
+def test_simulations_from_further_off_are_taken_where_they_agree(is_linear: bool):
+    histories = histories_of(
+        (lambda t: t) if is_linear else (lambda t: torch.sin(4 * t))
+    )
+    center = histories.coordinates.to_z(torch.full((1, DIM), 0.2))[0]
+    fit = histories.regress(Region(center, 0.05 * np.eye(DIM), 3.0))
+    assert fit is not None
+    surrogate = Surrogate(histories.coordinates, [fit])
+    rng = np.random.default_rng(2)
+    draws = center + 0.02 * rng.standard_normal((1_000, DIM))
+    error = expected_error(surrogate, draws, rng)
+    wide, least = widened(histories, surrogate, error, draws, rng)
+    if is_linear:
+        assert least < 0.5 * error
+        assert len(wide.regressions[0].residual) > 300
+    else:
+        assert len(wide.regressions[0].residual) < 250
