@@ -22,6 +22,7 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rival_set import FEW_TRIALS
+from sbi_active.criticism.suspects import of_noise, of_trials
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import forked_generators
 
@@ -71,6 +72,8 @@ def find_warnings(
         *_of_trials(trials.fit, residuals, designed=designed),
         *_of_errors(residuals, residuals_after, tracing),
         *_of_evidence(tracing, detection),
+        *of_noise(detection),
+        *of_trials(tracing),
         *_of_verdict(tracing, effects, evaluation, exploratory=exploratory),
     )
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.detection import THRESHOLD
 from sbi_active.criticism.errors import log_sum_exp
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
+from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.criticism.rival_set import HOPELESS, RivalSet
 from sbi_active.criticism.unknown_scale import log_evidence
 from sbi_active.seeding import derive_seed
@@ -19,7 +19,6 @@ __all__ = ["grow", "log_prior"]
 
 Array = NDArray[Any]
 
-CATCH_ALLS = (NONE, UNEXPLAINED, SCATTER)
 BEAM = 3
 MAX_EFFECTS = 4
 #: All sets of one effect more are together this much less probable, nats.
@@ -77,7 +76,7 @@ def log_prior(names: tuple[str, ...], prior: dict[str, float]) -> float:
     In proportion to the mean of its effects' probabilities alone, :math:`p_i`. Over all
     sets of k these means add up to :math:`\binom{n-1}{k-1} \frac1k \sum_i p_i`.
     """
-    num, k = sum(name not in CATCH_ALLS for name in prior), len(names)
+    num, k = sum(name not in (NONE, *CATCH_ALLS) for name in prior), len(names)
     log_mean = log_sum_exp(np.array([prior[name] for name in names])) - np.log(k)
     return float(log_mean + np.log(k / comb(num - 1, k - 1)) - COST * (k - 1))
 

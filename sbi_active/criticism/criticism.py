@@ -15,12 +15,13 @@ from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.equivalence import equivalent_effects
 from sbi_active.criticism.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.formulas import guess
+from sbi_active.criticism.influence import unless_refuted
 from sbi_active.criticism.joint import joint_prior
 from sbi_active.criticism.next_action import choose_action
 from sbi_active.criticism.residuals import find_residuals
 from sbi_active.criticism.results import (
+    CATCH_ALLS,
     NONE,
-    SCATTER,
     UNEXPLAINED,
     Detection,
     Evaluation,
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
 __all__ = ["Criticism", "close_loop"]
 
 FEWEST_TRIALS = 4  # to leave one out
-CATCH_ALLS = (NONE, UNEXPLAINED, SCATTER)
 
 
 class Criticism:
@@ -257,7 +257,12 @@ class Criticism:
         from sbi_active.criticism.severe_tests import severe_tests
 
         tracing = self.trace()
-        simulator, prior = self.add()
+        evaluation = self.evaluate() if evaluate else None
+        tracing = unless_refuted(tracing, evaluation)
+        held_out = self._parts[1].held_out
+        if tracing.refuted and held_out is not None:
+            evaluation = evaluate_held_out(self.rivals, tracing, held_out)
+        simulator, prior = self.add(tracing.chosen)
         space = self.actions if plan else None
         after = None
         if tracing.verdict != NONE:
@@ -272,7 +277,7 @@ class Criticism:
             tracing=tracing,
             simulator=simulator,
             prior=prior,
-            evaluation=self.evaluate() if evaluate else None,
+            evaluation=evaluation,
             next_action=None if space is None else self.next_action(),
             actions=self.actions,
             digest=self.digest,

@@ -68,6 +68,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
         log_b, error = bayes_factor(others, log_evidence(rivals))
         p_value = float(chi2.sf(null.best_chi_square, freedom))
     lower = log_b - MARGIN * error
+    least, lower_p = _least_chi_square(rivals)
     return Detection(
         log_bayes_factor=log_b,
         standard_error=error,
@@ -79,7 +80,29 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
         level=level,
         null_log_evidence=first,
         null_cross_check=check,
+        least_chi_square=least,
+        lower_p_value=lower_p,
     )
+
+
+def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
+    """Return the smallest chi-square of the bare model, and how probable one is.
+
+    Errors of t noise are taken as Gaussian of its core, which are no larger.
+    """
+    noise, own = rivals.noise, rivals.model.noise
+    name = rivals.evidence().name
+    rival, sample = rivals.rivals[name], rivals.samples[name]
+    declared = own is not None and own.posterior is None and len(noise.scales) == 1
+    spare = len(rivals.measurements) - rival.dim
+    if not declared or rivals.roughness.any() or spare < 1:
+        return np.nan, 1.0
+    residual = rival.residual(sample.u, penalized=False)[0]
+    best = residual[int(np.argmin(((residual / noise.typical_sd) ** 2).sum(1)))]
+    least = float((noise.whitener(best)(best) ** 2).sum())
+    df = noise.cells[0].df
+    core = df / (df - 2) if np.isfinite(df) else 1.0
+    return least, float(chi2.cdf(core * least, spare))
 
 
 def num_determined(rivals: RivalSet) -> float:

@@ -18,7 +18,7 @@ from scipy.special import gammaln
 
 from sbi_active.criticism.measurements import Measurements
 
-__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "log_sum_exp"]
+__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "log_sum_exp", "student"]
 
 Array = NDArray[Any]
 Whitener = Callable[[Array], Array]
@@ -44,8 +44,12 @@ class ErrorModel(ABC):
         It maps (..., N) to (..., N), linearly.
         """
 
-    def regimes(self) -> list[Whitener]:
-        """Return whitening transforms under which the posterior has other widths."""
+    def regimes(self, residual: Array) -> list[Whitener]:
+        """Return whitening transforms under which the posterior has other widths.
+
+        Args:
+            residual: At a mode, shape (N,).
+        """
         return []
 
 
@@ -139,7 +143,7 @@ class NoiseGrid(ErrorModel):
                 square = np.einsum("ni,ni->n", e, e)[:, None]
                 log_p = -0.5 * square / self.scales**2 - 0.5 * num * LOG_2PI
             else:
-                log_p = _student(e[:, None] / self.scales[:, None], cell.df).sum(-1)
+                log_p = student(e[:, None] / self.scales[:, None], cell.df).sum(-1)
             log_p = log_p - num * np.log(self.scales) - cell.log_scale
             parts.append(prior + self.log_scale_prior + log_p)
         return np.stack(parts, 1)
@@ -184,7 +188,7 @@ class NoiseGrid(ErrorModel):
         return self.cells[int(np.argmax(self.log_prior))], float(self.scales[middle])
 
 
-def _student(e: Array, df: float) -> Array:
+def student(e: Array, df: float) -> Array:
     """Return log densities of t errors of unit standard deviation."""
     log_norm = gammaln(0.5 * (df + 1)) - gammaln(0.5 * df)
     log_norm -= 0.5 * np.log(np.pi * (df - 2))

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sbi_active.criticism.predictive import Prediction, predict
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evaluation, Tracing
+from sbi_active.criticism.results import CATCH_ALLS, NONE, Evaluation, Tracing
 from sbi_active.criticism.rival_set import RivalSet
 from sbi_active.criticism.trials import Trials
 
@@ -78,7 +78,7 @@ def _predictions(
     before = predict(rivals, trials)
     if tracing.verdict == NONE:
         return before, before
-    error = tracing.verdict if tracing.verdict in (UNEXPLAINED, SCATTER) else None
+    error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
     names = tracing.chosen or tracing.beside
     return before, predict(rivals, trials, names=names, error=error)
 

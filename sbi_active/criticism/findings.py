@@ -9,6 +9,7 @@ import numpy as np
 from sbi_active.criticism.headline import added, probability, with_error
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
 from sbi_active.criticism.section import Section, joined
+from sbi_active.criticism.suspects import label
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report import Report
@@ -44,7 +45,14 @@ def effects(report: Report) -> Section:
             order = found.log_evidence - null
             fit = f"{order:.1f}", f"{found.effective_sample_size:.0f}"
         inside = "yes" if name in tracing.credible_set else ""
-        cells = (name, probability(p), *inclusion, phi.strip(), *fit, inside)
+        cells = (
+            label(tracing, name),
+            probability(p),
+            *inclusion,
+            phi.strip(),
+            *fit,
+            inside,
+        )
         rows.append((-p, -order, cells))
     rows.sort(key=lambda row: row[:2])
     text = [

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
+from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED
+from sbi_active.criticism.suspects import in_words, label, verdict_clause
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report import Report
@@ -27,6 +28,7 @@ def verdict_line(report: Report) -> str:
     tracing, verdict = report.tracing, report.verdict
     p = tracing.probabilities.get(verdict)
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
+    line += verdict_clause(tracing)
     if tracing.beside:
         line += f", beside {' + '.join(tracing.beside)}"
     if report.guess is not None:
@@ -48,6 +50,7 @@ def added(report: Report) -> str:
         NONE: "nothing",
         UNEXPLAINED: (beside and f"{beside} and ") + "a residual process",
         SCATTER: "larger noise",
+        OUTLIER: f"{in_words(report.tracing)} set aside",
     }
     return words.get(report.verdict, report.verdict)
 
@@ -74,9 +77,18 @@ def summary_sentence(report: Report) -> str:
             "They scatter more than the declared noise, and no declared effect "
             "explains it."
         )
+    elif report.verdict == OUTLIER:
+        which = in_words(report.tracing).capitalize()
+        found.append(
+            f"{which} does not agree with the others: check it, and correct, withdraw "
+            "or repeat it."
+        )
     others = [n for n in report.credible_set if n != report.verdict]
     if others:
-        shares = [f"{n} ({stated(report.probabilities[n])})" for n in others]
+        shares = [
+            f"{label(report.tracing, n)} ({stated(report.probabilities[n])})"
+            for n in others
+        ]
         found.append(f"Not excluded: {', '.join(shares)}.")
     found += [
         f"{e.name}: {e.describe.rstrip('.')}."
@@ -86,8 +98,10 @@ def summary_sentence(report: Report) -> str:
     if report.evaluation is not None:
         rows = report.before_after.set_index("metric").to_dict("index")
         rmse = rows["rmse"]
+        folds = report.tracing.refuted and report.evaluation.scheme != "held out"
+        model = report.tracing.instead_of if folds else added(report)
         sentence = (
-            f"With {added(report)}, the RMSE on trials that had no part in it goes "
+            f"With {model}, the RMSE on trials that had no part in it goes "
             f"from {number(rmse['before'])} to {number(rmse['after'])}"
         )
         if rmse["interval"] is not None:

@@ -13,7 +13,7 @@ from scipy.special import gammaln
 from sbi_active.criticism.errors import log_sum_exp
 from sbi_active.criticism.rival import Rival
 
-__all__ = ["ImportanceSample", "TMixture", "importance_sample"]
+__all__ = ["ImportanceSample", "TMixture", "importance_sample", "lower_factors"]
 
 Array = NDArray[Any]
 
@@ -30,6 +30,8 @@ MISSED, LOOKS = 15.0, (0, 7)
 DEFENSIVE, OVERALL = 0.5, 0.3
 #: Inflation of a fitted covariance, so that the proposal's tails are the heavier.
 INFLATION = 1.5
+#: Smallest variance of a covariance, as a share of the largest.
+SINGULAR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,25 @@ class ImportanceSample:
     def draws(self, num: int, rng: np.random.Generator) -> Array:
         """Return equally weighted draws in u, shape (num, dim)."""
         return self.u[rng.choice(len(self.u), num, p=self.weights)]
+
+
+def lower_factors(cov: Array) -> Array:
+    """Return lower Cholesky factors of covariances, shape (..., dim, dim).
+
+    One that is singular in floating point, as where a few trials are believed to many
+    digits, has its smallest variances raised to 1e-12 of the largest.
+    """
+    try:
+        return np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        pass
+    safe = np.where(np.isfinite(cov).all((-1, -2), keepdims=True), cov, 0.0)
+    values, vectors = np.linalg.eigh(0.5 * (safe + np.swapaxes(safe, -1, -2)))
+    least = np.maximum(SINGULAR * values[..., -1:], SINGULAR**2)
+    root = vectors * np.sqrt(np.maximum(values, least))[..., None, :]
+    upper = np.linalg.qr(np.swapaxes(root, -1, -2), mode="r")
+    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return np.swapaxes(upper * sign[..., None], -1, -2)
 
 
 def importance_sample(
@@ -192,6 +213,6 @@ def _adapted(sample: ImportanceSample, proposal: TMixture) -> TMixture:
         cov = (sample.weights[:, None] * apart).T @ apart
         cov += 1e-10 * np.diag(np.diag(cov) + 1e-12)
         means = np.concatenate([means, mean[None]])
-        factors = np.concatenate([factors, np.linalg.cholesky(cov)[None]])
+        factors = np.concatenate([factors, lower_factors(cov)[None]])
         weights = np.append((1 - OVERALL) * weights, OVERALL)
     return TMixture(means, factors, weights)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.errors import Whitener
-from sbi_active.criticism.importance import INFLATION, TMixture
+from sbi_active.criticism.importance import INFLATION, TMixture, lower_factors
 from sbi_active.criticism.rival import Rival
 from sbi_active.seeding import derive_seed
 
@@ -148,7 +148,7 @@ def find_modes(
     at = _distinct(u[cost - cost[0] < NEGLIGIBLE], SAME_MODE)[:MAX_MODES]
     # Never wider than the prior: a flat direction has its variance.
     means, factors = [at], [_factors(rival, at, whiten, step, 1.0)]
-    for other in rival.error.regimes():
+    for other in rival.error.regimes(rival.residual(at[:1])[0][0]):
         own, _ = _descend(rival, at[:1], other, step, LATE, secant=True)
         means.append(own)
         factors.append(_factors(rival, own, other, step, 1.0))
@@ -188,7 +188,7 @@ def along_ridges(
     target = rival.log_prior(u) + rival.log_likelihood(u)
     if not np.isfinite(target.max()):
         return modes.proposal
-    u = u[target > target.max() - NEGLIGIBLE / 2]
+    u = u[target >= target.max() - NEGLIGIBLE / 2]
     _, jac = rival.jacobian(modes.u[:1], modes.whiten, step)
     known = np.linalg.svd(jac[0] / np.sqrt(_floor(rival)), compute_uv=False) > 1
     num_open = max(int(rival.searched.sum() - known.sum()), 1)
@@ -217,7 +217,7 @@ def _factors(
     precision[:, fixed] = 0.0
     precision[:, :, fixed] = 0.0
     precision = precision + np.diag(fixed.astype(float))
-    return np.linalg.cholesky(np.linalg.inv(precision) * INFLATION)
+    return lower_factors(np.linalg.inv(precision) * INFLATION)
 
 
 def _which_distinct(u: Array, apart: float) -> list[int]:

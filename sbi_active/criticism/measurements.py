@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -98,6 +98,22 @@ class Measurements:
             np.asarray(np.isfinite(x.reshape(num, -1)).any(1)),
             x.shape,
         )
+
+    def bounded(self, center: Array, reach: Array) -> Measurements:
+        """Return the same with numbers that are beyond all reason within a reach.
+
+        What is so far off is wrong whatever its digits are, and in double precision its
+        residual would hold nothing of the simulator any more. Where most trials are, it
+        is the model that is elsewhere, and nothing is changed.
+
+        Args:
+            center: Of what can be expected, shape (N,).
+            reach: How far numbers may be from it, shape (N,).
+        """
+        x = np.clip(self.x, center - reach, center + reach)
+        beyond = np.unique(self.trial[x != self.x])
+        few = 0 < len(beyond) <= self.valid.sum() / 2
+        return replace(self, x=x) if few else self
 
     def __len__(self) -> int:
         return len(self.x)

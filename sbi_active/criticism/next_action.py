@@ -19,7 +19,7 @@ from sbi_active.criticism.candidates import (
 )
 from sbi_active.criticism.outside import outside_candidates
 from sbi_active.criticism.predictive import predict
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, NextAction, Tracing
+from sbi_active.criticism.results import CATCH_ALLS, NextAction, Tracing
 from sbi_active.criticism.rival_set import RivalSet
 from sbi_active.design import Design
 from sbi_active.designer import InformationGainDesigner
@@ -99,7 +99,7 @@ class PredictedRival:
             self.rivals,
             self._trials,
             names=tuple(n for n in parts if n in self.rivals.effects),
-            error=self.name if self.name in (UNEXPLAINED, SCATTER) else None,
+            error=self.name if self.name in CATCH_ALLS else None,
             num_draws=num_samples,
             seed=seed,
             scored=False,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.errors import LOG_2PI, NoiseCell, NoiseGrid, log_sum_exp
 from sbi_active.criticism.noise_grid import declared_noise
 from sbi_active.criticism.outcomes import log_outcomes
+from sbi_active.criticism.outliers import OneOutlier
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.rival import Rival
 from sbi_active.criticism.rival_set import RivalSet
@@ -79,7 +80,7 @@ def predict(
         trials: Trials to predict, taken as unseen; None takes those that were fitted,
             with the residual process of "unexplained" conditioned on them.
         names: Effects of the rival.
-        error: None, "unexplained" or "scatter".
+        error: None, "unexplained", "scatter" or "outlier".
         num_draws: From the posterior, n.
         seed: Of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
@@ -160,9 +161,8 @@ def _drawn_cells(
     """Return a cell and a scale of the noise for each draw, given its residual."""
     grid = rival.error
     if not isinstance(grid, NoiseGrid):
-        assert isinstance(grid, ResidualProcess)
-        cells, scales = grid.noise_posterior(residual, rng)
-        return cells, scales
+        assert isinstance(grid, ResidualProcess | OneOutlier)
+        return grid.noise_posterior(residual, rng)
     joint = grid.joint(residual)
     flat = joint.reshape(len(residual), -1)
     gumbel = rng.gumbel(size=flat.shape)  # the maximum is a draw from softmax

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.criticism.errors import log_sum_exp
-from sbi_active.criticism.importance import LOOKS, MISSED, ImportanceSample, TMixture
+from sbi_active.criticism.importance import (
+    LOOKS,
+    MISSED,
+    ImportanceSample,
+    TMixture,
+    lower_factors,
+)
 from sbi_active.criticism.least_squares import Modes, along_ridges
 from sbi_active.criticism.rival import Rival
 from sbi_active.criticism.roughness import quadratic
@@ -93,7 +99,7 @@ def _by_regression(
     weight = _tempered(target, min(PER_COEFFICIENT * num, 0.5 * len(u)))
     mean = weight @ u
     cov = ((u - mean) * weight[:, None]).T @ (u - mean) + 1e-12 * np.eye(dim)
-    whiten = np.linalg.inv(np.linalg.cholesky(cov)).T
+    whiten = np.linalg.inv(lower_factors(cov)).T
     root = np.sqrt(weight)[:, None]
     residual = rival.residual(u)[0]
     rows = quadratic((u - mean) @ whiten)
@@ -108,7 +114,7 @@ def _by_regression(
         log_p[has] += POWER * rival.error.log_likelihood(quadratic(z[has]) @ fit)
         return log_p
 
-    proposal = TMixture(mean[None], np.linalg.cholesky(cov)[None])
+    proposal = TMixture(mean[None], lower_factors(cov)[None])
     for _ in range(NUM_ADAPTED):
         draws = proposal.sample(NUM_DRAWS, rng)
         log_w = log_posterior(draws) - proposal.log_prob(draws)
@@ -119,7 +125,7 @@ def _by_regression(
         cov = ((draws - center) * w[:, None]).T @ (draws - center)
         # Scott's width, of kernels whose mixture has the draws' covariance.
         width = NUM_COMPONENTS ** (-1 / (dim + 4))
-        kernel = np.linalg.cholesky(width**2 * cov + 1e-12 * np.eye(dim))
+        kernel = lower_factors(width**2 * cov + 1e-12 * np.eye(dim))
         means = draws[rng.choice(len(draws), NUM_COMPONENTS, p=w)]
         proposal = TMixture(means, np.repeat(kernel[None], NUM_COMPONENTS, 0))
     return proposal

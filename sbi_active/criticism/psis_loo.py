@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.errors import log_sum_exp
 from sbi_active.criticism.predictive import predict
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Tracing
+from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, Tracing
 from sbi_active.criticism.rival_set import RivalSet
 
 __all__ = ["LeaveOneOut", "leave_one_out"]
@@ -73,12 +73,12 @@ def leave_one_out(rivals: RivalSet, tracing: Tracing) -> tuple[LeaveOneOut, ...]
 
     Args:
         rivals: The models.
-        tracing: Their verdict. "unexplained" has the bare model alone.
+        tracing: Their verdict. "unexplained" and "outlier" have the bare model alone.
     """
     found = [_density(rivals)]
     if tracing.verdict == SCATTER:
         found.append(_density(rivals, error=SCATTER))
-    elif tracing.verdict not in (NONE, UNEXPLAINED):
+    elif tracing.verdict not in (NONE, UNEXPLAINED, OUTLIER):
         found.append(_density(rivals, tracing.chosen))
     return (*found,)
 
@@ -92,8 +92,8 @@ def _density(
     evidence = rivals.evidence(names, error=error)
     prediction = predict(rivals, names=names, error=error, num_draws=NUM_DRAWS)
     log_p = prediction.log_likelihood
-    efficiency = min(evidence.effective_sample_size / NUM_DRAWS, 1.0)
-    log_w, k = pareto_smoothed(log_p, relative_efficiency=efficiency)
+    efficiency = np.clip(evidence.effective_sample_size, 1.0, NUM_DRAWS) / NUM_DRAWS
+    log_w, k = pareto_smoothed(log_p, relative_efficiency=float(efficiency))
     return LeaveOneOut(
         name=evidence.name,
         density=log_sum_exp(log_w + log_p, axis=0),

@@ -91,12 +91,12 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """One of "none", "unexplained", "scatter", or effects joined by " + "."""
+        """A catch-all ("none", "unexplained", ...) or effects joined by " + "."""
         return self.tracing.verdict
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """Posterior probability by effect, "none", "unexplained" and "scatter"."""
+        """Posterior probability by effect and catch-all, "outlier" after an alarm."""
         return self.tracing.probabilities
 
     @property

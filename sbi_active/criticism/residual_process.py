@@ -35,7 +35,7 @@ from sbi_active.criticism.errors import (
 )
 from sbi_active.criticism.measurements import Measurements
 
-__all__ = ["LENGTHS", "ResidualProcess"]
+__all__ = ["LENGTHS", "ResidualProcess", "smooth_features"]
 
 Array = NDArray[Any]
 
@@ -102,7 +102,8 @@ class ResidualProcess(ErrorModel):
             units[True] = self._relative(spread, typical)
         inputs = self._inputs(action, order)
         for kind, relative in product(range(len(inputs)), units):
-            features = units[relative][:, None] * _features(measurements, inputs[kind])
+            points = _coordinates(measurements, inputs[kind], measurements.span)
+            features = units[relative][:, None] * _features(*points)
             for k, cell in enumerate(noise.cells):
                 whitened = cell.whiten(features.T).T
                 values, vectors = np.linalg.eigh(whitened.T @ whitened)
@@ -133,7 +134,7 @@ class ResidualProcess(ErrorModel):
             basis, self.amplitudes[place[1]], self.noise.scales[place[2]]
         )
 
-    def regimes(self) -> list[Whitener]:
+    def regimes(self, residual: Array) -> list[Whitener]:
         # A large process leaves the parameters wide, a small one narrow.
         cell = int(np.argmax(self.noise.log_prior))
         scale = float(np.median(self.noise.scales))
@@ -250,10 +251,20 @@ def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
     return np.exp(-0.5 * distance) * (rows[1][:, None] == columns[1][None])
 
 
-def _features(m: Measurements, place: Array) -> Array:
+def smooth_features(m: Measurements, at: Array) -> Array:
+    """Return features of a smooth function along one trial alone, shape (n, m).
+
+    Args:
+        m: The measurements of all trials.
+        at: Which of them are the trial's n, bool, shape (N,).
+    """
+    points, channel = _coordinates(m, np.zeros((m.shape[0], 0)), m.span)
+    return _features(points[at], channel[at])
+
+
+def _features(points: Array, channel: Array) -> Array:
     """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
-    points, channel = _coordinates(m, place, m.span)
-    some = np.unique(np.linspace(0, len(m) - 1, MAX_POINTS).astype(int))
+    some = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
     few = points[some], channel[some]
     values, vectors = np.linalg.eigh(_kernel(few, few))
     keep = values > NEGLIGIBLE * values.max()

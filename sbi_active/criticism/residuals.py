@@ -28,7 +28,7 @@ def find_residuals(
     Args:
         rivals: The models and their trials.
         names: Effects of the rival.
-        error: None, "unexplained" or "scatter".
+        error: None, "unexplained", "scatter" or "outlier".
     """
     trials, m = rivals.trials, rivals.measurements
     prediction = predict(rivals, names=names, error=error)

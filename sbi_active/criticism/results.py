@@ -22,8 +22,10 @@ __all__ = [
 
 Array = NDArray[Any]
 
-#: What is no effect: the bare model, the residual process, and noise inflation.
-NONE, UNEXPLAINED, SCATTER = "none", "unexplained", "scatter"
+#: What is no effect: the bare model, the residual process, noise inflation, and a gross
+#: error of one trial.
+NONE, UNEXPLAINED, SCATTER, OUTLIER = "none", "unexplained", "scatter", "outlier"
+CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +72,7 @@ class Evidence:
     r"""Marginal likelihood of one model, :math:`\log Z = \log \int p(x|z) p(z) dz`.
 
     Attributes:
-        name: "none", effects joined by " + ", "unexplained" or "scatter".
+        name: "none", effects joined by " + ", "unexplained", "scatter" or "outlier".
         log_evidence: log Z, nats.
         standard_error: Of log Z, Monte Carlo, nats.
         effective_sample_size: Of the importance weights; the particles' number for
@@ -109,6 +111,10 @@ class Detection:
         level: Below which it is an alarm; 0 where something is unknown of the noise.
         null_log_evidence: By least squares, nats.
         null_cross_check: The same by tempering; None where no alarm was near.
+        least_chi_square: The smallest of any parameters that were tried; NaN where the
+            size of the noise is not declared.
+        lower_p_value: Probability of one as small, all parameters taken as determined;
+            1 where the size of the noise is not declared.
     """
 
     log_bayes_factor: float
@@ -121,6 +127,8 @@ class Detection:
     level: float
     null_log_evidence: float
     null_cross_check: float | None
+    least_chi_square: float = float("nan")
+    lower_p_value: float = 1.0
 
     @property
     def alarm(self) -> bool:
@@ -184,10 +192,11 @@ class Tracing:
     """Which effect the data point to.
 
     Attributes:
-        verdict: "none", "unexplained", "scatter", or effects joined by " + ".
-        chosen: Names of the effects of the verdict; empty for the other three.
-        probabilities: Posterior probability by "none", "unexplained", "scatter",
-            effect, and sets of effects that were tried (names joined by " + ").
+        verdict: "none", "unexplained", "scatter", "outlier", or effects joined by
+            " + ".
+        chosen: Names of the effects of the verdict; empty for the other four.
+        probabilities: Posterior probability by "none", "unexplained", "scatter", after
+            an alarm "outlier", effect, and sets of effects that were tried (names joined by " + ").
         inclusion: Probability that an effect belongs to the model, by effect.
         credible_set: Smallest set of names with at least 90 % of the probability, most
             probable first.
@@ -207,6 +216,15 @@ class Tracing:
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
             taking the rest; empty where it takes all, and for any other verdict.
+        outliers: Probability that each trial is the one, if one has a gross error, by
+            its index, most probable first; empty without an alarm.
+        needed: Indices of the trials without any one of which the data do not point to
+            the effects that explain them best.
+        instead_of: Effects that the evidence is for and the verdict does not name,
+            since a trial that may have a gross error alone speaks for them, or further
+            trials speak against them; "" for none.
+        refuted: The RMSE of these further trials before and after, which is why;
+            None where it is not.
     """
 
     verdict: str
@@ -223,6 +241,10 @@ class Tracing:
     coarsening: float = 1.0
     guesses: tuple[tuple[str, float], ...] = ()
     beside: tuple[str, ...] = ()
+    outliers: dict[float, float] = field(default_factory=dict)
+    needed: tuple[float, ...] = ()
+    instead_of: str = ""
+    refuted: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

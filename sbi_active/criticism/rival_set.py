@@ -22,12 +22,14 @@ from sbi_active.criticism.importance import (
 from sbi_active.criticism.least_squares import ROUGH, THOROUGH, find_modes
 from sbi_active.criticism.noise_grid import declared_noise, scattered
 from sbi_active.criticism.outcomes import DISAGREEMENT, UNKNOWN_RATES
+from sbi_active.criticism.outliers import OneOutlier
 from sbi_active.criticism.proposals import regressions, ridges
 from sbi_active.criticism.residual_process import ResidualProcess
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
 from sbi_active.criticism.rival import Rival
 from sbi_active.criticism.roughness import look_for_jumps
 from sbi_active.criticism.scales import SearchCoordinates
+from sbi_active.criticism.starts import starts_near_parents
 from sbi_active.criticism.tempering import temper
 from sbi_active.criticism.trial_simulator import TrialSimulator
 from sbi_active.criticism.trials import Trials
@@ -59,10 +61,10 @@ BEHIND = 5.0
 #: jumps, would have to do better.
 ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
 NUM_SPREAD = 200
+#: Deviations of the prior predictive beyond which a number counts as that far.
+FARTHEST = 1e3
 #: Draws of largest weight, among which the best fit is sought.
 NUM_TOP = 20
-#: Searches that start at posteriors of smaller rivals.
-NUM_NEAR = 8
 
 
 class RivalSet:
@@ -120,6 +122,9 @@ class RivalSet:
         )
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
+        reach = FARTHEST * np.hypot(self.spread, self.noise.typical_sd)
+        self.measurements = self.measurements.bounded(self.center, reach)
+        self.simulator.measurements = self.measurements
         self.can_fail = not trials.valid.all() or self.simulator.failed
         self.step, self.is_smooth, self.roughness = look_for_jumps(
             self.rival(()), seed=seed
@@ -135,15 +140,8 @@ class RivalSet:
 
         Args:
             names: Of the effects.
-            error: None for the noise alone, "unexplained" or "scatter".
+            error: None for the noise alone, "unexplained", "scatter" or "outlier".
         """
-        own = {None: self.noise, UNEXPLAINED: None, SCATTER: None}
-        model: ErrorModel | None = own[error]
-        if error == SCATTER:
-            model = scattered(self.noise)
-        elif error == UNEXPLAINED:
-            model = self.residual_process()
-        assert model is not None
         parts = [*names, *([] if error is None else [error])]
         return Rival(
             " + ".join(parts) or NONE,
@@ -151,7 +149,7 @@ class RivalSet:
             prior=self.prior,
             effects=[self.effects[name] for name in names],
             nuisances=self.nuisances,
-            error=model,
+            error=self._error_model(error),
             spread=self.spread,
             center=self.center,
             disagreement=(
@@ -160,6 +158,22 @@ class RivalSet:
                 else (DISAGREEMENT,)
             ),
         )
+
+    def _error_model(self, error: str | None) -> ErrorModel:
+        if error == SCATTER:
+            return scattered(self.noise)
+        if error == UNEXPLAINED:
+            return self.residual_process()
+        return self.noise if error is None else self.one_outlier()
+
+    def one_outlier(self) -> OneOutlier:
+        """Return the noise with a gross error in one trial."""
+        if not hasattr(self, "_outlier"):
+            off = np.abs(self.measurements.x - self.center) / self.noise.typical_sd
+            self._outlier = OneOutlier(
+                self.noise, self.measurements, largest=float(off.max())
+            )
+        return self._outlier
 
     @property
     def has_known_noise(self) -> bool:
@@ -249,7 +263,7 @@ class RivalSet:
         return other
 
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
-        near = self._starts(rival, seed)
+        near = starts_near_parents(self.rivals, self.samples, rival, seed)
         search = THOROUGH if self.is_smooth else ROUGH
         modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
         rng = np.random.default_rng(seed)
@@ -302,32 +316,6 @@ class RivalSet:
         """Return the largest log evidence so far."""
         known = [e.log_evidence for e in self.evidences.values()]
         return float(max([*known, self.reference]))
-
-    def _starts(self, rival: Rival, seed: int) -> Array | None:
-        """Return points at posteriors of smaller rivals, the rest from the prior.
-
-        Those with one effect less are the parents; without effects, or behind a
-        catch-all, it is the bare model.
-        """
-        names = [e.name for e in rival.effects]
-        parents = [[n for n in names if n != left] for left in names] or [[]]
-        known = [p for p in parents if (" + ".join(p) or NONE) in self.rivals]
-        if not known or rival.name == NONE:
-            return None
-        rng = np.random.default_rng(seed)
-        parts = []
-        for own in known:
-            parent = self.rivals[" + ".join(own) or NONE]
-            each = max(NUM_NEAR // len(known), 1)
-            drawn = parent.coordinates.to_z(self.samples[parent.name].draws(each, rng))
-            z = rival.coordinates.to_z(rival.coordinates.sample(each, seed=seed))
-            shared, theta_dim = parent.columns(), parent.theta_dim
-            z[:, :theta_dim] = drawn[:, :theta_dim]
-            for name, place in rival.columns().items():
-                if name in shared:
-                    z[:, place] = drawn[:, shared[name]]
-            parts.append(rival.coordinates.from_z(z))
-        return np.concatenate(parts)
 
     def _keep(
         self,

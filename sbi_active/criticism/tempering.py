@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.errors import log_sum_exp
-from sbi_active.criticism.importance import ImportanceSample
+from sbi_active.criticism.importance import ImportanceSample, lower_factors
 from sbi_active.criticism.rival import Rival
 
 __all__ = ["temper"]
@@ -64,7 +64,7 @@ def temper(
         variance += max(len(u) * (w**2).sum() - 1, 0.0) / len(u)
         mean = w @ u
         cov = (w[:, None] * (u - mean)).T @ (u - mean)
-        factor = np.linalg.cholesky(cov + 1e-16 * np.eye(rival.dim))
+        factor = lower_factors(cov + 1e-16 * np.eye(rival.dim))
         ladder = (rng.uniform() + np.arange(num_particles)) / num_particles
         which = np.minimum(np.searchsorted(np.cumsum(w), ladder), len(w) - 1)
         u, log_l, b = u[which], log_l[which], b + step

@@ -16,9 +16,17 @@ from sbi_active.criticism.detection import REFUTED, THRESHOLD, alternatives
 from sbi_active.criticism.effects import Effect
 from sbi_active.criticism.equivalence import equivalent_effects
 from sbi_active.criticism.errors import log_sum_exp
+from sbi_active.criticism.influence import (
+    is_left_to_chance,
+    needed_trials,
+    withdrawn,
+)
 from sbi_active.criticism.near_aliases import near_aliases
+from sbi_active.criticism.outliers import gross_errors
 from sbi_active.criticism.results import (
+    CATCH_ALLS,
     NONE,
+    OUTLIER,
     SCATTER,
     UNEXPLAINED,
     Detection,
@@ -41,19 +49,25 @@ MASS = 0.9  # of the credible set
 RESCALED = (1 / 3, 3.0)
 
 
-def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
+def log_priors(
+    effects: Sequence[Effect], catch_alls: Sequence[str] = CATCH_ALLS
+) -> dict[str, float]:
     """Return log prior probabilities of none, each effect and the catch-alls.
 
-    Half is "none". Of the rest "unexplained" and "scatter" have a tenth each, and
-    the families share what is left equally.
+    Half is "none". Of the rest the catch-alls have a tenth each, and the families
+    share what is left equally.
+
+    Args:
+        effects: The declared ones.
+        catch_alls: Those that are compared.
     """
     members: dict[str, list[str]] = {}
     for effect in effects:
         members.setdefault(str(effect.family), []).append(effect.name)
     missing = 1 - PROBABILITY_OF_NONE
     each = missing * PROBABILITY_OF_CATCH_ALL
-    found = {NONE: PROBABILITY_OF_NONE, UNEXPLAINED: each, SCATTER: each}
-    share = (missing - 2 * each) / max(len(members), 1)
+    found = {NONE: PROBABILITY_OF_NONE} | dict.fromkeys(catch_alls, each)
+    share = (missing - len(catch_alls) * each) / max(len(members), 1)
     for names in members.values():
         found |= {name: share / len(names) for name in names}
     return {name: float(np.log(p)) for name, p in found.items()}
@@ -75,7 +89,8 @@ def trace(
     one of: declared effects, "unexplained", "scatter", each with all of its
     probability; then, of the effects, the most probable. Where known noise refutes
     that (its chi-square has p < .001), the residual process is tried beside it: then
-    "unexplained" is the process alone or with these effects, half and half.
+    "unexplained" is the process alone or with these effects, half and half. Effects
+    that rest on one trial are named only if that trial has hardly a gross error.
 
     Args:
         rivals: The models.
@@ -84,12 +99,11 @@ def trace(
         actions: The permitted ones, for what they hardly separate.
         compare: Whether to look for effects that these trials do not separate.
     """
-    prior = log_priors([*rivals.effects.values()])
-    log_z = {
-        NONE: rivals.evidence().log_evidence,
-        UNEXPLAINED: rivals.evidence(error=UNEXPLAINED).log_evidence,
-        SCATTER: rivals.evidence(error=SCATTER).log_evidence,
-    }
+    # Without an alarm there is no trial to set aside.
+    catch_alls = CATCH_ALLS if detection.alarm else (UNEXPLAINED, SCATTER)
+    prior = log_priors([*rivals.effects.values()], catch_alls)
+    log_z = {NONE: rivals.evidence().log_evidence}
+    log_z |= {e: rivals.evidence(error=e).log_evidence for e in catch_alls}
     log_z |= {name: log_evidence(rivals, (name,))[0] for name in rivals.effects}
     log_prior, share = {**prior}, 1.0
     if detection.alarm:
@@ -122,7 +136,7 @@ def trace(
         name: sum(p for k, p in probabilities.items() if name in k.split(" + "))
         for name in rivals.effects
     }
-    return Tracing(
+    tracing = Tracing(
         verdict=verdict,
         chosen=chosen,
         probabilities=probabilities,
@@ -138,7 +152,10 @@ def trace(
         ),
         coarsening=share,
         beside=beside,
+        outliers=gross_errors(rivals) if OUTLIER in log_p else {},
+        needed=needed_trials(rivals, chosen) if chosen else (),
     )
+    return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 
 
 def _normalized(log_p: dict[str, float]) -> dict[str, float]:
@@ -162,7 +179,7 @@ def _verdict(
     """
     if not alarm:
         return NONE
-    catch_alls = {name: probabilities[name] for name in (UNEXPLAINED, SCATTER)}
+    catch_alls = {n: p for n, p in probabilities.items() if n in CATCH_ALLS}
     declared = 1.0 - probabilities[NONE] - sum(catch_alls.values())
     best = max(catch_alls, key=catch_alls.__getitem__)
     if catch_alls[best] > declared:
@@ -251,4 +268,4 @@ def _under_unknown_scale(rivals: RivalSet, name: str) -> Evidence:
 
 
 def _effects_of(name: str) -> tuple[str, ...]:
-    return () if name in (NONE, UNEXPLAINED, SCATTER) else (*name.split(" + "),)
+    return () if name in (NONE, *CATCH_ALLS) else (*name.split(" + "),)

@@ -15,7 +15,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.augmented import AugmentedSimulator, takes_times
 from sbi_active.criticism.declarations import require_distinct, require_nested
 from sbi_active.criticism.effects import Effect
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
+from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.criticism.trials import Trials
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
@@ -82,7 +82,7 @@ def require_fitting(
     default = [f"theta_{i + 1}" for i in range(prior.event_shape[0])]
     require_distinct(effects, default if own is None else own)
     require_nested(effects)
-    reserved = (NONE, UNEXPLAINED, SCATTER)
+    reserved = (NONE, *CATCH_ALLS)
     taken = [e.name for e in effects if e.name in reserved]
     if taken:
         raise ValueError(

@@ -1,0 +1,290 @@
+"""A trial with a gross error is named and stands for no effect."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy.stats import norm
+from torch.distributions import Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
+from sbi_active.criticism import Criticism, Effect, Trials, close_loop
+from sbi_active.criticism.errors import NoiseCell, NoiseGrid
+from sbi_active.criticism.importance import lower_factors
+from sbi_active.criticism.influence import is_left_to_chance, unless_refuted, withdrawn
+from sbi_active.criticism.measurements import Measurements
+from sbi_active.criticism.outliers import OneOutlier
+from sbi_active.criticism.rival_set import RivalSet
+from sbi_active.criticism.suspects import of_noise, of_trials, suspects, verdict_clause
+from tests.criticism.reports import evaluation, flat, report, tracing
+
+PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
+ACTIONS = DiscreteActions(torch.arange(-5, 5.5, 0.5))
+XI = torch.tensor([-2.5, 1.0, -0.5, 3.0, 4.5, -1.5, 2.0, 0.5])
+
+
+def response(theta, action, quadratic=0.0):
+    xi = action[:, 0]
+    x = theta[:, 0] * torch.exp(3 - xi) + theta[:, 1] * xi + quadratic * xi**2
+    return x[:, None]
+
+
+MODEL = SimulatorModel(response, noise=GaussianNoise(1.0))
+QUADRATIC = Effect.keyword(
+    "quadratic",
+    prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+)
+
+
+def measured(xi=XI, *, quadratic=0.0, seed=0):
+    gen = torch.Generator().manual_seed(seed)
+    theta = torch.tensor([[1.5, -2.0]]).expand(len(xi), -1)
+    x = response(theta, xi[:, None], quadratic)
+    return x + torch.randn(x.shape, generator=gen)
+
+
+def criticism(x, *, xi=XI, model=MODEL, **options):
+    trials = Trials(xi, x, **options)
+    return Criticism(model, PRIOR, trials, effects=[QUADRATIC], actions=ACTIONS)
+
+
+def gaussian(measurements, sd=1.0):
+    cell = NoiseCell.of(measurements, sd=np.full(len(measurements), sd))
+    return NoiseGrid([cell])
+
+
+def test_the_density_is_a_mixture_over_trials_and_sizes():
+    m = Measurements.of(Trials(torch.arange(3.0), torch.zeros(3, 1)))
+    error = OneOutlier(gaussian(m, 0.5), m, largest=2_000.0)
+    r = np.array([[0.2, -7.0, 0.4]])
+    sizes = 3.0 ** np.arange(1, 8)
+    share = 6 / np.pi**2 / np.arange(1, 8) ** 2
+    expected = 0.0
+    for k in range(3):
+        others = np.prod([norm.pdf(r[0, j], scale=0.5) for j in range(3) if j != k])
+        wide = (share * norm.pdf(r[0, k], scale=0.5 * sizes)).sum()
+        expected += others * wide / 3
+    assert np.allclose(error.sizes, sizes)
+    assert error.log_likelihood(r)[0] == pytest.approx(np.log(expected))
+    assert error.responsibility(r)[0].argmax() == 1
+
+
+def test_the_density_along_trajectories_is_a_gaussian_mixture():
+    times = torch.linspace(0, 1, 4)
+    trials = Trials(torch.arange(2.0), torch.zeros(2, 4), sample_times=times)
+    m = Measurements.of(trials)
+    cell = NoiseCell.of(m, sd=np.full(8, 0.3), correlation_time=0.4)
+    error = OneOutlier(NoiseGrid([cell]), m, largest=1.0)
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(20, 8))
+    # The two trials share the error equally, whatever their numbers.
+    swapped = np.concatenate([draws[:, 4:], draws[:, :4]], 1)
+    assert np.allclose(error.log_likelihood(draws), error.log_likelihood(swapped))
+    one = np.array([[3.0, 3.0, 3.0, 3.0, 0, 0, 0, 0]])
+    assert error.responsibility(one)[0, 0] > 0.99
+
+
+@pytest.mark.parametrize("noise", [GaussianNoise(0.3), StudentTNoise(0.3, 4.0)])
+def test_all_trials_but_one_have_the_noise_alone(noise):
+    model = SimulatorModel(response, noise=noise)
+    rivals = RivalSet(model, PRIOR, Trials(XI, measured()), [])
+    r = np.random.default_rng(0).normal(size=(5, 8))
+    without = rivals.one_outlier().without_each(r)
+    for k in range(8):
+        rest = [j for j in range(8) if j != k]
+        cells = [
+            NoiseCell(c.log_weight, c.sd[rest], c.rho[rest], c.df)
+            for c in rivals.noise.cells
+        ]
+        expected = NoiseGrid(cells).log_likelihood(r[:, rest])
+        assert np.allclose(without[:, k], expected)
+
+
+@pytest.mark.parametrize("size", [8.0, -20.0])
+def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
+    x = measured()
+    x[7] += size
+    index = torch.arange(8) + 11
+    loop = criticism(x, index=index)
+    found = loop.trace()
+    assert found.verdict == "outlier"
+    assert found.chosen == ()
+    assert suspects(found) == (18.0,)
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    made = loop.report(evaluate=False, plan=False)
+    assert str(made).startswith("Verdict: outlier (P ")
+    assert "trial 18" in str(made).splitlines()[0]
+    assert "outlier: trial 18" in flat(made)
+    assert any("check its record" in warning for warning in made.warnings)
+    assert made.simulator is loop.model
+    theta = made.parameters.set_index("parameter")["after"]
+    assert abs(theta["theta_2"] + 2.0) < 0.6  # without the trial
+
+
+def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process():
+    times = torch.linspace(0.1, 1, 12)
+
+    def path(theta, action):
+        return theta[:, :1] * action * times + theta[:, 1:] * times**2
+
+    model = SimulatorModel(path, noise=GaussianNoise(0.05), sample_times=times)
+    gen = torch.Generator().manual_seed(0)
+    xi = torch.linspace(-2, 2, 8)
+    x = path(torch.tensor([[1.0, 2.0]]).expand(8, -1), xi[:, None])
+    x = x + 0.05 * torch.randn(x.shape, generator=gen)
+    x[5] = x[5] / 100  # metres for centimetres
+    trials = Trials(xi, x, sample_times=times)
+    found = Criticism(model, PRIOR, trials).trace()
+    assert found.verdict == "outlier"
+    assert suspects(found) == (5.0,)
+
+
+@pytest.mark.parametrize("wrong", [1e15, -1e30, "unit"])
+def test_what_nothing_explains_ends_no_loop(wrong):
+    x = measured()
+    x[2] = 100 * x[2] if wrong == "unit" else wrong
+    trials = Trials(XI, x)
+    made = close_loop(
+        MODEL, PRIOR, trials, effects=[QUADRATIC], actions=ACTIONS, evaluate=False
+    )
+    assert made.verdict == "outlier"
+    assert suspects(made.tracing) == (2.0,)
+
+
+def test_a_true_effect_stays_named_beside_the_outlier():
+    xi = XI.clone()
+    xi[1] = 4.0
+    found = criticism(measured(xi, quadratic=3.0), xi=xi).trace()
+    assert found.verdict == "quadratic"
+    assert found.needed == ()
+    assert found.probabilities["outlier"] < 1e-3
+
+
+def test_an_effect_for_which_one_doubtful_trial_speaks_is_not_named():
+    xi = torch.tensor([-2.0, -1.0, -1.5, 0.5, -0.5, 0.2, -1.0, 5.0])
+    xi[4], xi[5] = 2.0, 2.5
+    x = measured(xi, seed=3)
+    x[7] += 9.0
+    loop = criticism(x, xi=xi)
+    found = loop.trace()
+    assert found.verdict == "outlier"
+    assert suspects(found) == (7.0,)
+    assert 7.0 in found.needed or not found.instead_of
+
+
+def test_without_an_alarm_no_trial_is_suspected():
+    found = criticism(measured()).trace()
+    assert found.verdict == "none"
+    assert found.outliers == {}
+    assert "outlier" not in found.probabilities
+
+
+def test_noise_declared_too_large_is_said():
+    x = measured()
+    large = SimulatorModel(response, noise=GaussianNoise(100.0))
+    detection = criticism(x, model=large).detect()
+    assert detection.lower_p_value < 1e-4
+    (sentence,) = of_noise(detection)
+    assert "far smaller than the declared noise allows" in sentence
+    assert "declare the error of the measurement" in sentence
+    right = criticism(x).detect()
+    assert right.lower_p_value > 0.01
+    assert [*of_noise(right)] == []
+    assert sentence in report(detection=detection).warnings
+
+
+def test_large_t_noise_and_trajectories_are_looked_at_as_well():
+    student = SimulatorModel(response, noise=StudentTNoise(100.0, 4.0))
+    assert criticism(measured(), model=student).detect().lower_p_value < 1e-4
+    times = torch.linspace(0, 1, 12)
+    noise = GaussianNoise(10.0)
+    line = SimulatorModel(
+        lambda theta, xi: theta[:, :1] * times, noise=noise, sample_times=times
+    )
+    prior = BoxUniform(-torch.ones(1), torch.ones(1))
+    x = 0.5 * times + 0.1 * torch.randn(4, 12, generator=torch.manual_seed(0))
+    trials = Trials(torch.arange(4.0), x, sample_times=times)
+    assert Criticism(line, prior, trials).detect().lower_p_value < 1e-4
+
+
+def doubtful(**changes):
+    made = tracing(**{"outliers": {3.0: 0.95, 1.0: 0.05}, "needed": (3.0,)} | changes)
+    odds = {"drag": 0.7, "tilt": 0.1, "bias": 0.05, "outlier": 0.1}
+    return replace(made, probabilities=made.probabilities | odds)
+
+
+def test_a_verdict_is_left_to_chance_by_the_suspect_alone():
+    assert is_left_to_chance(doubtful())
+    assert not is_left_to_chance(doubtful(needed=()))
+    assert not is_left_to_chance(doubtful(needed=(1.0,)))
+    certain = doubtful()
+    rare = certain.probabilities | {"outlier": 1e-4}
+    assert not is_left_to_chance(replace(certain, probabilities=rare))
+
+
+def test_what_is_withdrawn_is_said():
+    made = withdrawn(doubtful())
+    assert (made.verdict, made.chosen, made.instead_of) == ("outlier", (), "drag")
+    clause = ": trial 3, and not drag, which rests on trial 3 alone"
+    assert verdict_clause(made) == clause
+    check, instead = of_trials(made)
+    assert "trial 3 does not agree with the others" in check
+    assert "repeat its action before adding it" in instead
+
+
+def test_a_verdict_that_rests_on_one_trial_says_so():
+    one = tracing(needed=(3.0,))
+    line = str(report(tracing=one)).splitlines()[0]
+    assert line.startswith("Verdict: drag (P = 0.81), rests on trial 3 alone")
+    (sentence,) = of_trials(one)
+    assert "without it the Bayes factor against the bare model is below 20" in sentence
+    three = tracing(needed=(0.0, 3.0, 7.0))
+    assert verdict_clause(three) == ", falls without any one of trials 0, 3 and 7"
+
+
+def test_effects_that_further_trials_refute_are_withdrawn():
+    good = evaluation()
+    assert unless_refuted(tracing(), good).verdict == "drag"
+    assert unless_refuted(tracing(), None).verdict == "drag"
+    table = good.table.copy()
+    table.loc[table["metric"] == "rmse", ["before", "after", "ratio"]] = 1.1, 8.0, 7.3
+    bad = replace(good, before=good.after, after=good.before, table=table)
+    made = unless_refuted(tracing(), bad)
+    assert (made.verdict, made.instead_of) == ("unexplained", "drag")
+    assert made.refuted == (1.1, 8.0)
+    assert "RMSE 1.1 before and 8 after" in [*of_trials(made)][0]
+
+
+def test_held_out_trials_refute_an_alias():
+    xi = torch.tensor([-2.5, -0.5, 1.0, 0.5, -1.5, 2.0, 4.5, 5.0])
+    x = measured(xi)
+    x[6:] += torch.tensor([[20.0], [25.0]])  # twice the same slip
+    further = torch.arange(-1.5, 5.5, 0.75)
+    both = torch.cat([x, measured(further, seed=5)])
+    role = ["fit"] * 8 + ["held out"] * len(further)
+    loop = criticism(both, xi=torch.cat([xi, further]), role=role)
+    named = loop.trace()
+    assert named.verdict == "quadratic"
+    made = loop.report(plan=False)
+    assert made.verdict in ("unexplained", "outlier")
+    assert made.tracing.instead_of == "quadratic"
+    assert made.simulator is loop.model
+
+
+def test_a_few_numbers_beyond_reason_count_as_a_reach():
+    m = Measurements.of(Trials(torch.arange(4.0), torch.tensor([0.0, 1e15, 2.0, 3.0])))
+    center, reach = np.zeros(4), np.full(4, 1e3)
+    assert m.bounded(center, reach).x.tolist() == [0.0, 1e3, 2.0, 3.0]
+    same = m.bounded(center, np.full(4, 0.5))  # most: the model is elsewhere
+    assert same is m
+
+
+def test_factors_of_singular_covariances():
+    root = np.array([[1.0, 0.0], [1e-3, 1e-12]])
+    cov = np.stack([np.eye(2), root @ root.T, np.zeros((2, 2))])
+    factors = lower_factors(cov)
+    assert np.allclose(factors @ factors.swapaxes(1, 2), cov, atol=1e-11)
+    assert (np.diagonal(factors, axis1=1, axis2=2) > 0).all()
+    assert np.allclose(np.triu(factors, 1), 0.0)
