@@ -23,7 +23,7 @@ def tail_probability(
 
     .. math::
         P\big(D(x, \theta) \ge D(x_o, \theta)\big), \quad \theta \sim b,\;
-        x \sim p(x | \theta), \quad D = |L^{-1} (x - B^\top f)|,
+        x \sim p(x | \theta), \quad D = |L^{-1} (x - B^\top f)|^2,
 
     a trial and for all trials. The simulations' x are their residuals by a fit without
     them, since reality was not fitted to either.
@@ -47,7 +47,7 @@ def tail_probability(
         # must not excuse a misfit.
         observed = _squares(error, num_trials) / np.minimum(widening, 2.0)[:, None]
         simulated = _held_out(fit, num_trials)
-        pairs = zip(simulated.T**0.5, observed.T**0.5, strict=True)
+        pairs = zip(simulated.T, observed.T, strict=True)
         beyond += [_exceedance(known, value).sum() for known, value in pairs]
         count += len(z)
     tail = (beyond / max(count, 1)).clip(RESOLUTION, 1.0)
@@ -58,20 +58,32 @@ def _exceedance(known: Array, value: Array) -> Array:
     r"""Return the probability that a further draw is as large, shape (m,).
 
     Among n draws it is a rank. Ranks end at 1 / (n + 1), so that beyond the largest k
-    the excess over a threshold is taken for exponential, of which the mean of k is
-    known: :math:`P(y) = (1 + y / (k \bar y))^{-k}`, a little large for Gaussian tails.
+    the excess y over a threshold is taken for generalized Pareto,
+
+    .. math::
+        P(y) = (1 + \xi y / \bar y)^{-1 / \xi}, \qquad
+        \xi = \tfrac12 (1 - \bar y^2 / s^2) \ge 1 / k,
+
+    of their mean and variance. The least :math:`\xi` allows for a mean of k alone,
+    exactly so where the tail is exponential.
 
     Args:
         known: Draws, shape (n,).
         value: Shape (m,).
+
+    References:
+        Hosking & Wallis, Technometrics 1987 (moments); Knijnenburg et al.,
+        Bioinformatics 2009 (tails of permutation tests).
     """
     ordered, n = np.sort(known), len(known)
     k = max(n // 10, 5)
     threshold = ordered[-k - 1]
-    mean = (ordered[-k:] - threshold).mean() + 1e-12 * (1 + threshold)
+    excess = ordered[-k:] - threshold + 1e-12 * (1 + threshold)
+    mean = excess.mean()
+    shape = max(0.5 * (1 - mean**2 / (excess.var(ddof=1) + 1e-300)), 1 / k)
+    beyond = (value - threshold).clip(0.0) / mean
+    tail = (k + 1) / (n + 1) * (1 + shape * beyond) ** (-1 / shape)
     rank = (n - np.searchsorted(ordered, value) + 1) / (n + 1)
-    excess = (value - threshold).clip(0.0) / mean
-    tail = (k + 1) / (n + 1) * (1 + excess / k) ** -k
     return np.where(value > threshold, tail, rank)
 
 
