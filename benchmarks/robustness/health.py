@@ -1,0 +1,233 @@
+r"""False alarms: campaigns whose simulator is right, by how many numbers a trial has.
+
+    python -m benchmarks.robustness.health
+    python -m benchmarks.robustness.health --summary
+    python -m benchmarks.robustness.health --campaigns 20 --numbers 50 --lost sensor
+
+Each campaign draws its parameters from the prior and three trials from the simulator
+itself, so that any alarm is false; at most 5 % may raise one. Simulators take turns:
+linear, nonlinear, noise that is correlated along the numbers. A fifth of the numbers is
+lost to the sensor, of which the simulator knows nothing (of trials of one number, a
+fifth, told as missing), or nothing is; or a fifth of the simulator's own rows end at
+half their length (those of one number have no measurement). Resumable:
+``results/health.csv`` is appended to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.stats import beta
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from sbi_active import (
+    BoxActions,
+    Campaign,
+    CampaignOptions,
+    MixtureDensity,
+    Refinement,
+)
+from sbi_active.seeding import derive_seed, forked_generators
+
+RESULTS = Path(__file__).parent / "results" / "health.csv"
+COLUMNS = [
+    "numbers", "lost", "campaign", "simulator", "health",
+    *(f"{name}_{k}" for name in ("surprise", "misfit") for k in (1, 2, 3)),
+    "seconds",
+]  # fmt: skip
+NUMBERS = (1, 10, 50, 200, 500, 1_000)
+LOST = ("nothing", "sensor", "simulator")
+MANY = 200  # numbers
+SHARE = 0.2  # of the numbers
+NOISE = 0.1
+NUM_CAMPAIGNS, NUM_TRIALS = 200, 3
+PRIOR = MultivariateNormal(torch.zeros(2), torch.eye(2))
+ACTIONS = BoxActions([0.5], [2.0])
+NETWORK = MixtureDensity(
+    hidden_features=(8,), num_components=1, num_iterations=5, baseline="none"
+)
+CHEAP = CampaignOptions(
+    num_simulations=100,
+    density_estimator=NETWORK,
+    refinement=Refinement(num_histories=1_000, num_particles=1_000),
+)
+#: For campaigns of many numbers, which cost more.
+CHEAPER = replace(
+    CHEAP,
+    num_scored=1_000,
+    refinement=Refinement(num_histories=200, first_share=0.5, num_particles=1_000),
+)
+
+
+def _grid(q: int) -> Tensor:
+    return torch.linspace(0.0, 1.0, q) if q > 1 else torch.ones(1)
+
+
+def _noise(theta: Tensor, q: int, correlation: float) -> Tensor:
+    """Return stationary autoregressive noise, shape (n, q)."""
+    e = torch.randn(len(theta), q)
+    for j in range(1, q if correlation else 0):
+        kept = (1 - correlation**2) ** 0.5 * e[:, j]
+        e[:, j] = correlation * e[:, j - 1] + kept
+    return NOISE * e
+
+
+def linear(theta: Tensor, action: Tensor, q: int) -> Tensor:
+    """A straight line with independent noise."""
+    mean = theta[:, :1] * action + theta[:, 1:] * _grid(q)
+    return mean + _noise(theta, q, 0.0)
+
+
+def nonlinear(theta: Tensor, action: Tensor, q: int) -> Tensor:
+    """A saturating oscillation, whose noise grows with it."""
+    mean = torch.sin(action * _grid(q) + theta[:, :1]) * torch.tanh(1 + theta[:, 1:])
+    return mean + (1 + mean.abs()) * _noise(theta, q, 0.0)
+
+
+def correlated(theta: Tensor, action: Tensor, q: int) -> Tensor:
+    """A straight line with noise that is correlated along the numbers."""
+    mean = theta[:, :1] * action + theta[:, 1:] * _grid(q)
+    return mean + _noise(theta, q, 0.9)
+
+
+SIMULATORS = (linear, nonlinear, correlated)
+
+
+def ends_early(simulator: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Return a simulator of which a fifth of the numbers are lost."""
+
+    def simulate(theta: Tensor, action: Tensor, q: int) -> Tensor:
+        x = simulator(theta, action, q)
+        ends = torch.rand(len(x)) < SHARE
+        first = q // 2
+        x[ends, first:] = torch.nan
+        return x
+
+    return simulate
+
+
+def campaign(q: int, lost: str, index: int) -> dict[str, Any]:
+    """Run one campaign and return its row."""
+    truth, start = SIMULATORS[index % len(SIMULATORS)], time.process_time()
+    seed = derive_seed(index, f"health {q} {lost}")
+    own = ends_early(truth) if lost == "simulator" else truth
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return own(theta, action, q)
+
+    options = CHEAPER if q >= MANY else CHEAP
+    run = Campaign(simulator, PRIOR, ACTIONS, method="nsbi", seed=seed, options=options)
+    with forked_generators(seed, "theta"):
+        theta = PRIOR.sample((1,))
+    for k in range(NUM_TRIALS):
+        action = run.ask().action
+        with forked_generators(seed, "x", k):
+            x = simulator(theta, action[None])[0]
+            if lost == "sensor":
+                x[torch.rand(q) < SHARE] = torch.nan
+        if lost == "sensor" and bool(x.isnan().all()):
+            run.tell(status="missing")
+        else:
+            run.tell(x)
+        run.update()
+    row = {"numbers": q, "lost": lost, "campaign": index, "simulator": truth.__name__}
+    for name in ("surprise", "misfit"):
+        for trial in run.history:
+            p = getattr(trial, name)
+            row[f"{name}_{trial.index + 1}"] = "" if p is None else f"{p:.3g}"
+    seconds = time.process_time() - start
+    return row | {"health": run.health, "seconds": f"{seconds:.1f}"}
+
+
+def read(path: Path = RESULTS) -> list[dict[str, str]]:
+    """Return the rows so far."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _key(row: dict[str, Any]) -> tuple[str, str, str]:
+    return str(row["numbers"]), row["lost"], str(row["campaign"])
+
+
+def fill(path: Path, cells: list[tuple[int, str]], campaigns: range) -> None:
+    """Run the campaigns that have no row yet."""
+    done = {_key(row) for row in read(path)}
+    path.parent.mkdir(exist_ok=True)
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        if not done:
+            writer.writeheader()
+        for index in campaigns:
+            for q, lost in cells:
+                if (str(q), lost, str(index)) not in done:
+                    writer.writerow(campaign(q, lost, index))
+                    file.flush()
+
+
+def interval(count: int, n: int) -> tuple[float, float]:
+    """Return the binomial interval of 95 % (Clopper & Pearson, Biometrika 1934)."""
+    low = beta.ppf(0.025, count, n - count + 1) if count else 0.0
+    high = beta.ppf(0.975, count + 1, n - count) if count < n else 1.0
+    return float(low), float(high)
+
+
+def _share(rows: list[dict[str, str]], name: str) -> float:
+    values = [row[f"{name}_{k}"] for row in rows for k in (1, 2, 3)]
+    known = [float(v) for v in values if v]
+    return sum(v < 0.05 for v in known) / max(len(known), 1)
+
+
+def summary(rows: list[dict[str, str]]) -> Iterator[str]:
+    """Yield the share of alarms by cell, and of surprises and misfits below .05."""
+    yield (
+        f"{'numbers':>7}  {'lost to':<10}{'n':>4}  {'alarms':<22}{'surprise < .05':>15}"
+        f"{'misfit < .05':>14}{'seconds':>9}"
+    )
+    for q in NUMBERS:
+        for lost in LOST:
+            cell = [r for r in rows if r["numbers"] == str(q) and r["lost"] == lost]
+            if not cell:
+                continue
+            n, count = len(cell), sum(row["health"] == "alarm" for row in cell)
+            low, high = interval(count, n)
+            seconds = sum(float(row["seconds"]) for row in cell) / n
+            yield (
+                f"{q:>7}  {lost:<10}{n:>4}  "
+                f"{f'{count / n:.3f} [{low:.3f}, {high:.3f}]':<22}"
+                f"{_share(cell, 'surprise'):>15.3f}{_share(cell, 'misfit'):>14.3f}"
+                f"{seconds:>9.1f}"
+            )
+
+
+def main() -> None:
+    """Run what is missing and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    parser.add_argument("--first", type=int, default=0, help="index of the first")
+    parser.add_argument("--campaigns", type=int, default=NUM_CAMPAIGNS, help="a cell")
+    parser.add_argument("--numbers", type=int, nargs="*", default=NUMBERS)
+    parser.add_argument("--lost", nargs="*", choices=LOST, default=LOST)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    if not chosen.summary:
+        cells = [(q, lost) for q in chosen.numbers for lost in chosen.lost]
+        campaigns = range(chosen.first, chosen.first + chosen.campaigns)
+        fill(chosen.results, cells, campaigns)
+    print("\n".join(summary(read(chosen.results))))
+
+
+if __name__ == "__main__":
+    main()
