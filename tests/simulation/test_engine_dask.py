@@ -1,4 +1,4 @@
-"""A real Dask cluster on this machine, one worker of which is killed meanwhile."""
+"""A real Dask cluster on this machine, whose workers are killed meanwhile."""
 
 import os
 import signal
@@ -10,12 +10,16 @@ from collections import Counter
 
 import cloudpickle
 import joblib
+import numpy as np
 import pytest
 import torch
 
 from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
+from sbi_active.simulation.cluster import DaskPool, _answer_apart
+from sbi_active.simulation.pools import pickled
+from sbi_active.simulation.schedule import Schedule
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip(
@@ -146,5 +150,82 @@ def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
         warnings.simplefilter("ignore", MissingRowsWarning)
         result = simulate(killer, theta, action, seed=0, num_workers=2, batch_size=2)
     assert result.tracebacks.keys() == {2}
-    assert "KilledWorker" in result.tracebacks[2]
+    assert "ended by signal 9" in result.tracebacks[2]
     assert torch.equal(result.x[result.valid], theta[result.valid])
+
+
+@pytest.mark.slow
+def test_all_workers_killed_at_once_lose_nothing(client, rows, tmp_path):
+    client.wait_for_workers(2)
+    expected = simulate(seeded, *rows, seed=0).x
+
+    def kill():
+        while len([*tmp_path.iterdir()]) < 3:
+            time.sleep(1e-3)
+        for pid in client.run(os.getpid).values():
+            os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    with joblib.parallel_config(backend="dask"):
+        result = simulate(
+            ReportingSeeded(tmp_path), *rows, seed=0, num_workers=2, batch_size=10
+        )
+    killer.join(timeout=0)
+    assert not killer.is_alive()
+    assert result.tracebacks == {}
+    assert torch.equal(result.x, expected)
+
+
+def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch):
+    monkeypatch.setattr(DaskPool, "PATIENCE", 0.0)
+    theta, action = (r[:20] for r in rows)
+    results = []
+
+    def run():
+        with joblib.parallel_config(backend="dask"):
+            results.append(simulate(seeded, theta, action, seed=0, num_workers=2))
+
+    async def give_up(cluster):  # as it does where one is not back after 15 s
+        for name in [*cluster.workers]:
+            await cluster.workers.pop(name).close()
+
+    with (
+        distributed.LocalCluster(
+            n_workers=1, processes=False, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+        warnings.catch_warnings(record=True) as said,
+    ):
+        warnings.simplefilter("always")
+        client.sync(give_up, cluster)
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        thread.join(timeout=30)
+        assert not thread.is_alive()
+    texts = [str(warning.message) for warning in said]
+    assert sum("no workers at inproc://" in text for text in texts) == 1
+    assert torch.equal(results[0].x, simulate(seeded, theta, action, seed=0).x)
+
+
+def test_rows_at_risk_run_in_a_child():
+    parent = os.getpid()
+
+    def simulator(theta, action):
+        if bool((action == 3).any()):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if bool((action == 2).any()) and os.getpid() != parent:
+            raise RuntimeError("only where it was set up")
+        return theta + action
+
+    theta, action = torch.rand(3, 1), torch.tensor([[1.0], [2.0], [3.0]])
+    schedule = Schedule(theta, action, seed=0, has_seeds=False)
+    calls = [schedule._call(np.array([i]), "alone") for i in range(3)]
+    good, falls_back, deadly = (
+        _answer_apart(pickled(simulator), call) for call in calls
+    )
+    for i, reply in enumerate((good, falls_back)):
+        assert reply.x is not None
+        assert torch.equal(reply.x, theta[[i]] + action[[i]])
+    assert deadly.fault == "worker died"
+    assert "ended by signal 9" in deadly.traceback
