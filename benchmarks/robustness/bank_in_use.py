@@ -118,8 +118,9 @@ def misused(case: str) -> None:
     cases=("float64", "float16", "int64", "bool", "strided", "0 rows", "numpy seed"),
 )
 def kinds(case: str) -> None:
-    dtype = getattr(torch, case, torch.float32)
-    rows = columns(0 if case == "0 rows" else 5, dtype)
+    dtype = {"float64": torch.float64, "float16": torch.float16}.get(case)
+    dtype = dtype or {"int64": torch.int64, "bool": torch.bool}.get(case)
+    rows = columns(0 if case == "0 rows" else 5, dtype or torch.float32)
     if case == "strided":
         rows = Simulations(rows.theta.flip(0).T.contiguous().T, rows.action, rows.x)
     seed: Any = np.int64(3) if case == "numpy seed" else 3

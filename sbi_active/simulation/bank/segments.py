@@ -143,8 +143,7 @@ def _is_meta(meta: Mapping[str, Any]) -> bool:
 
 def _is_run(run: Mapping[str, Any]) -> bool:
     named = all(isinstance(run.get(name), str) for name in ("digest", "label"))
-    seed = run.get("seed")
-    return named and type(seed) is int and -(2**63) <= seed < 2**63
+    return named and type(run.get("seed")) is int
 
 
 def _dataset(path: Path, file: h5py.File, name: str, size: int) -> h5py.Dataset:

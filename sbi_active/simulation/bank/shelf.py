@@ -301,7 +301,7 @@ class Shelf:
             "label": [codes[run["label"]] for run in segment.runs],
         }
         return {
-            name: np.array(of_run[name], np.int64)[columns["run"]]
+            name: _whole_numbers(of_run[name])[columns["run"]]
             if name in of_run
             else columns[name]
             for name in names
@@ -348,6 +348,16 @@ class Shelf:
         path = self._folder / f"{first:08d}-{last:08d}.h5"
         require(path, NAME.fullmatch(path.name) is not None, "no more room for numbers")
         write_segment(path, columns, meta)
+
+
+def _whole_numbers(values: list[int]) -> np.ndarray:
+    try:
+        return np.array(values, np.int64)
+    except OverflowError as error:
+        raise ValueError(
+            f"expected seeds below 2**63 for a column of them; got {max(values):.3g}; "
+            "read the other columns"
+        ) from error
 
 
 def _numbers(path: Path) -> tuple[int, int]:
