@@ -355,8 +355,8 @@ def _whole_numbers(values: list[int]) -> np.ndarray:
         return np.array(values, np.int64)
     except OverflowError as error:
         raise ValueError(
-            f"expected seeds below 2**63 for a column of them; got {max(values):.3g}; "
-            "read the other columns"
+            "expected seeds below 2**63 for a column of them; got one of "
+            f"{max(v.bit_length() for v in values)} bits; read the other columns"
         ) from error
 
 
