@@ -144,7 +144,8 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     version = state.version
     state.processed.clear()
     for trial in state.trials:
-        state.unscore(trial.index)
+        if trial.status != "pending":
+            state.unscore(trial.index)
     learner.restart()
     if version.trials:
         before = [t for i in version.trials if (t := state.trials[i]).is_measured]

@@ -166,6 +166,20 @@ def test_a_corrected_trial_is_as_if_told_at_once(method):
     assert torch.equal(draws(right), draws(wrong))
 
 
+@pytest.mark.filterwarnings("ignore:trial 0")
+def test_a_pending_trial_stays_through_a_correction():
+    right, wrong = tell(campaign()), tell(campaign(), x0=1e15)
+    pending = wrong.ask()
+    wrong.tell(TOLD[0][1], trial=0)
+    wrong.update(), right.update()
+    assert torch.equal(draws(right), draws(wrong))
+    assert wrong.ask() is pending
+    for c in (right, wrong):
+        c.tell(1.8, action=[3.0])
+        c.update()
+    assert torch.equal(draws(right), draws(wrong))
+
+
 @pytest.mark.filterwarnings("ignore:trial 1")
 def test_a_withdrawn_trial_is_as_if_missing():
     missing, wrong = campaign(), tell(campaign(), x1=62.0)
