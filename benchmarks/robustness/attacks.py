@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 __all__ = ["Attack", "Attacks", "Outcome", "attempt"]
 
 
@@ -97,6 +99,7 @@ def attempt(attack: Attack, case: Any) -> Outcome:
 
 def _run(attack: Attack, case: Any, sender: Any) -> None:
     os.setsid()  # its workers end with it
+    torch.set_num_threads(1)  # a pool of threads does not survive the fork
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)

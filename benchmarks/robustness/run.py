@@ -20,7 +20,14 @@ from pathlib import Path
 
 from benchmarks.robustness.attacks import Attack, attempt
 
-AREAS = ("engine", "bank", "campaign", "criticism", "parameters")
+AREAS = (
+    "engine",
+    "bank",
+    "campaign",
+    "criticism",
+    "effects_and_reports",
+    "parameters",
+)
 RESULTS = Path(__file__).parent / "results"
 COLUMNS = ["attack", "case", "survived", "answer", "cpu_seconds"]
 
@@ -74,15 +81,15 @@ def summary() -> Iterator[str]:
     """Yield the table: tried and survived by area, then what was not survived."""
     lost: list[str] = []
     total = [0, 0]
-    yield f"{'area':<12}{'attacks':>8}{'tried':>8}{'survived':>10}"
+    yield f"{'area':<20}{'attacks':>8}{'tried':>8}{'survived':>10}"
     for area in AREAS:
         rows = rows_of(area)
         bad = [row for row in rows if row["survived"] != "True"]
         lost += [f"{area}: {r['attack']} [{r['case']}]: {r['answer']}" for r in bad]
         total = [total[0] + len(rows), total[1] + len(rows) - len(bad)]
         names = {row["attack"] for row in rows}
-        yield f"{area:<12}{len(names):>8}{len(rows):>8}{len(rows) - len(bad):>10}"
-    yield f"{'all':<20}{total[0]:>8}{total[1]:>10}"
+        yield f"{area:<20}{len(names):>8}{len(rows):>8}{len(rows) - len(bad):>10}"
+    yield f"{'all':<28}{total[0]:>8}{total[1]:>10}"
     yield from lost
 
 
