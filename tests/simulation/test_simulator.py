@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from sbi.utils import BoxUniform
 
-from sbi_active import GaussianNoise, SimulatorModel, simulate
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, simulate
 from sbi_active.campaign.telling import outcome_told
 from sbi_active.inference.condition import outcome_rows
-from sbi_active.simulation import MissingRowsWarning, SimulationError
+from sbi_active.seeding import row_normals
+from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
 from sbi_active.simulation.simulator import outcome_tensor
 
 THETA = torch.arange(4.0)[:, None]
@@ -161,6 +163,21 @@ def test_complex_parameters_and_actions_are_refused(name):
     rows[name] = rows[name] + 1j
     with pytest.raises(ValueError, match="expected theta and action of real numbers"):
         simulate(lambda t, a: t, **rows, seed=0)
+
+
+@pytest.mark.parametrize("lost", [torch.nan, torch.inf])
+@pytest.mark.parametrize("mixes", [False, True])
+def test_the_check_of_rows_without_a_measurement(lost, mixes):
+    def simulator(theta, action, seeds):
+        x = theta + row_normals(seeds, 1).float()
+        x = x + x[:1] if mixes else x  # the order of rows matters
+        return torch.where(theta > 0.8, lost, x)
+
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    report = check_simulator(simulator, prior, DiscreteActions([1.0]), num_rows=64)
+    assert report.counts["invalid"] > 0
+    assert report.rows_are_independent is not mixes
+    assert not report.is_deterministic
 
 
 def test_a_number_a_row_is_a_column():
