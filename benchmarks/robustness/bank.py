@@ -207,6 +207,8 @@ def entry(case: str) -> None:
     path.write_text(json.dumps({k: v for k, v in good.items() if k != case}))
     if case in ENTRIES:
         refused(lambda: Bank(folder), path)
+    elif case == "id":
+        refused(Bank(folder).read, folder / "segments")
     else:  # banks of before have none
         assert torch.equal(Bank(folder).read().theta[::5, 0], torch.arange(4.0))
 

@@ -249,7 +249,8 @@ def _on_dask(simulator: Any, *rows: torch.Tensor, start: Any, workers: int = 2) 
         distributed.LocalCluster(workers, **options) as cluster,
         distributed.Client(cluster) as client,
     ):
-        client.wait_for_workers(workers)
+        if workers:
+            client.wait_for_workers(workers)
         threading.Thread(target=start, args=(cluster, client), daemon=True).start()
         with joblib.parallel_config(backend="dask"):
             return simulate(simulator, *rows, seed=0, num_workers=2)

@@ -233,6 +233,19 @@ def test_crafted_headers(folder, content):
     assert main(["bank", "inspect", str(folder)]) == 2
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, "sparse"])
+def test_headers_that_are_no_texts(folder, make):
+    path = folder / "bank.json"
+    path.unlink()
+    if make == "sparse":
+        with path.open("wb") as file:
+            file.truncate(2**40)
+    else:
+        make(path)
+    with pytest.raises(CorruptSegmentError, match=r"bank\.json"):
+        Bank(folder)
+
+
 @pytest.mark.parametrize(
     "name",
     [

@@ -7,9 +7,16 @@ import stat
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CorruptSegmentError", "is_count", "parsed", "regular_size", "require"]
+__all__ = [
+    "LARGEST_TEXT",
+    "CorruptSegmentError",
+    "is_count",
+    "parsed",
+    "regular_size",
+    "require",
+]
 
-#: Bytes of a text that are read at most; settings and lists of runs have far fewer.
+#: Bytes of a header that are read at most; the settings in one have far fewer.
 LARGEST_TEXT = 256 * 2**20
 
 #: Lists and objects within each other; a fingerprint has about 30 at most.
@@ -70,7 +77,6 @@ def parsed(path: Path, content: bytes) -> dict[str, Any]:
     Raises:
         CorruptSegmentError: If it is no object, or one that no bank writes.
     """
-    require(path, len(content) <= LARGEST_TEXT, f"a text of {len(content)} bytes")
     try:
         value = json.loads(content.decode(), parse_constant=_refused)
         _require_flat(value, DEEPEST)

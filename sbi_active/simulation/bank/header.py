@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.simulation.bank.damage import (
+    LARGEST_TEXT,
     is_count,
     parsed,
     regular_size,
@@ -99,7 +100,8 @@ def read_header(folder: Path) -> dict[str, Any]:
     """
     path = folder / HEADER
     try:
-        regular_size(path)
+        size = regular_size(path)
+        require(path, size <= LARGEST_TEXT, f"a text of {size} bytes")
         header = parsed(path, path.read_bytes())
     except (FileNotFoundError, NotADirectoryError) as error:
         raise ValueError(
