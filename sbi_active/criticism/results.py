@@ -196,7 +196,8 @@ class Tracing:
             " + ".
         chosen: Names of the effects of the verdict; empty for the other four.
         probabilities: Posterior probability by "none", "unexplained", "scatter", after
-            an alarm "outlier", effect, and sets of effects that were tried (names joined by " + ").
+            an alarm "outlier", effect, and sets of effects that were tried (names
+            joined by " + ").
         inclusion: Probability that an effect belongs to the model, by effect.
         credible_set: Smallest set of names with at least 90 % of the probability, most
             probable first.
