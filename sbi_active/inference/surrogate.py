@@ -93,8 +93,10 @@ class LocalRegression:
         residual: Whitened residuals, shape (n, q).
         standardized: Residuals over their deviations, not rotated, shape (n, q).
         whitening: :math:`L^{-1}`, shape (q, q).
+        deviation: Of the residuals, shape (q,), of the outcomes in use.
         leverage: h of the simulations, as part of the fit, shape (n,).
-        shrinkage: Of the correlations within a trial, 1 where S has none.
+        shrinkage: Of the correlations within a trial and across trials, 1 where S has
+            none.
     """
 
     region: Region
@@ -111,8 +113,9 @@ class LocalRegression:
     residual: Array
     standardized: Array
     whitening: Array
+    deviation: Array
     leverage: Array
-    shrinkage: float
+    shrinkage: tuple[float, float]
 
     @property
     def has_misfit(self) -> bool:
@@ -199,6 +202,7 @@ class LocalRegression:
             residual=_spread(residual @ inverse.T, used),
             standardized=_spread(residual / np.sqrt(np.diag(covariance)), used),
             whitening=inverse,
+            deviation=np.sqrt(np.diag(covariance)),
             leverage=((basis(u) @ root) ** 2).sum(1),
             shrinkage=shrinkage,
         )
@@ -329,7 +333,7 @@ def _covariance(
     noise_variance: Array,
     trial: NDArray[np.intp],
     independent: bool,
-) -> tuple[Array, float, float]:
+) -> tuple[Array, float, tuple[float, float]]:
     r"""Return the residuals' covariance, the factor of its inverse, and the shrinkage.
 
     Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`,
@@ -345,7 +349,7 @@ def _covariance(
     """
     q = residual.shape[1]
     if q == 0:
-        return np.zeros((0, 0)), 1.0, 1.0
+        return np.zeros((0, 0)), 1.0, (1.0, 1.0)
     deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise_variance)
     standardized = residual / deviation
     correlation = standardized.T @ standardized / freedom
@@ -358,7 +362,8 @@ def _covariance(
     size = q if across < 1 else int(np.bincount(trial).max())
     free = 1 + (size - 1) * (1 - shrunk) ** 2
     precision = max((freedom - free - 1) / freedom, 0.2)
-    return correlation * np.outer(deviation, deviation), precision, shrunk
+    covariance = correlation * np.outer(deviation, deviation)
+    return covariance, precision, (shrunk, across)
 
 
 def _shrinkage(correlation: Array, freedom: int) -> float:

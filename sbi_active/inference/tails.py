@@ -91,23 +91,53 @@ def _held_out(fit: LocalRegression, num_trials: int) -> Array:
     r"""Return the squares of simulations by a fit without them, shape (n, t + 1).
 
     With f the degrees of freedom, :math:`e_i` a residual over
-    :math:`\sqrt{1 - h_i}` and S its shrunk covariance, the one without it is
+    :math:`\sqrt{1 - h_i}`, S its covariance, and :math:`\lambda, \mu` the shrinkage
+    within and across trials, the covariance without it is
 
     .. math::
-        S_{-i} = \tfrac{f}{f - 1} \big(S - \tfrac{1 - \lambda}{f} e_i e_i^\top
+        S_{-i} = \tfrac{f}{f - 1} \big(S - \tfrac{1 - \mu}{f} e_i e_i^\top
+        - \tfrac{\mu - \lambda}{f} \sum_k e_{ik} e_{ik}^\top
         - \tfrac{\lambda}{f} \operatorname{diag}(e_i^2)\big),
 
-    of which the first term is inverted exactly (Sherman & Morrison, Ann. Math. Stat.
-    1950) and the second, of one number among many rows, to first order.
+    inverted exactly (Sherman & Morrison, Ann. Math. Stat. 1950) but for the last term,
+    of one number among many rows, which counts to first order.
     """
     freedom = len(fit.residual) - len(fit.root)
+    within, across = fit.shrinkage
     apart = 1 / np.sqrt((1 - fit.leverage).clip(1e-6))[:, None]
-    square = _squares(apart * fit.residual, num_trials)[:, :-1]
+    if across == 1:  # trials have nothing in common
+        square = _squares(apart * fit.residual, num_trials)[:, :-1]
+        square = square / (1 - (1 - within) * square / freedom).clip(1e-6)
+    else:
+        square = _held_out_jointly(fit, apart, num_trials)
     fourth = _squares((apart * fit.standardized) ** 2, num_trials)[:, :-1]
-    kept = 1 - (1 - fit.shrinkage) * square / freedom
-    square = (square + fit.shrinkage * fourth / freedom) / kept.clip(1e-6)
-    square *= (freedom - 1) / freedom
+    square = (square + within * fourth / freedom) * (freedom - 1) / freedom
     return np.concatenate([square, square.sum(1, keepdims=True)], 1)
+
+
+def _held_out_jointly(fit: LocalRegression, apart: Array, num_trials: int) -> Array:
+    """Return squares of each trial given those before, less the last term, (n, t)."""
+    n, size = fit.residual.shape
+    freedom, (within, across) = n - len(fit.root), fit.shrinkage
+    trial = np.repeat(np.arange(num_trials), size // num_trials)[fit.used]
+    residual = apart * fit.standardized[:, fit.used] * fit.deviation
+    own = [
+        residual[:, trial == k] @ fit.whitening[:, trial == k].T
+        for k in range(num_trials)
+    ]
+    common = np.full((num_trials, 1), np.sqrt((1 - across) / freedom))
+    weight = np.sqrt(max(across - within, 0.0) / freedom) * np.eye(num_trials)
+    factor = np.concatenate([common, weight], 1)
+    product = np.zeros((n, num_trials, num_trials))  # whitened, of the trials so far
+    total = [np.zeros(n)]
+    for k in range(num_trials):
+        block = np.stack([part[:, trial == k] for part in own], 1)
+        product += block @ block.swapaxes(1, 2)
+        row = product.sum(1) @ factor
+        kept = (1 + 1e-9) * np.eye(num_trials + 1) - factor.T @ product @ factor
+        gain = (row * np.linalg.solve(kept, row[..., None])[..., 0]).sum(1)
+        total.append(product.sum((1, 2)) + gain)
+    return np.diff(np.stack(total, 1), axis=1)
 
 
 def _squares(whitened: Array, num_trials: int) -> Array:

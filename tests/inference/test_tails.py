@@ -6,6 +6,7 @@ import torch
 from scipy.stats import binom, chi2
 from torch.distributions import MultivariateNormal
 
+from sbi_active.inference import surrogate
 from sbi_active.inference.refine import Refinement, refine
 from sbi_active.inference.regions import whole_space
 from sbi_active.inference.surrogate import LocalRegression, estimate_noise
@@ -36,9 +37,13 @@ def regression(rng, num_numbers, correlation):
     )
 
 
+@pytest.mark.parametrize("misfit", [np.inf, 0.0])  # trials have nothing in common; some
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
 @pytest.mark.parametrize("num_numbers", [1, 30, 120])
-def test_a_further_trial_is_as_far_out_as_those_held_out(num_numbers, correlation):
+def test_a_further_trial_is_as_far_out_as_those_held_out(
+    num_numbers, correlation, misfit, monkeypatch
+):
+    monkeypatch.setattr(surrogate, "MISFIT", misfit)
     known, new = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
