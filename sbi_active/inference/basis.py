@@ -22,16 +22,18 @@ class Basis:
         degree: Of the monomials.
         frequency: Shape (d, w), w = 0 for none.
         phase: Shape (w,).
+        is_additive: Whether monomials are powers of one coordinate each.
     """
 
     degree: int
     frequency: Array
     phase: Array
+    is_additive: bool = False
 
     @staticmethod
-    def polynomial(degree: int, dim: int) -> Basis:
+    def polynomial(degree: int, dim: int, *, is_additive: bool = False) -> Basis:
         """Return a basis without cosines."""
-        return Basis(degree, np.zeros((dim, 0)), np.zeros(0))
+        return Basis(degree, np.zeros((dim, 0)), np.zeros(0), is_additive)
 
     @staticmethod
     def waves(length: float, dim: int, num: int) -> Basis:
@@ -44,10 +46,15 @@ class Basis:
     def num_features(self) -> int:
         """Number p of features."""
         dim, num_waves = self.frequency.shape
+        if self.is_additive:
+            return 1 + self.degree * dim + num_waves
         return math.comb(dim + self.degree, self.degree) + num_waves
 
     def __call__(self, u: Array) -> Array:
         """Return features, shape (n, p), of coordinates, shape (n, d)."""
+        if self.is_additive:
+            powers = [u**degree for degree in range(1, self.degree + 1)]
+            return np.concatenate([np.ones((len(u), 1)), *powers], 1)
         monomials = [np.ones(len(u))]
         last = [(0, monomials[0])]
         for _ in range(self.degree):

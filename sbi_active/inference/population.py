@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
+from sbi_active.inference.unbounding import Unbounding
+
 __all__ = [
     "GaussianMixture",
     "Particles",
@@ -176,14 +178,33 @@ class StudentProposal:
     Args:
         mixture: The components.
         base: The defensive proposal.
+        unbounding: Where the components were fitted; None is in z itself.
     """
 
-    def __init__(self, mixture: GaussianMixture, base: Proposal) -> None:
-        self.base = base
+    def __init__(
+        self,
+        mixture: GaussianMixture,
+        base: Proposal,
+        unbounding: Unbounding | None = None,
+    ) -> None:
+        self.base, self._unbounding = base, unbounding
         k = len(mixture.log_weight)
         self._weight = 0.8 * np.exp(mixture.log_weight) + 0.2 / k
         self._mean = mixture.mean
         self._factor = INFLATION**0.5 * mixture.factor
+
+    @staticmethod
+    def fit(
+        points: Array,
+        num_components: int,
+        base: Proposal,
+        rng: np.random.Generator,
+        unbounding: Unbounding | None = None,
+    ) -> StudentProposal:
+        """Fit components to points, shape (n, d)."""
+        places = points if unbounding is None else unbounding.to_line(points)
+        mixture = GaussianMixture.fit(places, num_components, rng)
+        return StudentProposal(mixture, base, unbounding)
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         d = self._mean.shape[1]
@@ -200,19 +221,25 @@ class StudentProposal:
                 strict=True,
             )
         ]
-        return np.concatenate([*pieces, self.base.sample(num_base, rng)])
+        drawn = np.concatenate(pieces)
+        if self._unbounding is not None:
+            drawn = self._unbounding.from_line(drawn)
+        return np.concatenate([drawn, self.base.sample(num_base, rng)])
 
     def log_prob(self, z: Array) -> Array:
         d = z.shape[1]
+        y = z if self._unbounding is None else self._unbounding.to_line(z)
         constant = (
             gammaln(0.5 * (FREEDOM + d))
             - gammaln(0.5 * FREEDOM)
             - 0.5 * d * np.log(np.pi * FREEDOM)
         )
-        square, log_volume = _mahalanobis(z, self._mean, self._factor)
+        square, log_volume = _mahalanobis(y, self._mean, self._factor)
         student = constant - log_volume
         student = student - 0.5 * (FREEDOM + d) * np.log1p(square / FREEDOM)
         student = logsumexp(student + np.log(self._weight), axis=1)
+        if self._unbounding is not None:
+            student = student + self._unbounding.log_slope(y)
         return np.logaddexp(
             np.log1p(-SHARE_OF_BASE) + student,
             np.log(SHARE_OF_BASE) + self.base.log_prob(z),
@@ -228,6 +255,7 @@ def population_monte_carlo(
     first: Proposal | None = None,
     num_components: int = 6,
     max_iterations: int = 40,
+    unbounding: Unbounding | None = None,
 ) -> tuple[Particles, int]:
     r"""Sample a density by importance sampling from mixtures fitted to it.
 
@@ -247,6 +275,7 @@ def population_monte_carlo(
         first: A guess at the target to begin with; None begins at the base.
         num_components: Of the fitted mixtures.
         max_iterations: Steps at most.
+        unbounding: Where mixtures are fitted; None is in z itself.
 
     Returns:
         The particles of the last step and the number of steps.
@@ -281,8 +310,7 @@ def population_monte_carlo(
         weight = normalized(tempered)
         num_fitted = max(NUM_FITTED, FITTED * _num_moments(z.shape[1]))
         points = z[_systematic(weight, num_fitted, rng)]
-        mixture = GaussianMixture.fit(points, num_components, rng)
-        proposal = StudentProposal(mixture, base)
+        proposal = StudentProposal.fit(points, num_components, base, rng, unbounding)
     return (particles if best is None else best), step + 1
 
 

@@ -21,7 +21,6 @@ from sbi_active.inference.exact_refinement import ExactRecord, refine_exactly
 from sbi_active.inference.histories import Histories, HistoryRecord
 from sbi_active.inference.outcome_checks import check_outcomes
 from sbi_active.inference.population import (
-    GaussianMixture,
     Proposal,
     StudentProposal,
     population_monte_carlo,
@@ -45,6 +44,7 @@ from sbi_active.inference.simulated_likelihood import (
 )
 from sbi_active.inference.surrogate import Surrogate
 from sbi_active.inference.trust import SERIOUS_MISFIT, Course, Stage, diagnose
+from sbi_active.inference.unbounding import Unbounding
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 from sbi_active.threads import single_thread
@@ -226,8 +226,8 @@ def _refine(
             generous=stage.excess < 3,
         )
         base = RegionsProposal(regions)
-        mixture = GaussianMixture.fit(particles.resample(800, rng), 6, rng)
-        first = StudentProposal(mixture, base)
+        points, line = particles.resample(800, rng), _unbounding(coordinates)
+        first = StudentProposal.fit(points, 6, base, rng, line)
 
     if stage.excess > SERIOUS_MISFIT:
         few = coordinates.to_theta(stage.draws[:8])
@@ -306,6 +306,7 @@ def _sampled(
         num_particles=int(many * settings.num_particles),
         first=first,
         num_components=num_components if many == 1 else num_components // 2,
+        unbounding=_unbounding(surrogate.coordinates),
     )
     if not np.isfinite(particles.log_normalizer):
         raise UnexplainedOutcomeError(
@@ -313,6 +314,12 @@ def _sampled(
             "likelihood; correct the outcome, or leave the trial out"
         )
     return Stage.of(surrogate, particles, settings.defensive, rng)
+
+
+def _unbounding(coordinates: PriorCoordinates) -> Unbounding | None:
+    """Return the map to where edges are no concern, which a few edges are not."""
+    is_needed = coordinates.bounded.sum() > MANY
+    return Unbounding(coordinates.bounded) if is_needed else None
 
 
 def _with_more(

@@ -41,6 +41,7 @@ Array = NDArray[Any]
 
 CAUTION = 2.0  # at least, under misfit
 MISFIT = 1.12  # residual over noise variance above which the basis misses something
+MANY = 6  # parameters beyond which bases without products are tried too
 GAIN = 0.005  # nats an outcome that a larger basis must save
 MAX_WAVES = 120  # random Fourier features
 WAVE_LENGTHS = (1.0, 0.5, 0.25)  # in half-widths of the region
@@ -303,6 +304,9 @@ class Surrogate:
 
 def _candidates(dim: int, num_rows: int) -> list[Basis]:
     polynomials = [Basis.polynomial(degree, dim) for degree in (1, 2, 3)]
+    if dim > MANY:  # products of two parameters each would need too many rows
+        powers = [Basis.polynomial(d, dim, is_additive=True) for d in (2, 3)]
+        polynomials = [polynomials[0], *powers, *polynomials[1:]]
     num_waves = min(MAX_WAVES, num_rows // 4)
     return polynomials + [Basis.waves(s, dim, num_waves) for s in WAVE_LENGTHS]
 

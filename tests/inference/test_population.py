@@ -11,6 +11,7 @@ from sbi_active.inference.population import (
     StudentProposal,
     population_monte_carlo,
 )
+from sbi_active.inference.unbounding import Unbounding
 
 
 class Box:
@@ -85,6 +86,46 @@ def test_proposal_density_is_normalized_and_matches_its_draws():
     inside = (abs(proposal.sample(20_000, rng)) <= 1).all(1).mean()
     error = density.std() / np.sqrt(len(box)) + 0.5 / np.sqrt(20_000)
     assert abs(density.mean() - inside) < 4 * error
+
+
+def test_unbounded_proposal_is_normalized_and_stays_within_edges():
+    rng = np.random.default_rng(0)
+    line = Unbounding(np.array([True, True]))
+    points = 1 - 0.3 * rng.random((800, 2)) ** 2  # piled up at a corner
+    proposal = StudentProposal.fit(points, 2, Box(), rng, line)
+    z = line.from_line(line.to_line(points))
+    assert abs(z - points).max() < 1e-9
+    box = rng.uniform(-1, 1, (100_000, 2))
+    density = 4 * np.exp(proposal.log_prob(box))
+    assert density.mean() == pytest.approx(1, abs=4 * density.std() / 100_000**0.5)
+    assert (abs(proposal.sample(10_000, rng)) <= 1).all()
+
+
+@pytest.mark.parametrize("dim", [9, 12])
+def test_a_density_cut_at_many_edges(dim: int):
+    # A normal density about a corner of the box, 1 in 2^d of which is within.
+    class Cube:
+        def sample(self, num_samples: int, rng: np.random.Generator) -> np.ndarray:
+            return rng.uniform(-1, 1, (num_samples, dim))
+
+        def log_prob(self, z: np.ndarray) -> np.ndarray:
+            return np.where((abs(z) <= 1).all(1), -dim * np.log(2), -np.inf)
+
+    def log_density(z: np.ndarray) -> np.ndarray:
+        log_prob = -0.5 * (((z - 1) / 0.2) ** 2).sum(1) - dim * np.log(0.2)
+        log_prob = log_prob - 0.5 * dim * np.log(np.pi / 2)
+        return np.where((abs(z) <= 1).all(1), log_prob, -np.inf)
+
+    particles, _ = population_monte_carlo(
+        log_density,
+        Cube(),
+        np.random.default_rng(0),
+        num_particles=1_300 * dim,
+        num_components=3,
+        unbounding=Unbounding(np.ones(dim, dtype=bool)),
+    )
+    assert particles.effective_sample_size > 500
+    assert abs(particles.log_normalizer) < 4 / particles.effective_sample_size**0.5
 
 
 def test_mixture_handles_repeated_points():

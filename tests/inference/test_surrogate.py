@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sbi_active.inference.basis import Basis
 from sbi_active.inference.regions import whole_space
 from sbi_active.inference.surrogate import LocalRegression, estimate_noise
 
@@ -66,3 +67,23 @@ def test_too_few_rows_give_nothing():
     noise = estimate_noise(x[:5], x[5:10], np.ones(1))
     fit = LocalRegression.fit(whole_space(2), z, x, noise=noise, num_trials=1)
     assert fit is None
+
+
+def test_powers_alone_serve_many_parameters():
+    rng = np.random.default_rng(0)
+    z = rng.uniform(-1, 1, (NUM, 12))  # too few rows for 455 cubics
+    x = np.exp(z) + 0.1 * rng.standard_normal((NUM, 12))
+    pairs = 0.1 * rng.standard_normal((2, 80, 12))
+    noise = estimate_noise(pairs[0], pairs[1], np.ones(12))
+    fit = LocalRegression.fit(whole_space(12), z, x, noise=noise, num_trials=1)
+    assert fit is not None
+    assert fit.basis.num_features == 37 == fit.basis(z).shape[1]
+    assert not fit.has_misfit
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_features_are_counted(degree: int):
+    basis = Basis.polynomial(degree, 4)
+    assert basis(np.zeros((2, 4))).shape == (2, basis.num_features)
+    waves = Basis.waves(1.0, 4, 7)
+    assert waves(np.zeros((2, 4))).shape == (2, waves.num_features)
