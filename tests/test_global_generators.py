@@ -1,5 +1,7 @@
 """Who leaves the global generators of torch and NumPy as they were: see seeding."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -79,7 +81,7 @@ def kept():
 def test_a_campaign(kept, method, simulator):
     options = OPTIONS
     if method == "seqbed":
-        options = type(OPTIONS)(num_simulations=300, density_estimator=RATIOS)
+        options = replace(OPTIONS, density_estimator=RATIOS)
     c = kept(
         "Campaign",
         lambda: Campaign(simulator, PRIOR, ACTIONS, method=method, options=options),
