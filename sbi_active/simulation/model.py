@@ -17,6 +17,7 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.noise import NoiseModel
 from sbi_active.simulation.simulator import (
     Simulator,
+    all_finite,
     outcome_array,
     outcome_tensor,
     require_noise,
@@ -318,11 +319,11 @@ class SimulatorModel:
                 f"shape {tuple(theta.shape)}; do give one column a parameter"
             )
         for name, rows in (("theta", theta), ("action", action)):
-            bad = torch.nonzero(~rows.isfinite().all(1))[:, 0]
-            if len(bad):
+            if not all_finite(rows):
+                first = int(torch.nonzero(~rows.isfinite().all(1))[0, 0])
                 raise ValueError(
-                    f"expected finite {name}; got {rows[bad[0]].tolist()} in row "
-                    f"{int(bad[0])}; do remove NaN and inf"
+                    f"expected finite {name}; got {rows[first].tolist()} in row "
+                    f"{first}; do remove NaN and inf"
                 )
         for name, value in effects.items():
             if name not in self.effect_names and not self._takes_any:

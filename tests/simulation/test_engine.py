@@ -15,6 +15,7 @@ import torch
 from sbi_active import GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome, SimulationInterrupted
+from sbi_active.simulation.pace import Pace
 from sbi_active.simulation.store import run_digest
 
 # A worker cannot import a test module.
@@ -94,7 +95,8 @@ def test_x_depends_on_neither_workers_nor_batches(simulator, rows):
     )
 
 
-def test_a_batch_has_the_rows_that_were_asked_for(rows):
+def test_a_batch_has_the_rows_that_were_asked_for(rows, monkeypatch):
+    monkeypatch.setattr(Pace, "SECONDS", 60.0)  # whatever else the machine does
     sizes = []
 
     def simulator(theta, action, seeds):
