@@ -159,35 +159,22 @@ def _trial_to_tell(
 
 
 def _action_told(action: Any, action_dim: int) -> Tensor:
-    row = action_rows(_numbers(action, "the action"), action_dim, num_rows=1)[0]
-    if not bool(row.isfinite().all()):
+    numbers = _numbers(action, "the action")
+    finite = numbers.isfinite() & (numbers.abs() <= LARGEST)
+    if numbers.is_complex() or not bool(finite.all()):
         raise ValueError(
-            f"expected a finite action; got {row.tolist()}; pass the action that was "
-            "executed, or status='missing' where it is unknown"
+            f"expected a finite action of real numbers; got {numbers.tolist()}; pass "
+            "the action that was executed, or status='missing' where it is unknown"
         )
-    return row
+    return action_rows(numbers, action_dim, num_rows=1)[0]
 
 
 def _numbers(told: Any, what: str) -> Tensor:
-    """Return numbers in float32, apart from what the caller may still change."""
+    """Return numbers apart from what the caller may still change."""
     with torch.inference_mode(False):  # tensors of that mode are barred from training
         if isinstance(told, Tensor):
-            tensor = told.detach().cpu().clone()
-        else:
-            tensor = torch.from_numpy(_array(told, what))
-        if tensor.is_complex():
-            raise ValueError(
-                f"expected real numbers for {what}; got complex ones; pass the real "
-                "and the imaginary part, or the absolute value, as numbers of their own"
-            )
-        size = tensor.double().abs()
-        too_large = size.isfinite() & (size > LARGEST)
-        if bool(too_large.any()):
-            raise ValueError(
-                f"expected {what} within {LARGEST:.2g}, the largest of float32; got "
-                f"{float(size[too_large].max()):.3g}; use another unit"
-            )
-        return tensor.float()
+            return told.detach().cpu().clone()
+        return torch.from_numpy(_array(told, what))
 
 
 def _array(told: Any, what: str) -> np.ndarray:

@@ -265,10 +265,10 @@ def test_the_last_trial_told_twice():
         ([None], "expected the outcome x as numbers; got [None]"),
         (object(), "expected the outcome x as numbers; got <object"),
         (10**400, "expected the outcome x as numbers; got 1000"),
-        (1 + 2j, "expected real numbers for the outcome x; got complex ones"),
-        (torch.tensor([1j]), "expected real numbers for the outcome x; got complex"),
-        (np.array([1e39]), "expected the outcome x within 3.4e+38, the largest of"),
-        (-torch.ones(1).double() * 1e300, "expected the outcome x within 3.4e+38"),
+        (1 + 2j, "expected x of real numbers; got torch.complex128"),
+        (torch.tensor([1j]), "expected x of real numbers; got torch.complex64"),
+        (np.array([1e39]), "expected x within +-3.4e38, the range of float32"),
+        (-torch.ones(1).double() * 1e300, "expected x within +-3.4e38"),
         ([], "expected x of shape (1,)"),
         (torch.zeros(0, 1), "expected one outcome of shape (1,); got 0"),
         ([[1.0], [2.0]], "expected one outcome of shape (1,); got 2"),
@@ -286,7 +286,7 @@ def test_outcomes_that_are_refused(x, text):
 @pytest.mark.parametrize("action", [[np.nan], [np.inf], [1e39], "abc", [1j]])
 def test_actions_that_are_refused(action):
     c = campaign()
-    with pytest.raises(ValueError, match="expected (a finite|the|real).* action"):
+    with pytest.raises(ValueError, match="expected (a finite|the) action"):
         c.tell(1.0, action=action)
     assert c.state.trials == []
 
