@@ -15,6 +15,7 @@ from sbi_active.criticism.declarations import (
     require_parts,
     sound_null,
 )
+from sbi_active.seeding import forked_generators
 
 __all__ = ["Context", "Effect", "Hook"]
 
@@ -157,9 +158,9 @@ class Effect:
         value = phi.reshape(len(phi), *shape)
         inside = self.prior.support.check(value)[:, None].flatten(1).all(-1)  # type: ignore[union-attr]
         # Outside of its support a distribution raises or gives what it likes.
-        safe = torch.where(
-            inside.reshape(-1, *[1] * len(shape)), value, self.prior.sample()
-        )
+        with forked_generators(0, "inside"):
+            some = self.prior.sample()
+        safe = torch.where(inside.reshape(-1, *[1] * len(shape)), value, some)
         density = self.prior.log_prob(safe).double()[:, None].flatten(1).sum(-1)
         return density.where(inside, -torch.inf)
 

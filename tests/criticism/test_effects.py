@@ -244,3 +244,11 @@ def test_an_effect_through_keywords_of_the_simulator():
     assert float(x) == pytest.approx(3 * 2 - 0.5 * 4)
     with pytest.raises(ValueError, match="expected 2 keywords .* got air_drag"):
         Effect.keyword("law", "air_drag", prior=Normal(torch.zeros(2), torch.ones(2)))
+
+
+def test_a_density_leaves_the_global_generator_alone():
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    density = effect(prior=HalfNormal(1.0)).log_prob(torch.tensor([[1.0], [-1.0]]))
+    assert density.isfinite().tolist() == [True, False]
+    assert torch.equal(state, torch.get_rng_state())
