@@ -399,6 +399,12 @@ def test_a_flipped_bit_or_a_cut_gives_the_rows_or_the_error(folder):
                 assert torch.equal(Bank(folder).read().x, expected.x)
 
 
+def test_all_of_the_structure_has_checksums(folder):
+    # The older kind of file has none, and HDF5 reads some flipped ones for ever.
+    with segment(folder, 1).open("rb") as file:
+        assert file.read(9) == b"\x89HDF\r\n\x1a\n\x02"
+
+
 def test_control_characters_do_not_reach_the_terminal(folder, capsys):
     header = json.loads((folder / "bank.json").read_text())
     header["created"] = "\x1b[2J\ud800"

@@ -46,6 +46,9 @@ COLUMNS = {
     "run": np.dtype(np.int32),
 }
 
+#: Those of more than one number a row.
+TABLES = ("theta", "action", "x")
+
 #: Bytes of a segment of several rows that are read at most; none is written as large.
 LARGEST = 2**30
 
@@ -66,7 +69,9 @@ def write_segment(
     checksums = {name: _checksum(array) for name, array in columns.items()}
     text = json.dumps({**meta, "checksums": checksums}).encode()
     buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
+    # From 1.8 on all of HDF5's own structure has checksums; without them a flipped bit
+    # can make it read for ever.
+    with h5py.File(buffer, "w", libver=("v108", "v108")) as file:
         for name, array in columns.items():
             file.create_dataset(name, data=array)
         file.create_dataset(META, data=np.frombuffer(text, np.uint8))
@@ -98,12 +103,11 @@ def read_segment(
         # HDF5 looks its path up more than once, and the file may be gone by then.
         with open(path, "rb") as opened, h5py.File(opened, "r") as file:
             meta = _meta(path, file, size)
-            datasets = {name: _dataset(path, file, name, size) for name in COLUMNS}
-            _require_rows(path, datasets, meta)
-            meta["shapes"] = {
-                name: [*datasets[name].shape[1:]] for name in ("theta", "action", "x")
-            }
             wanted = COLUMNS if names is None else names
+            looked_at = {*wanted, *TABLES}
+            datasets = {n: _dataset(path, file, n, size) for n in looked_at}
+            _require_rows(path, datasets, meta)
+            meta["shapes"] = {name: [*datasets[name].shape[1:]] for name in TABLES}
             columns = {name: datasets[name][()] for name in wanted}
     except (FileNotFoundError, CorruptSegmentError):
         raise
@@ -172,9 +176,8 @@ def _require_rows(
     path: Path, datasets: Mapping[str, h5py.Dataset], meta: Mapping[str, Any]
 ) -> None:
     for name, dataset in datasets.items():
-        is_table = name in ("theta", "action", "x")
         long = dataset.shape[:1] == (meta["num_rows"],)
-        fits = long and (is_table or len(dataset.shape) == 1)
+        fits = long and (name in TABLES or len(dataset.shape) == 1)
         require(path, fits, f"{name!r} of shape {dataset.shape}")
 
 
