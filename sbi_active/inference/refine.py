@@ -330,13 +330,11 @@ def _with_more(
     rng: np.random.Generator,
 ) -> Stage:
     """Return the stage with simulations from further off, where they are of use."""
-    surrogate, error = widened(
-        histories, stage.surrogate, stage.error, stage.draws, rng
-    )
+    surrogate, bias = widened(histories, stage.surrogate, stage.error, stage.draws, rng)
     if surrogate is stage.surrogate:
         return stage
     wide = _sampled(surrogate, base, stage.particles.proposal, settings, rng)
-    return replace(wide, error=error)
+    return replace(wide, error=wide.error + bias)
 
 
 def _simulate_stage(

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sbi_active.inference.histories import Histories
 from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
@@ -33,6 +34,7 @@ Array = NDArray[Any]
 
 SMALL = 0.05  # nats that need no mending
 NUM_REPEATS = 20  # of the coefficients
+CHANCE = 0.99  # of agreement, where only chance makes a difference
 NUM_PLACES = 400  # of the belief
 REACHES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # times a region's radius
 
@@ -64,7 +66,7 @@ def widened(
     draws: Array,
     rng: np.random.Generator,
 ) -> tuple[Surrogate, float]:
-    """Return the surrogate of more distant simulations that agrees and errs least.
+    """Return the surrogate of more distant simulations that agree, which errs least.
 
     Args:
         histories: All simulations.
@@ -74,12 +76,14 @@ def widened(
         rng: Source of randomness.
 
     Returns:
-        The surrogate, or the one given, and its expected error in nats.
+        The surrogate, or the one given, and what it may err beyond its expected error,
+        in nats, as it differs from the one given by more than that one's error.
     """
-    best, least = surrogate, error
+    best, least, bias = surrogate, error, 0.0
     # The difference from a better surrogate is chi-squared, of as many degrees as there
-    # are parameters; two deviations of that are chance.
-    allowed = error * (1 + 2 * (2 / draws.shape[1]) ** 0.5)
+    # are parameters.
+    dim = draws.shape[1]
+    allowed = error * chi2.ppf(CHANCE, dim) / dim
     near = surrogate.log_likelihood(draws)
     for reach in REACHES:
         fits = [
@@ -93,12 +97,10 @@ def widened(
         difference = _nats(other.log_likelihood(draws) - near)
         if not difference <= allowed:
             break
-        # What the two differ by beyond the error of the first is one of the second.
-        bias = max(difference - error, 0.0)
-        found = bias + expected_error(other, draws, rng)
+        found = expected_error(other, draws, rng)
         if found < least:
-            best, least = other, found
-    return best, least
+            best, least, bias = other, found, max(difference - error, 0.0)
+    return best, bias
 
 
 def _changes(fit: LocalRegression, z: Array, rng: np.random.Generator) -> Array:
