@@ -26,6 +26,7 @@ def test_shares_by_cell():
         "numbers": "10",
         "lost": "sensor",
         "health": "ok",
+        "untested": "0",
         "seconds": "1.0",
     } | numbers
     alarm = row | {"health": "alarm", "surprise_1": "0.001", "misfit_3": ""}

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from sbi_active.campaign.state import CampaignState
+from sbi_active.inference.regression_error import LARGE
 
 __all__ = ["Health", "assess", "log_e_value"]
 
@@ -34,7 +35,10 @@ def assess(state: CampaignState) -> Health:
     levels add up to :math:`\alpha`. Alarms stay until another model is adopted.
 
     Args:
-        state: Of the campaign. Trials count that the current model scored.
+        state: Of the campaign. Trials count that the current model scored, under a
+            belief that is off by no more than 0.2 nats for want of simulations
+            (``error_nats_if_explained`` of its diagnostics): another predicts wrongly
+            though the simulator be right.
 
     References:
         Vovk & Wang, Annals of Statistics 2021 (e-values from p-values); Ville, Etude
@@ -42,7 +46,11 @@ def assess(state: CampaignState) -> Health:
     """
     version = state.version
     trials = [t for t in state.measured if t.version == version.number]
-    surprises = [t.surprise for t in trials if t.surprise is not None]
+    surprises = [
+        t.surprise
+        for t in trials
+        if t.surprise is not None and (t.belief_error or 0.0) <= LARGE
+    ]
     misfits = [version.misfit, *[t.misfit for t in trials]]
     bets, total = [0.0], 0.0
     for surprise in surprises:

@@ -26,6 +26,7 @@ from sbi_active.campaign.unexplained import (
 )
 from sbi_active.inference import information_gained
 from sbi_active.inference.belief import require_support, require_width
+from sbi_active.inference.regression_error import LARGE
 from sbi_active.inference.rounds import Observation, UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
@@ -118,6 +119,7 @@ class Learner:
             score.num_simulations,
             score.num_missing,
             surprise=score.surprise,
+            belief_error=_error(getattr(self.belief, "diagnostics", {})),
             log_score=score.log_score,
             version=state.version.number,
         )
@@ -299,10 +301,19 @@ def misfit(diagnostics: dict[str, Any]) -> float | None:
     """Return a belief's tail probability, of all trials or the worst, both counted.
 
     Args:
-        diagnostics: Of the belief; without tail probabilities there is none.
+        diagnostics: Of the belief; without tail probabilities there is none, nor where
+            it is off by more than a test of the simulator can bear.
     """
-    if "tail_probability" not in diagnostics:
+    if "tail_probability" not in diagnostics or _error(diagnostics) > LARGE:
         return None
     each = diagnostics["tail_probability_of_trial"]
     worst = min(diagnostics["tail_probability"], len(each) * min(each))
     return min(1.0, 2 * float(worst))
+
+
+def _error(diagnostics: dict[str, Any]) -> float:
+    """Return the nats that a belief is off as its simulations are few, 0 if unknown."""
+    modes = diagnostics.get("assumptions", {}).get("few_modes", {"holds": True})
+    if not modes["holds"]:  # whatever the others found is without a bound
+        return math.inf
+    return float(diagnostics.get("error_nats_if_explained", 0.0))

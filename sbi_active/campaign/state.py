@@ -163,9 +163,13 @@ class Trial:
         information_gained: Realized, KL(belief after || before) in nats.
         surprise: Tail probability of x under the posterior predictive of the belief
             before the trial; uniform where the simulator is right.
+        belief_error: Nats that the belief before the trial is off for want of
+            simulations, by its own estimate; above 0.2 the surprise says nothing about
+            the simulator.
         log_score: Log density of x under it, nats.
         misfit: Tail probability of all trials so far under the belief after this one,
-            which was fitted to them; None for a belief that was not refined.
+            which was fitted to them; None for a belief that was not refined, or that is
+            off by more than 0.2 nats.
         outlyingness: How far x lies beyond all simulations from the prior at this
             action, in their range, by its farthest number; inf where none of them had
             such a number, None where it is as others from the belief before are. Above
@@ -187,6 +191,7 @@ class Trial:
     target: str | None = None
     information_gained: float | None = None
     surprise: float | None = None
+    belief_error: float | None = None
     log_score: float | None = None
     misfit: float | None = None
     outlyingness: float | None = None
@@ -235,6 +240,7 @@ class ModelVersion:
 UNSCORED: dict[str, Any] = {
     "information_gained": None,
     "surprise": None,
+    "belief_error": None,
     "log_score": None,
     "misfit": None,
     "outlyingness": None,

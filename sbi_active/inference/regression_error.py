@@ -28,11 +28,12 @@ from scipy.stats import chi2
 from sbi_active.inference.histories import Histories
 from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
 
-__all__ = ["SMALL", "expected_error", "widened"]
+__all__ = ["LARGE", "SMALL", "expected_error", "widened"]
 
 Array = NDArray[Any]
 
 SMALL = 0.05  # nats that need no mending
+LARGE = 0.2  # nats that the belief is off
 NUM_REPEATS = 20  # of the coefficients
 CHANCE = 0.99  # of agreement, where only chance makes a difference
 NUM_PLACES = 400  # of the belief
@@ -40,7 +41,11 @@ REACHES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # times a region's radius
 
 
 def expected_error(
-    surrogate: Surrogate, draws: Array, rng: np.random.Generator
+    surrogate: Surrogate,
+    draws: Array,
+    rng: np.random.Generator,
+    *,
+    explained: bool = False,
 ) -> float:
     """Return the expected divergence from the belief of endless simulations, in nats.
 
@@ -48,6 +53,8 @@ def expected_error(
         surrogate: The likelihood.
         draws: Of the belief, shape (n, d).
         rng: Source of the coefficients' errors.
+        explained: Whether observations that lie further out than simulations are moved
+            to where those lie, so that the error is that of the simulations alone.
     """
     draws = draws[:: max(len(draws) // NUM_PLACES, 1)]
     label = surrogate.assign(draws)
@@ -55,7 +62,7 @@ def expected_error(
     for k, fit in enumerate(surrogate.regressions):
         rows = np.flatnonzero(label == k)
         if len(rows):
-            change[:, rows] = _changes(fit, draws[rows], rng)
+            change[:, rows] = _changes(fit, draws[rows], rng, explained=explained)
     return _nats(change[:, label >= 0])
 
 
@@ -103,13 +110,20 @@ def widened(
     return best, bias
 
 
-def _changes(fit: LocalRegression, z: Array, rng: np.random.Generator) -> Array:
+def _changes(
+    fit: LocalRegression, z: Array, rng: np.random.Generator, *, explained: bool
+) -> Array:
     """Return what other coefficients would add to log likelihoods, (repeats, n)."""
     features = fit.basis(fit.region.scaled(z))
     rotated = features @ fit.root
     error = features @ fit.coefficient
     (p, q), freedom = fit.coefficient.shape, len(fit.residual) - len(fit.root)
-    scale = -0.5 * fit.precision / (1 + (rotated**2).sum(1))
+    widening = 1 + (rotated**2).sum(1)
+    scale = -0.5 * fit.precision / widening
+    if explained:
+        usual = np.sqrt(max(fit.used.sum(), 1) * widening / fit.precision)
+        length = np.linalg.norm(error, axis=1)
+        error *= (usual / np.maximum(length, usual))[:, None]
     changes = []
     for _ in range(NUM_REPEATS):
         step = rotated @ (rng.standard_normal((p, q)) * fit.used)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
 from sbi_active.inference.population import Particles
-from sbi_active.inference.regression_error import SMALL, expected_error
+from sbi_active.inference.regression_error import LARGE, SMALL, expected_error
 from sbi_active.inference.surrogate import MISFIT, LocalRegression, Surrogate
 from sbi_active.inference.tails import tail_probability
 
@@ -20,7 +20,6 @@ Array = NDArray[Any]
 
 SETTLED = 0.03  # nats a dimension that the last stage may have changed
 LIVE = 0.01  # mass below which a region is left out of the checks
-LARGE = 0.2  # nats that the belief is off
 MIN_EFFECTIVE = 0.05  # share of the particles
 ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
 HARD_NOISE = 0.03  # nats a number that a Gaussian loses on the noise
@@ -239,6 +238,9 @@ def diagnose(
         "residual_to_noise": float(ratio),
         "num_regions": len(fits),
         "error_nats": last.error,
+        "error_nats_if_explained": expected_error(
+            last.surrogate, last.draws, rng, explained=True
+        ),
         "region_mass": [float(mass) for mass in last.mass],
         "prior_edge_mass": edge_mass,
         "tail_probability": joint,

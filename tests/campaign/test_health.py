@@ -104,6 +104,13 @@ def test_health_from_surprises():
     assert assess(state([0.4, 5e-4, 5e-3], number=1)) == "ok"
 
 
+def test_a_belief_that_is_off_for_want_of_simulations_is_no_test():
+    made = state([0.4, 5e-4, 5e-3])
+    for error, health in ((0.1, "alarm"), (0.3, "ok"), (math.inf, "ok")):
+        made.change(1, belief_error=error)
+        assert assess(made) == health
+
+
 def test_health_from_misfit():
     assert assess(state([0.5, 0.5], [0.5, 0.05])) == "ok"
     assert assess(state([0.5, 0.5], [0.5, 0.01])) == "watch"

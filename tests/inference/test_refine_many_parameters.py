@@ -41,7 +41,7 @@ def test_ten_and_twenty_parameters(dim: int, num_histories: int):
     assert -0.02 < divergence < 0.3
 
 
-@pytest.mark.parametrize(("num", "num_histories"), [(2, 600), (80, 200)])
+@pytest.mark.parametrize(("num", "num_histories"), [(2, 600), (80, 400)])
 def test_trust_follows_the_error_and_not_the_dimension(num: int, num_histories: int):
     divergence, belief = refined(10, num, seed=1, num_histories=num_histories)
     diagnostics = belief.diagnostics
