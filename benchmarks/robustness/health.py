@@ -9,8 +9,8 @@ itself, so that any alarm is false; at most 5 % may raise one. Simulators take t
 linear, nonlinear, noise that is correlated along the numbers. A fifth of the numbers is
 lost to the sensor, of which the simulator knows nothing (of trials of one number, a
 fifth, told as missing), or nothing is; or a fifth of the simulator's own rows end at
-half their length (those of one number have no measurement). Tests that do not count, as
-too few simulations leave the belief off, are listed as such. Resumable:
+half their length (those of one number have no measurement). Tests that do not count,
+as too few simulations leave the belief off, are listed as such. Resumable:
 ``results/health.csv`` is appended to.
 """
 

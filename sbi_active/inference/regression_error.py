@@ -119,9 +119,9 @@ def _changes(
     error = features @ fit.coefficient
     (p, q), freedom = fit.coefficient.shape, len(fit.residual) - len(fit.root)
     widening = 1 + (rotated**2).sum(1)
-    scale = -0.5 * fit.precision / widening
+    scale = -0.5 * fit.covariance.precision / widening
     if explained:
-        usual = np.sqrt(max(fit.used.sum(), 1) * widening / fit.precision)
+        usual = np.sqrt(max(fit.used.sum(), 1) * widening / fit.covariance.precision)
         length = np.linalg.norm(error, axis=1)
         error *= (usual / np.maximum(length, usual))[:, None]
     changes = []

@@ -15,8 +15,7 @@ a measurement or none, is a further factor
 (:mod:`~sbi_active.inference.validity`).
 
 References:
-    Wood, Nature 2010 (synthetic likelihood); Schafer & Strimmer, Stat. Appl. Genet.
-    Mol. Biol. 2005 (shrinkage); Hartlap et al., A&A 2007 (inverse of a covariance).
+    Wood, Nature 2010 (synthetic likelihood).
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
 from scipy.stats import chi2, f
 
 from sbi_active.inference.basis import Basis
 from sbi_active.inference.coordinates import PriorCoordinates
 from sbi_active.inference.regions import Region, nearest_region
+from sbi_active.inference.residual_covariance import ResidualCovariance, alike
 from sbi_active.inference.validity import TrialOutcome
 
 __all__ = ["LocalRegression", "NoiseEstimate", "Surrogate", "estimate_noise"]
@@ -83,8 +82,6 @@ class LocalRegression:
         basis: f.
         coefficient: :math:`B L^{-\top}`, outcomes whitened by S = L L^T, shape (p, q).
         root: :math:`R^{-1}` of F = Q R, so that h = |f R^{-1}|^2, shape (p, p).
-        log_volume: log det L.
-        precision: Factor that makes the inverse of the sample covariance unbiased.
         outcomes: Probability of a measurement, or of none, of each trial in which
             simulations do not all agree.
         used: Which outcomes were observed, shape (q,); all others have no coefficient
@@ -94,19 +91,14 @@ class LocalRegression:
         excess: The same with chance removed: above 1 means misfit.
         residual: Whitened residuals, shape (n, q).
         standardized: Residuals over their deviations, not rotated, shape (n, q).
-        whitening: :math:`L^{-1}`, shape (q, q).
-        deviation: Of the residuals, shape (q,), of the outcomes in use.
+        covariance: S, of the outcomes in use.
         leverage: h of the simulations, as part of the fit, shape (n,).
-        shrinkage: Of the correlations within a trial and across trials, 1 where S has
-            none.
     """
 
     region: Region
     basis: Basis
     coefficient: Array
     root: Array
-    log_volume: float
-    precision: float
     outcomes: tuple[TrialOutcome, ...]
     used: NDArray[np.bool_]
     roughness: float
@@ -114,10 +106,8 @@ class LocalRegression:
     excess: float
     residual: Array
     standardized: Array
-    whitening: Array
-    deviation: Array
+    covariance: ResidualCovariance
     leverage: Array
-    shrinkage: tuple[float, float]
 
     @property
     def has_misfit(self) -> bool:
@@ -184,34 +174,24 @@ class LocalRegression:
         ratio = (residual**2).sum(0) / freedom / noise.variance
         deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise.variance)
         standardized = residual / deviation
-        correlation = standardized.T @ standardized / freedom
-        excess = _excess(ratio, correlation, freedom, noise.num_pairs)
-        correlation, precision, shrinkage = _shrunk(
-            correlation, freedom, trial, excess <= MISFIT
-        )
-        # Trials with nothing in common apart: a ninth of the time for three.
-        groups = trial if shrinkage[1] == 1 else np.zeros_like(trial)
-        inverse, log_volume = _whitening(
-            correlation * np.outer(deviation, deviation), groups
+        excess = _excess(ratio, alike(standardized, freedom), freedom, noise.num_pairs)
+        covariance = ResidualCovariance.of(
+            standardized, deviation, freedom, trial, independent=excess <= MISFIT
         )
         return LocalRegression(
             region=region,
             basis=basis,
-            coefficient=_spread(coefficient @ inverse.T, used),
+            coefficient=_spread(covariance.whiten(coefficient), used),
             root=root,
-            log_volume=log_volume,
-            precision=precision,
             outcomes=outcomes,
             used=used,
             roughness=roughness,
             ratio=float(ratio.mean()) if q > 0 else 1.0,
             excess=excess,
-            residual=_spread(residual @ inverse.T, used),
+            residual=_spread(covariance.whiten(residual), used),
             standardized=_spread(standardized, used),
-            whitening=inverse,
-            deviation=deviation,
+            covariance=covariance,
             leverage=((basis(u) @ root) ** 2).sum(1),
-            shrinkage=shrinkage,
         )
 
     def whitened(self, z: Array) -> tuple[Array, Array]:
@@ -262,8 +242,10 @@ class LocalRegression:
         widening = 1 + ((features @ self.root) ** 2).sum(1)
         q = int(self.used.sum())
         square = ((features @ self.compact) ** 2).sum(1)
-        square = square * self.precision / (widening * caution)
-        log_volume = self.log_volume + 0.5 * q * np.log(2 * np.pi * widening * caution)
+        square = square * self.covariance.precision / (widening * caution)
+        log_volume = self.covariance.log_volume + 0.5 * q * np.log(
+            2 * np.pi * widening * caution
+        )
         log_likelihood = -0.5 * square - log_volume
         for outcome in self.outcomes:
             log_likelihood = log_likelihood + outcome.log_prob(z)
@@ -322,16 +304,16 @@ def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
     return float((variance / noise.variance).max(initial=0.0))
 
 
-def _excess(ratio: Array, correlation: Array, freedom: int, num_pairs: int) -> float:
-    r"""Return the misfit, residual over noise variance, with chance removed.
+def _excess(ratio: Array, num_alike: float, freedom: int, num_pairs: int) -> float:
+    """Return the misfit, residual over noise variance, with chance removed.
 
     The mean over outcomes is sharp where all are missed a little, the maximum where
-    one is missed; each less what chance alone reaches: ratios are F distributed, their
-    squares correlate as :math:`r_{ij}^2`.
+    one is missed; each less what chance alone reaches: ratios are F distributed and
+    correlate as the squares of the residuals' correlations.
 
     Args:
         ratio: Of the outcomes, shape (q,).
-        correlation: Of the residuals, shape (q, q).
+        num_alike: Outcomes that vary as one, by their correlations.
         freedom: Rows less coefficients.
         num_pairs: That the noise is known from.
     """
@@ -339,65 +321,9 @@ def _excess(ratio: Array, correlation: Array, freedom: int, num_pairs: int) -> f
     if q == 0:
         return 0.0
     deviation = np.sqrt(2 / freedom + 2 / max(num_pairs, 1))
-    alike = ((correlation**2).sum() - q * (q - 1) / freedom).clip(q) / q
-    mean = ratio.mean() - 3 * deviation * np.sqrt(alike / q)
+    mean = ratio.mean() - 3 * deviation * np.sqrt(num_alike / q)
     largest = ratio.max() / f.isf(CHANCE / q, freedom, max(num_pairs, 1))
     return float(max(mean, largest))
-
-
-def _shrunk(
-    correlation: Array, freedom: int, trial: NDArray[np.intp], independent: bool
-) -> tuple[Array, float, tuple[float, float]]:
-    r"""Return residuals' correlation, the factor of its inverse, and the shrinkage.
-
-    Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`,
-    apart within a trial and across trials. Noise does not correlate across trials,
-    which are independent given theta; misfit does.
-
-    Args:
-        correlation: Shape (q, q).
-        freedom: Rows less coefficients.
-        trial: Of each outcome, shape (q,).
-        independent: Whether there is no misfit.
-    """
-    q = len(correlation)
-    if q == 0:
-        return correlation, 1.0, (1.0, 1.0)
-    within = trial[:, None] == trial
-    diagonal = np.eye(q, dtype=bool)
-    across = 1.0 if independent else _shrinkage(correlation[~within], freedom)
-    shrunk = _shrinkage(correlation[within & ~diagonal], freedom)
-    correlation = np.where(within, correlation, (1 - across) * correlation)
-    correlation = np.where(diagonal, 1.0, (1 - shrunk) * correlation)
-    size = q if across < 1 else int(np.bincount(trial).max())
-    free = 1 + (size - 1) * (1 - shrunk) ** 2
-    precision = max((freedom - free - 1) / freedom, 0.2)
-    return correlation, precision, (shrunk, across)
-
-
-def _whitening(covariance: Array, group: NDArray[np.intp]) -> tuple[Array, float]:
-    """Return the inverse Cholesky factor, and the log determinant of the factor.
-
-    Args:
-        covariance: Shape (q, q), zero between groups.
-        group: Of each outcome, shape (q,).
-    """
-    inverse, log_volume = np.zeros_like(covariance), 0.0
-    (invert,) = get_lapack_funcs(("trtri",), (covariance,))
-    for label in np.unique(group):
-        rows = np.flatnonzero(group == label)
-        place = np.ix_(rows, rows)
-        factor = np.linalg.cholesky(covariance[place])
-        log_volume += float(np.log(np.diag(factor)).sum())
-        inverse[place], _ = invert(factor, lower=1)
-    return inverse, log_volume
-
-
-def _shrinkage(correlation: Array, freedom: int) -> float:
-    if correlation.size == 0:
-        return 1.0
-    variance = (1 - correlation**2) ** 2 / freedom
-    return float(min(1.0, variance.sum() / max((correlation**2).sum(), 1e-300)))
 
 
 def _spread(columns: Array, used: NDArray[np.bool_]) -> Array:

@@ -103,7 +103,7 @@ def _held_out(fit: LocalRegression, num_trials: int) -> Array:
     of one number among many rows, which counts to first order.
     """
     freedom = len(fit.residual) - len(fit.root)
-    within, across = fit.shrinkage
+    within, across = fit.covariance.shrinkage
     apart = 1 / np.sqrt((1 - fit.leverage).clip(1e-6))[:, None]
     if across == 1:  # trials have nothing in common
         square = _squares(apart * fit.residual, num_trials)[:, :-1]
@@ -118,13 +118,11 @@ def _held_out(fit: LocalRegression, num_trials: int) -> Array:
 def _held_out_jointly(fit: LocalRegression, apart: Array, num_trials: int) -> Array:
     """Return squares of each trial given those before, less the last term, (n, t)."""
     n, size = fit.residual.shape
-    freedom, (within, across) = n - len(fit.root), fit.shrinkage
+    covariance, freedom = fit.covariance, n - len(fit.root)
+    within, across = covariance.shrinkage
     trial = np.repeat(np.arange(num_trials), size // num_trials)[fit.used]
-    residual = apart * fit.standardized[:, fit.used] * fit.deviation
-    own = [
-        residual[:, trial == k] @ fit.whitening[:, trial == k].T
-        for k in range(num_trials)
-    ]
+    residual = apart * fit.standardized[:, fit.used] * covariance.deviation
+    own = [covariance.whiten(residual * (trial == k)) for k in range(num_trials)]
     common = np.full((num_trials, 1), np.sqrt((1 - across) / freedom))
     weight = np.sqrt(max(across - within, 0.0) / freedom) * np.eye(num_trials)
     factor = np.concatenate([common, weight], 1)

@@ -55,7 +55,8 @@ def test_cubic_is_smooth_and_a_wave_is_not():
 
 def test_white_noise_shrinks_to_a_diagonal():
     fit, _ = regress(lambda z: z, q=12, num_trials=3)
-    precision = fit.whitening.T @ fit.whitening * 0.1**2
+    whitening = fit.covariance.whiten(np.eye(12))
+    precision = whitening @ whitening.T * 0.1**2
     apart = precision - np.diag(np.diag(precision))
     # Unshrunk, 132 correlations of deviation .05 would reach .12 or more.
     assert abs(apart).max() < 0.05

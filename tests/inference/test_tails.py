@@ -50,7 +50,7 @@ def test_a_further_trial_is_as_far_out_as_those_held_out(
         fit = regression(rng, num_numbers, correlation)
         z = rng.standard_normal((400, 1))
         error, widening = fit.whitened(z)  # less zero, which is no observation
-        error -= outcomes(rng, z, num_numbers, correlation) @ fit.whitening.T
+        error -= fit.covariance.whiten(outcomes(rng, z, num_numbers, correlation))
         new.append(_squares(error, NUM_TRIALS) / widening[:, None])
         known.append(_held_out(fit, NUM_TRIALS))
     known, new = np.concatenate(known), np.concatenate(new)
