@@ -2,6 +2,7 @@ r"""Linear-Gaussian problems with a closed form: the error of a belief and what 
 
     python -m benchmarks.robustness.exact
     python -m benchmarks.robustness.exact --prior box
+    python -m benchmarks.robustness.exact --histories 150
     python -m benchmarks.robustness.exact --summary
 
 Three trials of
@@ -12,7 +13,9 @@ Three trials of
 each passed to ``ASBI.update`` with the simulator, at 2 to 20 parameters and 2 to 200
 numbers. The prior is standard normal, so that the posterior is Gaussian; or a box
 (``--prior box``) wide enough for the posterior to be the Gaussian of the likelihood,
-which takes at least as many numbers as parameters. Columns of ``results/exact.csv``:
+which takes at least as many numbers as parameters. With ``--histories``, fewer
+simulations than by default, so that beliefs are wrong and shall say so. Columns of
+``results/exact.csv``:
 
 - ``kl``: KL(exact || belief) in nats, by 4,000 draws of the exact posterior;
   ``kl_error`` is its standard error;
@@ -33,7 +36,7 @@ import csv
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +45,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
-from sbi_active import ASBI
+from sbi_active import ASBI, Refinement
 from sbi_active.inference.belief import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -56,6 +59,7 @@ BEYOND = 8.0  # posterior deviations from the middle to the edge of a box prior
 RESULTS = Path(__file__).parent / "results" / "exact.csv"
 COLUMNS = [
     "prior",
+    "histories",
     "dim",
     "size",
     "seed",
@@ -120,8 +124,11 @@ class Problem:
         normal = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
         return Problem(simulator, normal, action, x, exact)
 
-    def infer(self, seed: int) -> Belief:
+    def infer(self, seed: int, num_histories: int | None) -> Belief:
         """Return the belief after the trials, one update each."""
+        settings = Refinement()
+        if num_histories is not None:
+            settings = replace(settings, num_histories=num_histories)
         inference = ASBI(self.prior, show_progress_bars=False)
         trials = list(zip(self.action, self.x, strict=True))
         for k, (action, x) in enumerate(trials):
@@ -129,6 +136,7 @@ class Problem:
                 x.float(),
                 action=action,
                 simulator=self.simulator,
+                refinement=settings,
                 seed=derive_seed(seed, k),
             )
         return belief
@@ -150,15 +158,18 @@ class Problem:
         }
 
 
-def row_of(prior: str, dim: int, size: int, seed: int) -> dict[str, object]:
+def row_of(
+    prior: str, num_histories: int | None, dim: int, size: int, seed: int
+) -> dict[str, object]:
     """Return the row of a problem; an error becomes the row's failure."""
     start = time.process_time()
-    row: dict[str, object] = {"prior": prior, "dim": dim, "size": size, "seed": seed}
+    row: dict[str, object] = {"prior": prior, "histories": num_histories or ""}
+    row |= {"dim": dim, "size": size, "seed": seed}
     problem = Problem.draw(prior, dim, size, seed)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            belief = problem.infer(seed)
+            belief = problem.infer(seed, num_histories)
     except Exception as error:  # a crash is a result
         return row | {"failure": f"{type(error).__name__}: {error}"[:200]}
     seconds = time.process_time() - start
@@ -179,12 +190,13 @@ def row_of(prior: str, dim: int, size: int, seed: int) -> dict[str, object]:
     )
 
 
-def rows() -> list[dict[str, str]]:
-    """Return the rows so far."""
+def rows(prior: str, num_histories: int | None) -> list[dict[str, str]]:
+    """Return the rows of a prior and a number of simulations so far."""
     if not RESULTS.exists():
         return []
+    kind = prior, str(num_histories or "")
     with RESULTS.open(newline="") as file:
-        return list(csv.DictReader(file))
+        return [r for r in csv.DictReader(file) if (r["prior"], r["histories"]) == kind]
 
 
 def problems(prior: str, seeds: range) -> Iterator[tuple[int, int, int]]:
@@ -196,9 +208,12 @@ def problems(prior: str, seeds: range) -> Iterator[tuple[int, int, int]]:
                     yield dim, size, seed
 
 
-def run(prior: str, seeds: range) -> None:
+def run(prior: str, num_histories: int | None, seeds: range) -> None:
     """Run the problems that have no row yet."""
-    done = {(r["prior"], int(r["dim"]), int(r["size"]), int(r["seed"])) for r in rows()}
+    done = {
+        (int(r["dim"]), int(r["size"]), int(r["seed"]))
+        for r in rows(prior, num_histories)
+    }
     is_new = not RESULTS.exists()
     RESULTS.parent.mkdir(exist_ok=True)
     with RESULTS.open("a", newline="") as file:
@@ -206,9 +221,9 @@ def run(prior: str, seeds: range) -> None:
         if is_new:
             writer.writeheader()
         for dim, size, seed in problems(prior, seeds):
-            if (prior, dim, size, seed) in done:
+            if (dim, size, seed) in done:
                 continue
-            row = row_of(prior, dim, size, seed)
+            row = row_of(prior, num_histories, dim, size, seed)
             writer.writerow(row)
             file.flush()
             print(" ".join(str(value) for value in row.values()), flush=True)
@@ -243,12 +258,12 @@ def main() -> None:
     """Run what is missing and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--prior", choices=("gaussian", "box"), default="gaussian")
+    parser.add_argument("--histories", type=int, help="of each refinement")
     parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     if not arguments.summary:
-        run(arguments.prior, SEEDS)
-    found = [row for row in rows() if row["prior"] == arguments.prior]
-    print("\n".join(summary(found)))
+        run(arguments.prior, arguments.histories, SEEDS)
+    print("\n".join(summary(rows(arguments.prior, arguments.histories))))
 
 
 if __name__ == "__main__":

@@ -148,8 +148,8 @@ def _diagnose(
 ) -> dict[str, Any]:
     """Return figures about the draws, as of a learned likelihood where they apply."""
     effective = pool.effective_sample_size
-    near_edge = (np.abs(pool.z[:, coordinates.bounded]) > 0.98).any(1)
-    edge_mass = float(pool.weight[near_edge].sum())
+    near_edge = np.abs(pool.z[:, coordinates.bounded]) > 0.98
+    edge_mass = float((pool.weight @ near_edge).max(initial=0.0))
     tail = _tail_probability(likelihood, coordinates, pool, seed)
     warnings = []
     if effective < COARSE:

@@ -55,7 +55,7 @@ Array = NDArray[Any]
 
 HALF = 0.5  # of the budget, after which misfit is taken to stay
 MANY = 6  # parameters beyond which each covariance needs more particles
-MIN_STAGE = 60  # histories below which another stage adds nothing
+MIN_STAGE = 60  # histories below which another stage adds nothing; more by dimension
 
 
 def refine(
@@ -185,14 +185,20 @@ def _refine(
     first: Proposal | None = None
     course = Course(budget=settings.num_histories)
     num_forced = 1
+    least = max(MIN_STAGE, 2 * (coordinates.dim + 21))
     while True:
-        stage_size = _stage_size(settings, histories.num_drawn)
+        stage_size = _stage_size(settings, histories.num_drawn, least)
         _simulate_stage(histories, regions, stage_size, settings, rng)
-        next_size = _stage_size(settings, histories.num_drawn)
-        is_last = next_size < MIN_STAGE
+        next_size = _stage_size(settings, histories.num_drawn, least)
+        is_last = next_size < least
         fits = [histories.regress(region) for region in regions]
         regressions = [fit for fit in fits if fit is not None]
         if not regressions:
+            if histories.valid.mean() > 0.5:  # it is not the outcomes that lack
+                raise ValueError(
+                    f"expected at least {least} histories for {coordinates.dim} "
+                    f"parameters; got {histories.num_drawn}; raise num_histories"
+                )
             raise UnexplainedOutcomeError(
                 "expected simulations with a measurement, since trials had one; got "
                 f"none or NaN in {histories.num_drawn - int(histories.valid.sum())} of "
@@ -277,12 +283,12 @@ def _refine(
     return belief
 
 
-def _stage_size(settings: Refinement, used: int) -> int:
+def _stage_size(settings: Refinement, used: int, least: int) -> int:
     share = settings.first_share if used == 0 else settings.stage_share
-    size = max(int(share * settings.num_histories), MIN_STAGE)
+    size = max(int(share * settings.num_histories), least)
     left = settings.num_histories - used
     # A remainder too small for a stage of its own goes to the one before.
-    return left if left < size + MIN_STAGE else size
+    return left if left < size + least else size
 
 
 def _sampled(

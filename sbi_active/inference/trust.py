@@ -27,7 +27,7 @@ LIGHT_TAILS = -0.3  # excess kurtosis; -1.2 for uniform noise, 0 for Gaussian
 SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 UNSETTLED = 0.1  # nats a dimension
 CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
-EDGE = 0.5  # mass within 1 % of the prior's edge that calls for a warning
+EDGE = 0.5  # mass within 1 % of the edge of one parameter that calls for a warning
 RARE = 1e-3  # tail probability of the observation that calls for a warning
 
 
@@ -159,7 +159,7 @@ def diagnose(
     dim = last.draws.shape[1]
     tail, joint = tail_probability(last.surrogate, last.draws, num_trials)
     edge = np.abs(last.draws[:, last.surrogate.coordinates.bounded]) > 0.98
-    edge_mass = float(edge.any(1).mean())
+    edge_mass = float(edge.mean(0).max(initial=0.0))
     effective = min(
         stage.particles.effective_sample_size / len(stage.particles.z)
         for stage in course.stages

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from sbi_active.inference.refine import Refinement, refine
+from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.seeding import forked_generators
 
 
@@ -47,3 +49,28 @@ def test_trust_follows_the_error_and_not_the_dimension(num: int, num_histories: 
     diagnostics = belief.diagnostics
     assert diagnostics["error_nats"] == pytest.approx(divergence, rel=0.7, abs=0.05)
     assert diagnostics["trustworthy"] == (divergence < 0.2)
+
+
+def refine_two_of(dim: int):
+    """Return the belief of many parameters, of which a trial tells of two."""
+    prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return theta[:, :2] + 0.5 * torch.randn(len(theta), 2)
+
+    settings = Refinement(num_histories=200, num_particles=1_000)
+    x = torch.full((1, 2), 0.5)
+    return refine(simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=0)
+
+
+def test_many_edges_are_no_edge():
+    """A prior of forty parameters has most of its mass near one edge or another."""
+    belief = refine_two_of(40)
+    assert belief.diagnostics["prior_edge_mass"] < 0.1
+    assert not any("edge" in text for text in belief.diagnostics["warnings"])
+
+
+def test_too_few_histories_are_no_unexplained_outcome():
+    with pytest.raises(ValueError, match=r"at least 342 histories for 150") as error:
+        refine_two_of(150)
+    assert not isinstance(error.value, UnexplainedOutcomeError)
