@@ -23,6 +23,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ from sbi_active import (
     GaussianNoise,
     InformationGainDesigner,
     MixtureDensity,
+    Refinement,
+    SeqBED_C,
     SimulatorModel,
     simulate,
 )
@@ -107,12 +110,17 @@ def gain(estimator: str) -> list[Any]:
     """Return a design by an estimator, on a model that was trained for it."""
     actions = DiscreteActions(torch.arange(-5, 5.5, 2.5))
     simulator = SimulatorModel(response("linear"), noise=GaussianNoise(1.0))
-    trainer = ALHI if estimator in ("likelihood", "contrastive") else ASBI
+    network = MixtureDensity(num_iterations=60)
+    trainers = {
+        "likelihood": lambda: ALHI(BOX, network, show_progress_bars=False),
+        "contrastive": lambda: ALHI(BOX, network, show_progress_bars=False),
+        "ratio": lambda: SeqBED_C(BOX, show_progress_bars=False),
+        "info_nce": lambda: SeqBED_C(BOX, show_progress_bars=False),
+    }
     model = None
     if estimator not in ("entropy", "nested"):
-        inference = trainer(
-            BOX, MixtureDensity(num_iterations=60), show_progress_bars=False
-        )
+        make = trainers.get(estimator)
+        inference = make() if make else ASBI(BOX, network, show_progress_bars=False)
         with forked_generators(1):
             theta, action = BOX.sample((600,)), actions.sample((600,), seed=1)
             x = simulator(theta, action)
@@ -152,6 +160,57 @@ def refinement(variant: str, *, declared: bool) -> list[Any]:
     with forked_generators(0):
         draws = belief.sample(torch.Size([64]))
     return [draws.mean(0), draws, belief.log_prob(draws)]
+
+
+def many(num_parameters: int) -> list[Any]:
+    """Return draws of a belief of many parameters, with numbers that are missing."""
+    with forked_generators(6):
+        weight = torch.randn(num_parameters, 30)
+        x = torch.randn(1, num_parameters) @ weight + torch.randn(2, 30)
+    x[0, 20:] = torch.nan
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return action * (theta @ weight) + torch.randn(len(theta), 30)
+
+    prior = BoxUniform(-3 * torch.ones(num_parameters), 3 * torch.ones(num_parameters))
+    inference = ASBI(prior, show_progress_bars=False)
+    trials = [Observation(torch.ones(1), row) for row in x]
+    belief = inference.update_all(
+        trials,
+        simulator=simulator,
+        seed=7,
+        refinement=Refinement(num_histories=600, num_particles=2_000),
+    )
+    with forked_generators(0):
+        draws = belief.sample(torch.Size([64]))
+    return [draws.mean(0), draws, belief.log_prob(draws)]
+
+
+def adoption() -> list[Any]:
+    """Return a campaign before and after it adopts an effect."""
+    problem = draw_case(get_world("A"), "library", 1, num_trials=8).problem
+    options = replace(SMALL, refinement=Refinement(num_histories=400))
+    run = Campaign(
+        problem.model,
+        problem.prior,
+        problem.actions,
+        effects=problem.effects,
+        seed=1,
+        options=options,
+    )
+    trials = problem.trials
+    for action, x in zip(trials.action[:6], trials.x[:6], strict=True):
+        run.tell(x, action=action)
+    run.tell(status="missing", action=trials.action[6])
+    run.update()
+    report = run.criticize()
+    run.adopt(report)
+    run.withdraw(2)
+    run.update()
+    with forked_generators(0):
+        draws = run.belief.sample(torch.Size([64]))
+    scores = [[t.surprise, t.misfit, t.information_gained] for t in run.history]
+    return [report.verdict, draws, scores, run.health]
 
 
 def verdict(world: str, kind: Any, number: int) -> list[Any]:
@@ -223,6 +282,9 @@ def runs() -> Iterator[tuple[str, Run]]:
     for variant in CURVES:
         yield f"refinement, {variant}", lambda v=variant: refinement(v, declared=False)
     yield "refinement, jump, declared noise", lambda: refinement("jump", declared=True)
+    for number in (4, 12):
+        yield f"refinement, {number} parameters", lambda d=number: many(d)
+    yield "adoption", adoption
     for world, numbers in (("A", (0, 1)), ("B", (0, 1)), ("C", (0,))):
         for kind in ("clean", "library"):
             for number in numbers:
@@ -282,7 +344,8 @@ def main() -> int:
         seconds = time.process_time() - start
         print(f"{name}: {'same' if same else 'DIFFERS'}, {seconds:.1f} CPU s")
     if arguments.write:
-        text = {"environment": environment(), "runs": made}
+        ordered = {name: made[name] for name, _ in runs()}
+        text = {"environment": environment(), "runs": ordered}
         FIGURES.write_text(json.dumps(text, indent=1) + "\n")
         return 0
     if different and known.get("environment") != environment():
