@@ -16,7 +16,7 @@ from sbi_active.actions import (
     MixedActions,
 )
 from sbi_active.campaign import Campaign, CampaignOptions, StopRules, Trial
-from sbi_active.designer import Design, InformationGainDesigner, RandomDesigner
+from sbi_active.design.designer import Design, InformationGainDesigner, RandomDesigner
 from sbi_active.inference import (
     ALHI,
     ASBI,

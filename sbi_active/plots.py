@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.designer import Design
+from sbi_active.design.designer import Design
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,8 +15,8 @@ from sbi_active import (
     Simulations,
     SimulatorModel,
 )
-from sbi_active.choice import choose
-from sbi_active.search.elimination import Estimates
+from sbi_active.design.choice import choose
+from sbi_active.design.elimination import Estimates
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
 from tests.test_designer import ACTIONS, VALUES
 

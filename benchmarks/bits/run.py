@@ -98,7 +98,8 @@ def campaign(method: str) -> list[Any]:
     run = Campaign(
         task.simulator, task.prior, task.actions, method=method, seed=3, options=options
     )
-    run.run(task.real_system, num_rounds=2)
+    with forked_generators(4):
+        run.run(task.real_system, num_rounds=2)
     with forked_generators(0):
         draws = run.belief.sample(torch.Size([64]))
     trials = [[t.action, t.x, t.surprise, t.log_score] for t in run.history]
@@ -314,7 +315,7 @@ def figures(made: list[Any]) -> dict[str, Any]:
     """Return the digest of what a run made, and its first entry to be read."""
     digest = hashlib.sha256(b"|".join(numbers(made))).hexdigest()
     first = made[0]
-    shown = first.flatten().tolist()[:4] if isinstance(first, Tensor) else first
+    shown = str(first.flatten().tolist()[:4] if isinstance(first, Tensor) else first)
     return {"digest": digest, "first": shown}
 
 

@@ -15,7 +15,7 @@ from benchmarks.criticism.cases import Case
 from benchmarks.criticism.oracle import oracle_rmse
 from sbi_active import SimulatorModel
 from sbi_active.criticism import close_loop
-from sbi_active.criticism.report import Report
+from sbi_active.criticism.report.report import Report
 
 __all__ = ["COLUMNS", "counted", "score_case"]
 

@@ -3,8 +3,8 @@ r"""Policies: where to measure next, given the measurements so far.
 *Random* draws :math:`\xi \sim \mathcal N(0, I_2)`. *Fixed* visits the places of one
 static design (:mod:`benchmarks.location_finding.static_design`), whatever is measured.
 *Myopic* is this library's loop: after every trial the belief is refined from all trials
-by :class:`~sbi_active.ASBI`, and the next place is the one of greatest expected
-information gain, by :class:`~sbi_active.InformationGainDesigner`, among candidates that
+by :class:`.ASBI`, and the next place is the one of greatest expected
+information gain, by :class:`.InformationGainDesigner`, among candidates that
 are drawn for this trial. *Myopic on particles* differs in the belief alone, which is
 that of :mod:`benchmarks.location_finding.particles`.
 """

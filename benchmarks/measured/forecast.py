@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from sbi_active.criticism.errors import NoiseGrid
-from sbi_active.criticism.noise_grid import declared_noise
-from sbi_active.criticism.residual_process import ResidualProcess
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED
-from sbi_active.criticism.rival_set import RivalSet
-from sbi_active.criticism.trial_simulator import TrialSimulator
-from sbi_active.criticism.trials import Trials
+from sbi_active.criticism.rivals.error_models import NoiseGrid
+from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 
 __all__ = ["Forecast", "aligned_error", "forecast"]
 

@@ -28,9 +28,9 @@ from benchmarks.robustness.small_loop import (
 )
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.report import Report
-from sbi_active.criticism.suspects import suspects
-from sbi_active.criticism.trials import Role
+from sbi_active.criticism.data.trials import Role
+from sbi_active.criticism.report.report import Report
+from sbi_active.criticism.report.suspects import suspects
 
 ATTACKS = Attacks()
 

@@ -13,7 +13,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
-from sbi_active.criticism.report import Report
+from sbi_active.criticism.report.report import Report
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.health import Health, assess
+from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learner import Learner
 from sbi_active.campaign.limits import Limits
@@ -49,7 +49,7 @@ class Campaign:
         actions: What the robot may do.
         method: "asbi", "alhi" (a surrogate likelihood) and "seqbed" (ratios) design
             actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
-        effects: What the simulator may lack, see :class:`~sbi_active.criticism.Effect`.
+        effects: What the simulator may lack, see :class:`.Effect`.
             With them, actions are also chosen to tell whether it does.
         cost: Of actions (n, action_dim), shape (n,), positive; or one number an action
             of a list. Actions are then chosen for their information by cost.
@@ -353,7 +353,7 @@ class Campaign:
             effects: What the simulator may lack, None takes the campaign's; those
                 already adopted are left out. The first library of a model counts as
                 frozen: with another one, or other priors, the report is "exploratory".
-            evaluate: As in :func:`~sbi_active.criticism.close_loop`.
+            evaluate: As in :func:`.close_loop`.
 
         Returns:
             The report; :meth:`adopt` takes it.

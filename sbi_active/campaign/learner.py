@@ -13,21 +13,21 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
-from sbi_active.campaign.methods import find_method
-from sbi_active.campaign.score import score_outcome
-from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.unexplained import (
+from sbi_active.campaign.checks.score import score_outcome
+from sbi_active.campaign.checks.unexplained import (
     doubts,
     in_doubt,
     is_suspect,
     outlyingness,
     simulate_prior,
 )
+from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
+from sbi_active.campaign.methods import find_method
+from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference import information_gained
-from sbi_active.inference.belief import require_support, require_width
-from sbi_active.inference.regression_error import LARGE
-from sbi_active.inference.rounds import Observation, UnexplainedOutcomeError
+from sbi_active.inference.beliefs.belief import require_support, require_width
+from sbi_active.inference.refinement.regression_error import LARGE
+from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 
@@ -203,7 +203,7 @@ class Learner:
         """Replace the belief by that of these trials, from scratch.
 
         Returns:
-            Its misfit to them, as in :class:`~sbi_active.campaign.ModelVersion`.
+            Its misfit to them, as in :class:`.ModelVersion`.
         """
         self.restart()
         explained = [t for t in map(self._examine, trials) if t.is_explained]

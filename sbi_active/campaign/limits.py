@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.choice import pricing
-from sbi_active.eligibility import Permission
+from sbi_active.design.choice import pricing
+from sbi_active.design.eligibility import Permission
 
 __all__ = ["Limits"]
 

@@ -32,7 +32,7 @@ class Method:
         build: Makes the trainer of a prior and a campaign's options.
         estimator: What is trained by default.
         faithful: Options of the setting of the method's authors that differ from those
-            of :meth:`~sbi_active.CampaignOptions.faithful`.
+            of :meth:`.CampaignOptions.faithful`.
     """
 
     designs: bool
@@ -108,7 +108,7 @@ def find_method(name: str) -> Method:
 def faithful_options(name: str) -> CampaignOptions:
     """Return the setting of a method's authors, for the numerical experiment.
 
-    That is :meth:`~sbi_active.CampaignOptions.faithful` for ASBI and NSBI; ALHI and
+    That is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and
     NLHI have the same network on x given (theta, action), beliefs by kernel density
     estimation and nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total
     of simulations.

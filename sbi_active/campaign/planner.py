@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from sbi_active.campaign.checks.unlike import most_unlike
 from sbi_active.campaign.learner import Learner
 from sbi_active.campaign.limits import Limits
 from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.unlike import most_unlike
-from sbi_active.design import Design, action_name
-from sbi_active.designer import InformationGainDesigner, RandomDesigner
+from sbi_active.design.design import Design, action_name
+from sbi_active.design.designer import InformationGainDesigner, RandomDesigner
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -41,7 +41,10 @@ class Planner:
     def __init__(
         self, limits: Limits, state: CampaignState, effects: Sequence[Effect]
     ) -> None:
-        from sbi_active.criticism.declarations import require_distinct, require_nested
+        from sbi_active.criticism.effects.declarations import (
+            require_distinct,
+            require_nested,
+        )
 
         require_distinct(effects)
         require_nested(effects)
@@ -114,7 +117,7 @@ class Planner:
 
         Args:
             index: Of the trial.
-            target: As in :meth:`~sbi_active.Campaign.ask`.
+            target: As in :meth:`.Campaign.ask`.
             learner: Of the current simulator.
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.

@@ -12,10 +12,10 @@ from typing import Any, Literal
 from torch import Tensor
 
 from sbi_active.campaign.stopping import StopRules
-from sbi_active.designer import Design
-from sbi_active.inference.kernel_belief import Bandwidth
-from sbi_active.inference.mixture_density import MixtureDensity
-from sbi_active.inference.refine import Refinement
+from sbi_active.design.designer import Design
+from sbi_active.inference.beliefs.kernel_belief import Bandwidth
+from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.inference.refinement.stages import Refinement
 
 __all__ = [
     "FAR",
@@ -42,16 +42,16 @@ class CampaignOptions:
         num_simulations: Rows a round to train on.
         num_samples: Simulations a candidate action for the expected information gain,
             half to choose and half to report.
-        density_estimator: What is learned: as in :class:`~sbi_active.ASBI` and
-            :class:`~sbi_active.ALHI`; for "seqbed" a classifier as in
-            :class:`~sbi_active.SeqBED_C`, or :class:`~sbi_active.inference.LFIRE`.
+        density_estimator: What is learned: as in :class:`.ASBI` and
+            :class:`.ALHI`; for "seqbed" a classifier as in
+            :class:`.SeqBED_C`, or :class:`.LFIRE`.
         posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
-            :class:`~sbi_active.ALHI`.
+            :class:`.ALHI`.
         bandwidth: Of kernels, where a belief has them.
         estimator: Of the expected information gain, as in
-            :class:`~sbi_active.InformationGainDesigner`; "posterior" is the paper's.
+            :class:`.InformationGainDesigner`; "posterior" is the paper's.
         eliminate: Whether candidates far behind the leader get no further samples.
-        exponent: Of the choice, as in :class:`~sbi_active.InformationGainDesigner`; inf
+        exponent: Of the choice, as in :class:`.InformationGainDesigner`; inf
             takes the best.
         design_on: "fresh" simulations, or those of the "training", which costs none
             further; the estimates are then too high, the more so the fewer rows.
@@ -68,9 +68,9 @@ class CampaignOptions:
             is to be learned about the parameters: at as many settings as parameters
             any simulator fits, and nothing tells that it is wrong. None never checks.
             A campaign that is given effects turns to the model by itself.
-        stop: When :meth:`~sbi_active.Campaign.run` ends before its last round.
+        stop: When :meth:`.Campaign.run` ends before its last round.
         num_workers: Of all simulations, see
-            :func:`~sbi_active.simulation.simulate`.
+            :func:`.simulate`.
         time_limit: Seconds a simulated row may take; None waits for ever. With it, or
             with more than one worker, a simulator that ends its process costs a row.
         num_retries: How often a row that a fault lost is tried again.
@@ -98,7 +98,7 @@ class CampaignOptions:
 
     @property
     def engine(self) -> dict[str, Any]:
-        """Options of :func:`~sbi_active.simulation.simulate`."""
+        """Options of :func:`.simulate`."""
         return {
             "num_workers": self.num_workers,
             "time_limit": self.time_limit,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch.distributions import Distribution
 
-from sbi_active.design import Design
+from sbi_active.design.design import Design
 from sbi_active.seeding import derive_seed, forked_generators
 
 __all__ = ["StopRules"]
@@ -18,7 +18,7 @@ NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
 
 @dataclass(frozen=True, kw_only=True)
 class StopRules:
-    """Rules by which :meth:`~sbi_active.Campaign.run` ends before its last round.
+    """Rules by which :meth:`.Campaign.run` ends before its last round.
 
     Any one ends it, but none while the campaign's health is not "ok": a simulator that
     lacks something makes a belief narrow at a wrong place, which is what both rules

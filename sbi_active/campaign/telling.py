@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
-from sbi_active.inference.condition import action_rows, outcome_rows
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 
 __all__ = ["find_trial", "told_trial"]
 

@@ -22,7 +22,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate
 from sbi_active.simulation.bank import Bank
 from sbi_active.simulation.bank.labeled import LabeledStore
-from sbi_active.simulation.store import run_digest
+from sbi_active.simulation.workers.store import run_digest
 from sbi_active.tasks import TASKS  # pyright: ignore
 
 __all__ = ["add_parser"]

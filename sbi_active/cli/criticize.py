@@ -19,8 +19,8 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.cli.check import actions_of, numbers_of, prior_of
 from sbi_active.cli.loading import load_object
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
-from sbi_active.criticism.augmented import takes_times
-from sbi_active.criticism.tables import TrialTable, read_table
+from sbi_active.criticism.data.table import TrialTable, read_table
+from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import TASKS, get_task  # pyright: ignore
 

@@ -22,7 +22,7 @@ from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.methods import METHODS, faithful_options, find_method
 from sbi_active.cli.options import add_options, make_task
-from sbi_active.inference.mixture_density import MixtureDensity
+from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate

@@ -1,11 +1,12 @@
 """The closed loop: find the residual, trace it to an effect, add it, report."""
 
-from sbi_active.criticism.augmented import AugmentedSimulator
 from sbi_active.criticism.criticism import Criticism, close_loop
-from sbi_active.criticism.effects import Context, Effect
-from sbi_active.criticism.generic import generic_effects
-from sbi_active.criticism.joint import JointPrior, joint_prior
-from sbi_active.criticism.report import Report
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.generic import generic_effects
+from sbi_active.criticism.effects.joint_prior import JointPrior, joint_prior
+from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import (
     Detection,
     Estimate,
@@ -16,7 +17,6 @@ from sbi_active.criticism.results import (
     SevereTest,
     Tracing,
 )
-from sbi_active.criticism.trials import Trials
 
 __all__ = [
     "AugmentedSimulator",

@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.criticism.augmented import AugmentedSimulator
-from sbi_active.criticism.detection import detect
-from sbi_active.criticism.effects import Effect
-from sbi_active.criticism.equivalence import equivalent_effects
-from sbi_active.criticism.evaluation import evaluate_held_out, evaluate_left_out
-from sbi_active.criticism.formulas import guess
-from sbi_active.criticism.influence import unless_refuted
-from sbi_active.criticism.joint import joint_prior
-from sbi_active.criticism.next_action import choose_action
-from sbi_active.criticism.residuals import find_residuals
+from sbi_active.criticism.checks import digest, require_fitting, with_noise
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.joint_prior import joint_prior
+from sbi_active.criticism.effects.summaries import MANY, MOST, can_summarize, summarize
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
@@ -29,16 +27,18 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.rival_set import RivalSet
-from sbi_active.criticism.summaries import MANY, MOST, can_summarize, summarize
-from sbi_active.criticism.tracing import trace
-from sbi_active.criticism.trials import Trials
-from sbi_active.criticism.validation import digest, require_fitting, with_noise
+from sbi_active.criticism.steps.detection import detect
+from sbi_active.criticism.steps.equivalence import equivalent_effects
+from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
+from sbi_active.criticism.steps.formulas import guess
+from sbi_active.criticism.steps.influence import unless_refuted
+from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.tracing import trace
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
-    from sbi_active.criticism.report import Report
+    from sbi_active.criticism.report.report import Report
 
 __all__ = ["Criticism", "close_loop"]
 
@@ -252,9 +252,9 @@ class Criticism:
             exploratory: Library or priors were changed after the data were seen, of
                 which it warns too.
         """
-        from sbi_active.criticism.psis_loo import leave_one_out
-        from sbi_active.criticism.report import build_report
-        from sbi_active.criticism.severe_tests import severe_tests
+        from sbi_active.criticism.next_trial.severe_tests import severe_tests
+        from sbi_active.criticism.report.report import build_report
+        from sbi_active.criticism.steps.leave_one_out import leave_one_out
 
         tracing = self.trace()
         evaluation = self.evaluate() if evaluate else None

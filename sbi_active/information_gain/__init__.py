@@ -4,20 +4,22 @@ from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
-from sbi_active.information_gain.contrastive import ContrastiveGain
-from sbi_active.information_gain.entropy import EntropyGain
-from sbi_active.information_gain.info_nce import InfoNCEGain
-from sbi_active.information_gain.likelihood import LikelihoodGain
-from sbi_active.information_gain.model_index import (
+from sbi_active.information_gain.estimators.contrastive import ContrastiveGain
+from sbi_active.information_gain.estimators.entropy import EntropyGain
+from sbi_active.information_gain.estimators.info_nce import InfoNCEGain
+from sbi_active.information_gain.estimators.likelihood import LikelihoodGain
+from sbi_active.information_gain.estimators.model_index import (
     ModelIndexGain,
     RivalPredictive,
     RivalSampler,
 )
-from sbi_active.information_gain.nested import NestedGain
-from sbi_active.information_gain.parameters import ParameterGain
-from sbi_active.information_gain.posterior import PosteriorGain
-from sbi_active.information_gain.ratio import RatioGain
-from sbi_active.information_gain.variational_nested import VariationalNestedGain
+from sbi_active.information_gain.estimators.nested import NestedGain
+from sbi_active.information_gain.estimators.parameters import ParameterGain
+from sbi_active.information_gain.estimators.posterior import PosteriorGain
+from sbi_active.information_gain.estimators.ratio import RatioGain
+from sbi_active.information_gain.estimators.variational_nested import (
+    VariationalNestedGain,
+)
 
 __all__ = [
     "CandidateSimulations",

@@ -37,10 +37,10 @@ class CandidateSampler:
         belief: Distribution of the parameters.
         action: Candidates, shape (a, action_dim).
         seed: Of everything drawn.
-        engine: Options of every :func:`~sbi_active.simulation.simulate`; None for none.
+        engine: Options of every :func:`.simulate`; None for none.
         others: Actions whose outcomes will be known as well, shape (p, action_dim);
             every draw then holds joint outcomes
-            (:func:`~sbi_active.information_gain.joint.join_outcomes`). None for none.
+            (:func:`.join_outcomes`). None for none.
 
     Attributes:
         action: Candidates, to which more may be added between draws.

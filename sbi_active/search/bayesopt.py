@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.search.base import Evaluations, Objective
-from sbi_active.search.coordinates import Coordinates
+from sbi_active.search.cube import Coordinates
 from sbi_active.search.sequential import SequentialSearch, permitted_points, spaced
 from sbi_active.seeding import derive_seed, forked_generators
 

@@ -13,7 +13,7 @@ __all__ = ["ExhaustiveSearch"]
 class ExhaustiveSearch(Search):
     """Compare all actions of a list.
 
-    They meet in :func:`~sbi_active.search.elimination.eliminate`, on common random
+    They meet in :func:`.eliminate`, on common random
     numbers.
     """
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.search.base import Evaluations, Objective
-from sbi_active.search.coordinates import Coordinates
+from sbi_active.search.cube import Coordinates
 from sbi_active.search.sequential import (
     SequentialSearch,
     permitted_points,
@@ -38,7 +38,7 @@ class GradientSearch(SequentialSearch):
         E[\log q(\theta_i | x_i, \xi_i) - \log p(\theta_i) \mid \xi_i] = U(\xi_i),
 
     so that a regression :math:`\mu(\xi) \pm s(\xi)` of them
-    (:class:`~sbi_active.search.Surrogate`) has the gradient that U is lacking; as has
+    (:class:`.Surrogate`) has the gradient that U is lacking; as has
     one of what other estimators give, on common random numbers. Where simulations are
     given and the estimator scores rows one by one, such as the paper's, they are all
     that is needed. Otherwise the utility is evaluated at actions that fill the space,

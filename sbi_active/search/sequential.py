@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 from sbi_active.search.base import Evaluations, Objective, Search
-from sbi_active.search.coordinates import Coordinates
+from sbi_active.search.cube import Coordinates
 from sbi_active.seeding import derive_seed
 
 __all__ = ["SequentialSearch"]

@@ -1,12 +1,13 @@
 """Simulators, their noise, and the engine that runs them."""
 
-from sbi_active.simulation.autocorrelated import AutocorrelatedNoise
 from sbi_active.simulation.bank import Bank, ReusedRows, reuse
 from sbi_active.simulation.check import check_simulator
-from sbi_active.simulation.engine import simulate
 from sbi_active.simulation.model import Simulator, SimulatorModel, require_noise
-from sbi_active.simulation.noise import GaussianNoise, NoiseModel
-from sbi_active.simulation.noise_estimation import estimate_noise
+from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise
+from sbi_active.simulation.noise.estimation import estimate_noise
+from sbi_active.simulation.noise.gaussian import GaussianNoise, NoiseModel
+from sbi_active.simulation.noise.student import StudentTNoise
+from sbi_active.simulation.noise.unknown import unknown_noise
 from sbi_active.simulation.outcomes import (
     MissingRowsWarning,
     Outcome,
@@ -14,10 +15,9 @@ from sbi_active.simulation.outcomes import (
     SimulationInterrupted,
     Simulations,
 )
-from sbi_active.simulation.simulator_report import SimulatorReport
-from sbi_active.simulation.store import RowStore
-from sbi_active.simulation.student import StudentTNoise
-from sbi_active.simulation.unknown_noise import unknown_noise
+from sbi_active.simulation.report import SimulatorReport
+from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.store import RowStore
 
 __all__ = [
     "AutocorrelatedNoise",

@@ -14,11 +14,11 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
-from sbi_active.simulation.engine import simulate
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
+from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.simulator import outcome_tensor, require_noise
-from sbi_active.simulation.simulator_report import SimulatorReport
+from sbi_active.simulation.workers.engine import simulate
 
 __all__ = ["SimulatorReport", "check_simulator"]
 
@@ -47,7 +47,7 @@ def check_simulator(
 
     Args:
         simulator: ``simulator(theta, action)``, see
-            :class:`~sbi_active.simulation.Simulator`.
+            :class:`.Simulator`.
         prior: Over the parameters.
         actions: What the robot may do; the values of a discrete space are all run.
         num_rows: Rows a check, at least 16.

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.seeding import forked_generators, row_seeds
-from sbi_active.simulation.noise import NoiseModel
+from sbi_active.simulation.noise.gaussian import NoiseModel
 from sbi_active.simulation.simulator import (
     Simulator,
     all_finite,

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.distributions import Beta, Distribution, HalfNormal, Independent, Normal
 
 from sbi_active.criticism import Effect
-from sbi_active.criticism.effects import Context
+from sbi_active.criticism.effects.effect import Context
 
 __all__ = ["make_effects"]
 

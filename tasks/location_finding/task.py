@@ -23,7 +23,7 @@ REACH, SPACING = 3.0, 0.25
 class LocationFindingTask(Task):
     r"""Find hidden sources by measuring their signal at places of our choice.
 
-    Model and reference stand in :mod:`sbi_active.tasks.location_finding.model`. The
+    Model and reference stand in :mod:`.model`. The
     action is a place in the plane; ``actions`` is a grid over [-3, 3]^2, which any set
     of places may replace.
 

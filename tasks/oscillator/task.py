@@ -30,7 +30,7 @@ __all__ = ["OscillatorTask"]
 class OscillatorTask(Task):
     r"""Shake an oscillator and find its frequency, damping, gain and delay.
 
-    Model and units stand in :mod:`sbi_active.tasks.oscillator.model`. The candidate
+    Model and units stand in :mod:`.model`. The candidate
     actions are 35 pairs of amplitude and frequency.
 
     Args:

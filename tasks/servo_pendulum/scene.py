@@ -47,7 +47,7 @@ def mujoco_angles(
     """Return the angles that the encoder reads in one recorded trial.
 
     Args:
-        theta: As in :mod:`sbi_active.tasks.servo_pendulum.model`, shape (5,).
+        theta: As in :mod:`.model`, shape (5,).
         recordings: Hold the trial.
         trial: Row of the recordings.
         coulomb: Dry friction, N m.

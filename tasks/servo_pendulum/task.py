@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sbi_active.actions import DiscreteActions
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.trials import Role
+from sbi_active.criticism.data.trials import Role
 from sbi_active.simulation import NoiseModel, SimulatorModel
 from sbi_active.tasks.base import Task
 from sbi_active.tasks.servo_pendulum.effects import make_effects
@@ -43,7 +43,7 @@ class ServoPendulumTask(Task):
 
     The parameters are torque constant, resistance, gain of the controller, armature and
     zero of the encoder, uniform around the data sheet; model and units stand in
-    :mod:`sbi_active.tasks.servo_pendulum.model`. An action is one of the recorded
+    :mod:`.model`. An action is one of the recorded
     trials, (kp, number of the goal trajectory), and x the angle at 5 Hz. The real
     system replays what was recorded.
 

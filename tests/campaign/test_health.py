@@ -8,8 +8,8 @@ import torch
 from scipy.integrate import quad
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_active.campaign.health import assess, log_e_value
-from sbi_active.campaign.score import score_outcome
+from sbi_active.campaign.checks.health import assess, log_e_value
+from sbi_active.campaign.checks.score import score_outcome
 from sbi_active.campaign.state import (
     CampaignOptions,
     CampaignState,

@@ -11,13 +11,13 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.combinations import log_prior
-from sbi_active.criticism.errors import NoiseCell, NoiseGrid
-from sbi_active.criticism.measurements import Measurements
-from sbi_active.criticism.noise_grid import declared_noise
-from sbi_active.criticism.residual_process import ResidualProcess
-from sbi_active.criticism.rival_set import RivalSet
-from sbi_active.criticism.unknown_scale import SCALES, log_evidence
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.unknown_scale import SCALES, log_evidence
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.steps.combinations import log_prior
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 ACTION = torch.linspace(-2, 2, 8)[:, None]

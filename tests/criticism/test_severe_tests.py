@@ -14,9 +14,9 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.criticism import Criticism, Effect, Trials, generic_effects
-from sbi_active.criticism.outside import extrapolated
-from sbi_active.criticism.predictive import predict
-from sbi_active.criticism.severe_tests import severe_tests
+from sbi_active.criticism.next_trial.outside import extrapolated
+from sbi_active.criticism.next_trial.severe_tests import severe_tests
+from sbi_active.criticism.steps.predictive import predict
 
 NOISE = 0.01
 ANGLES = DiscreteActions(
@@ -93,7 +93,7 @@ def test_the_verdict_fails_most_where_it_is_put_to_the_test(aliased):
 
 def _missed(criticism, action):
     """Return how far the verdict is from the truth, root mean square over x."""
-    from sbi_active.criticism.candidates import following
+    from sbi_active.criticism.next_trial.candidates import following
 
     trials = following(criticism.rivals, action[None])
     names = criticism.trace().chosen

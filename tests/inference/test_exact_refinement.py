@@ -12,18 +12,18 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.inference.coordinates import PriorCoordinates
-from sbi_active.inference.exact_belief import ExactBelief
-from sbi_active.inference.importance import importance_sample
-from sbi_active.inference.kernels import EitherProposal, KernelProposal
-from sbi_active.inference.refine import Refinement, refine
-from sbi_active.inference.refined_belief import RefinedBelief
-from sbi_active.inference.regions import PriorProposal
-from sbi_active.inference.simulated_likelihood import (
+from sbi_active.inference.refinement.importance import importance_sample
+from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.refinement.simulated_belief import ExactBelief
+from sbi_active.inference.refinement.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
 )
+from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference.regression.regions import PriorProposal
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.simulation.outcomes import MissingRowsWarning

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from sbi_active.inference.population import (
+from sbi_active.inference.sampling.population import (
     GaussianMixture,
     StudentProposal,
     population_monte_carlo,
 )
-from sbi_active.inference.unbounding import Unbounding
+from sbi_active.inference.sampling.unbounding import Unbounding
 
 
 class Box:

@@ -4,10 +4,10 @@ import numpy as np
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.inference.coordinates import PriorCoordinates
-from sbi_active.inference.population import Particles
-from sbi_active.inference.refined_belief import RefinedBelief
-from sbi_active.inference.regions import PriorProposal
+from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.regression.regions import PriorProposal
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.population import Particles
 
 
 def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():

@@ -17,9 +17,7 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference.coordinates import PriorCoordinates
-from sbi_active.inference.population import Particles
-from sbi_active.inference.regions import (
+from sbi_active.inference.regression.regions import (
     SPREAD,
     PriorProposal,
     Region,
@@ -28,6 +26,8 @@ from sbi_active.inference.regions import (
     nearest_region,
     whole_space,
 )
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.population import Particles
 
 PRIORS = {
     "box": BoxUniform(torch.tensor([-5.0, 0.0]), torch.tensor([5.0, 1e-3])),

@@ -5,9 +5,13 @@ import math
 import pytest
 import torch
 
-from sbi_active.inference.baseline import Baseline, _cholesky
-from sbi_active.inference.response import Response
-from sbi_active.inference.scaling import ActionScaling, Polynomials, exponents_of
+from sbi_active.inference.networks.action_scaling import (
+    ActionScaling,
+    Polynomials,
+    exponents_of,
+)
+from sbi_active.inference.networks.baseline import Baseline, _cholesky
+from sbi_active.inference.networks.response import Response
 
 
 @pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from sbi_active.inference.outcome_checks import BLURRED
-from sbi_active.inference.regions import whole_space
-from sbi_active.inference.validity import TrialOutcome, outcomes_of
+from sbi_active.inference.refinement.outcome_checks import BLURRED
+from sbi_active.inference.regression.outcomes import TrialOutcome, outcomes_of
+from sbi_active.inference.regression.regions import whole_space
 
 NUM = 500
 NONE = np.zeros((0, 2), dtype=bool)

@@ -22,8 +22,8 @@ from sbi_active.information_gain import (
     NestedGain,
     PosteriorGain,
 )
-from sbi_active.information_gain.classification import cross_fitted, probability
-from sbi_active.information_gain.presence import (
+from sbi_active.information_gain.fits.classification import cross_fitted, probability
+from sbi_active.information_gain.fits.presence import (
     presence_information,
     presence_notes,
     random_presence,

@@ -4,7 +4,7 @@ import torch
 from sbi_active import BoxActions, DiscreteActions
 from sbi_active.actions import ActionSpace
 from sbi_active.search import ExhaustiveSearch, GradientSearch
-from sbi_active.search.coordinates import Coordinates
+from sbi_active.search.cube import Coordinates
 from sbi_active.search.gradient import ascend
 from tests.search.known import BEST, SPACE, Counted, objective, utility
 

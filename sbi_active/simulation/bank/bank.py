@@ -28,7 +28,7 @@ from sbi_active.simulation.bank.positions import positions
 from sbi_active.simulation.bank.shelf import COLUMN_NAMES, Shelf
 from sbi_active.simulation.bank.stored_index import StoredIndex
 from sbi_active.simulation.outcomes import Outcome, Simulations
-from sbi_active.simulation.store import run_digest
+from sbi_active.simulation.workers.store import run_digest
 
 __all__ = ["Bank", "LabeledStore"]
 

@@ -1,0 +1,190 @@
+"""How well a trial was predicted, before it is used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.campaign.checks.spread import Spread
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
+
+__all__ = ["Score", "score_outcome"]
+
+#: Numbers of x up to which a kernel estimate says more than a Gaussian.
+MAX_DIM = 8
+TIE = 1e-9  # of a distance, by which rounding may part equal ones
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well an outcome was predicted.
+
+    Attributes:
+        surprise: Tail probability, in (0, 1].
+        log_score: Log density, nats.
+        num_simulations: Spent.
+        num_missing: Of them lost to faults of the simulator.
+    """
+
+    surprise: float
+    log_score: float
+    num_simulations: int
+    num_missing: int
+
+
+def score_outcome(
+    x: Tensor,
+    action: Tensor,
+    simulator: Callable[..., Any],
+    belief: Distribution,
+    *,
+    num_samples: int,
+    seed: int,
+    engine: Mapping[str, Any] | None = None,
+) -> Score:
+    r"""Compare an outcome with simulations from the belief before it.
+
+    .. math::
+        p = \frac{\#\{i \le n + 1 : D(x_i) \ge D(x_{n + 1})\}}{n + 1}, \qquad
+        x_i \sim p(x | \theta_i, \xi), \quad \theta_i \sim b,
+
+    with :math:`x_{n + 1}` the outcome and D the Mahalanobis distance by the mean and
+    covariance of all n + 1, which are exchangeable if the belief is the posterior and
+    the simulator right: p is then uniform (never too small) whatever the number of
+    numbers, and independent of the trials before it.
+
+    Outcomes without a measurement, or those with one, lie further out where they are
+    rarer. Of a trial that was partly measured only what was measured is compared, with
+    the same numbers of the simulations, so that a sensor that drops out is no surprise.
+    A simulator that itself leaves numbers out may be the cause as well; p is then the
+    larger of the two tail probabilities. Numbers that are there where simulations
+    seldom have them do count.
+
+    The log score is that of an equal mixture of a Gaussian and a kernel estimate, of a
+    Gaussian alone beyond 8 numbers, fitted to the simulations that have these numbers,
+    times the share of those.
+
+    Args:
+        x: The outcome, shape x_shape; NaN where nothing was measured.
+        action: The executed one, shape (action_dim,).
+        simulator: ``simulator(theta, action)``.
+        belief: Before the trial.
+        num_samples: n.
+        seed: Of the simulations.
+        engine: Options of :func:`.simulate`.
+
+    References:
+        Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &
+        Shafer, Algorithmic Learning in a Random World, 2005 (conformal p-values).
+    """
+    with forked_generators(seed, "theta"):
+        theta = belief.sample(torch.Size([num_samples]))
+    rows = simulate(
+        simulator,
+        theta,
+        action.expand(num_samples, -1),
+        seed=derive_seed(seed, "x"),
+        **(engine or {}),
+    )
+    drawn = rows.without_missing().x.double().flatten(1)
+    drawn = torch.where(drawn.isfinite(), drawn, torch.nan)
+    observed = x.double().flatten()
+    return Score(
+        surprise=_surprise(torch.cat([drawn, observed[None]])),
+        log_score=_log_score(drawn, observed),
+        num_simulations=num_samples,
+        num_missing=num_samples - len(drawn),
+    )
+
+
+def _surprise(rows: Tensor) -> float:
+    """Return the tail probability of the last row among all, shape (n + 1, q)."""
+    present = rows.isfinite()
+    own = present[-1]
+    if own.all() or not own.any():
+        return _tail(rows)
+    by_sensor = _tail(torch.where(own, rows, torch.nan))
+    is_partial = present.any(1) & ~present.all(1)
+    if not is_partial[:-1].any():
+        return by_sensor
+    return max(by_sensor, _tail(rows))
+
+
+def _tail(rows: Tensor) -> float:
+    """Return the share of rows that lie as far out as the last, itself included."""
+    measured = rows.isfinite().any(1)
+    same = measured == measured[-1]
+    num_same, num_other = int(same.sum()), int((~same).sum())
+    beyond = num_same
+    if measured[-1]:
+        beyond = int(_ranks(_unusual(rows[measured]))[-1])
+    return (beyond + (num_other if num_other <= num_same else 0)) / len(rows)
+
+
+def _unusual(rows: Tensor) -> Tensor:
+    """Return how unusual each row is by its numbers or by having them, shape (n,)."""
+    by_number = _ranks(_distance(rows))
+    present = rows.isfinite()
+    if bool((present == present[0]).all()):
+        return -by_number
+    return -torch.minimum(by_number, _ranks(-_num_with(present)))
+
+
+def _distance(rows: Tensor) -> Tensor:
+    """Return distances that rows with fewer numbers share with others, shape (n,)."""
+    count = rows.isfinite().sum(1)
+    share = (Spread.of(rows).distance / count).pow(1 / 3)  # about Gaussian
+    return (share - 1 + 2 / (9 * count)) * count.sqrt()  # Wilson & Hilferty, 1931
+
+
+def _num_with(present: Tensor) -> Tensor:
+    """Return how many rows have all the numbers that each row has, shape (n,)."""
+    patterns, label, count = present.float().unique(
+        dim=0, return_inverse=True, return_counts=True
+    )
+    contains = patterns @ patterns.T == patterns.sum(1, keepdim=True)
+    return (contains.double() @ count.double())[label]
+
+
+def _ranks(value: Tensor) -> Tensor:
+    """Return how many entries are as large as each, but for rounding, shape (n,)."""
+    ordered = value.sort().values
+    slack = TIE * (1 + value.abs())
+    return len(value) - torch.searchsorted(ordered, value - slack).double()
+
+
+def _log_score(drawn: Tensor, observed: Tensor) -> float:
+    """Return the log density of the outcome times the share that are of its kind."""
+    own, present = observed.isfinite(), drawn.isfinite()
+    is_measured = bool(own.any())
+    same = (present | ~own).all(1) if is_measured else ~present.any(1)
+    num_same, num_kinds = int(same.sum()), len(same.unique())
+    log_share = math.log((num_same + 0.5) / (len(drawn) + num_kinds))
+    if not is_measured:
+        return log_share
+    if num_same == 0:  # no simulation had these numbers
+        return -math.inf
+    return log_share + _log_density(drawn[same][:, own], observed[own])
+
+
+def _log_density(drawn: Tensor, observed: Tensor) -> float:
+    n, q = drawn.shape
+    spread = Spread.of(drawn)
+    root = spread.root()
+    both = torch.cat([drawn, observed[None]]) - spread.mean
+    z = torch.linalg.solve_triangular(root, both.T, upper=False).T
+    log_unit = -root.diagonal().log().sum() - 0.5 * q * math.log(2 * math.pi)
+    log_density = -0.5 * z[-1].square().sum()
+    if n > 1 and q <= MAX_DIM:
+        width = (4 / ((q + 2) * n)) ** (1 / (q + 4))
+        gap = (z[:-1] - z[-1]).square().sum(1) / width**2
+        kernel = (-0.5 * gap).logsumexp(0) - math.log(n) - q * math.log(width)
+        log_density = torch.logaddexp(log_density, kernel) - math.log(2)
+    return float(log_density + log_unit)

@@ -1,0 +1,141 @@
+"""What must hold before models are compared with trials."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.augmented import AugmentedSimulator, takes_times
+from sbi_active.criticism.effects.declarations import require_distinct, require_nested
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.results import CATCH_ALLS, NONE
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.noise.estimation import estimate_noise
+
+__all__ = ["digest", "require_fitting", "with_noise"]
+
+FEWEST_REPEATS = 3
+
+
+def with_noise(
+    model: SimulatorModel, prior: Distribution, trials: Trials
+) -> SimulatorModel:
+    """Return the model with noise from repeats where it is deterministic without."""
+    theta, action = _some_rows(prior, trials)
+    times = _times(model, len(theta))
+    if model.noise is not None or not model.is_deterministic(theta, action, **times):
+        return model
+    fit = trials.fit
+    first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
+    groups = [fit.x[first == i] for i in first.unique()]
+    most = max(len(group) for group in groups)
+    if most < FEWEST_REPEATS:
+        raise ValueError(
+            "expected measurement noise, declared or estimated from at least "
+            f"{FEWEST_REPEATS} repeats of one action; got a deterministic simulator "
+            f"without noise and at most {most} trials of one action, so that nothing "
+            "tells noise from effect; do declare SimulatorModel(fn, noise=...)"
+        )
+    repeated = [group for group in groups if len(group) > 1]
+    noisy = copy.copy(model)
+    has_time = model.sample_times is not None
+    noisy.noise = estimate_noise(
+        repeated,
+        kind="autocorrelated" if has_time else "gaussian",
+        times=model.sample_times,
+        pooled=True,
+    )
+    return noisy
+
+
+def digest(
+    model: SimulatorModel, prior: Distribution, effects: Sequence[Effect]
+) -> str:
+    """Return a hash of the noise, the effects and draws of all priors."""
+    words = [repr(model.noise)]
+    with forked_generators(0, "digest"):
+        words.append(repr(prior.sample(torch.Size([8])).tolist()))
+        for e in effects:
+            words.append(f"{e.name}|{e.hook}|{e.family}|{e.scope}|{e.null}")
+            words.append(repr(e.sample(8).tolist()))
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()[:16]
+
+
+def require_fitting(
+    model: SimulatorModel,
+    prior: Distribution,
+    trials: Trials,
+    effects: Sequence[Effect],
+    actions: ActionSpace | None,
+) -> None:
+    """Raise where the parts of a loop do not fit together."""
+    own = model.parameter_names
+    default = [f"theta_{i + 1}" for i in range(prior.event_shape[0])]
+    require_distinct(effects, default if own is None else own)
+    require_nested(effects)
+    reserved = (NONE, *CATCH_ALLS)
+    taken = [e.name for e in effects if e.name in reserved]
+    if taken:
+        raise ValueError(
+            f"expected effects not named {', '.join(reserved)}; got {taken[0]!r}; do "
+            "choose another name: noise inflation is tried in any case"
+        )
+    num = int(trials.fit.valid.sum())
+    if num < 2:
+        raise ValueError(
+            f"expected at least two valid trials to fit; got {num}; do measure more, "
+            "since one trial fits any model"
+        )
+    if actions is not None and actions.action_dim != trials.action.shape[1]:
+        raise ValueError(
+            f"expected actions of dimension {trials.action.shape[1]}, that of the "
+            f"trials; got {actions.action_dim}; do give the space they were drawn from"
+        )
+    if actions is not None:
+        _warn_outside(trials, actions)
+    theta, action = _some_rows(prior, trials)
+    if model.noise is not None:
+        x = model.mean(theta, action, **_times(model, len(theta)))
+        if not bool(x.isfinite().any()):
+            raise ValueError(
+                "expected a simulator that gives numbers at the trials' actions; got "
+                "NaN or inf throughout; do check its units and those of the actions"
+            )
+    # Compares every effect with the simulator at its null.
+    AugmentedSimulator(model, effects, check=(theta, action))
+
+
+def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
+    """Warn of actions that are not permitted; they are simulated all the same."""
+    dtype = torch.get_default_dtype()
+    outside = ~torch.as_tensor(actions.contains(trials.action.to(dtype)))
+    if not bool(outside.any()):
+        return
+    places = outside.nonzero()[:, 0].tolist()
+    warnings.warn(
+        f"the executed action {trials.action[places[0]].tolist()} of trial {places[0]} "
+        f"is not in {actions} (trials {places}); it is simulated where it was executed",
+        stacklevel=5,
+    )
+
+
+def _times(model: SimulatorModel, num: int) -> dict[str, Tensor]:
+    """Return the model's sample times where its function takes them, (num, k)."""
+    if not takes_times(model) or model.sample_times is None:
+        return {}
+    return {"times": model.sample_times.expand(num, -1)}
+
+
+def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor]:
+    with forked_generators(0, "check"):
+        theta = prior.sample((16,))  # type: ignore[arg-type]
+    return theta, trials.action[[i % len(trials) for i in range(16)]].to(theta.dtype)

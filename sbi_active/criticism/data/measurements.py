@@ -1,0 +1,130 @@
+"""Measured numbers in one row, with what their errors depend on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.trials import Trials
+
+__all__ = ["Measurements"]
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """The measured numbers of some trials, in the order trial, channel, time.
+
+    Attributes:
+        x: Shape (N,).
+        position: Of each in the flattened x of shape (t, *x_shape), shape (N,).
+        trial: Row of its trial, shape (N,).
+        channel: Its channel, shape (N,).
+        time: Its sample time; its place along x's first axis where no times are
+            given, shape (N,).
+        gap: Time since the measured number before it in the same trial and channel;
+            inf for the first, shape (N,).
+        has_time: Whether x has a time axis.
+        valid: Trials with any measurement, shape (t,), bool.
+        shape: (t, *x_shape).
+    """
+
+    x: Array
+    position: NDArray[np.int64]
+    trial: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    time: Array
+    gap: Array
+    has_time: bool
+    valid: Array
+    shape: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls,
+        trials: Trials,
+        model_times: Array | None = None,
+        *,
+        is_sequence: bool = False,
+    ) -> Measurements:
+        """Return the measurements of some trials.
+
+        Args:
+            trials: Their x has a time axis where they, or the model, have sample times.
+            model_times: The simulator's sample times.
+            is_sequence: The first axis of x is a time axis whose samples are counted.
+        """
+        x = trials.x.double().numpy()
+        num, length = x.shape[:2]
+        times = trials.sample_times
+        if times is not None:
+            stamps = times.double().numpy()
+        elif model_times is not None:
+            stamps = model_times
+        else:
+            stamps = np.arange(length, dtype=float)
+        has_time = is_sequence or times is not None or model_times is not None
+        stamps = np.broadcast_to(stamps, (num, length))
+        # (trial, channel, time), where x without a time axis has one "time" a channel.
+        channels = x.reshape(num, length, -1).transpose(0, 2, 1)
+        places = np.arange(x.size).reshape(num, length, -1).transpose(0, 2, 1)
+        if has_time:
+            time = np.broadcast_to(stamps[:, None], channels.shape)
+            channel = np.broadcast_to(
+                np.arange(channels.shape[1])[None, :, None], channels.shape
+            )
+        else:
+            time = np.zeros(channels.shape)
+            channel = places - places.reshape(num, -1).min(1)[:, None, None]
+        trial = np.broadcast_to(np.arange(num)[:, None, None], channels.shape)
+        keep = np.isfinite(channels) & np.isfinite(time)
+        gap = np.full(int(keep.sum()), np.inf)
+        if has_time:
+            a, b, c = trial[keep], channel[keep], time[keep]
+            follows = (a[1:] == a[:-1]) & (b[1:] == b[:-1])
+            gap[1:] = np.where(follows, np.diff(c), np.inf)
+        return cls(
+            channels[keep],
+            places[keep],
+            trial[keep].astype(np.int64),
+            channel[keep].astype(np.int64),
+            time[keep],
+            gap,
+            has_time,
+            np.asarray(np.isfinite(x.reshape(num, -1)).any(1)),
+            x.shape,
+        )
+
+    def bounded(self, center: Array, reach: Array) -> Measurements:
+        """Return the same with numbers that are beyond all reason within a reach.
+
+        What is so far off is wrong whatever its digits are, and in double precision its
+        residual would hold nothing of the simulator any more. Where most trials are, it
+        is the model that is elsewhere, and nothing is changed.
+
+        Args:
+            center: Of what can be expected, shape (N,).
+            reach: How far numbers may be from it, shape (N,).
+        """
+        x = np.clip(self.x, center - reach, center + reach)
+        beyond = np.unique(self.trial[x != self.x])
+        few = 0 < len(beyond) <= self.valid.sum() / 2
+        return replace(self, x=x) if few else self
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @property
+    def step(self) -> float:
+        """Median time between neighboring numbers; 1 without a time axis."""
+        gaps = self.gap[np.isfinite(self.gap)]
+        return float(np.median(gaps)) if len(gaps) else 1.0
+
+    @property
+    def span(self) -> float:
+        """Time from the first to the last number."""
+        return max(float(np.ptp(self.time)), self.step) if len(self) else 1.0

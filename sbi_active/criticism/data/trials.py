@@ -1,0 +1,372 @@
+"""Measured trials: actions, observations and what is known of each."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from sbi_active.criticism.data.arrays import (
+    copied,
+    padded,
+    repeated,
+    require_labels,
+    root,
+)
+from sbi_active.criticism.data.table import read_table
+
+__all__ = ["Role", "Trials"]
+
+Role = Literal["fit", "held out"]
+
+
+class Trials:
+    r"""Measured trials.
+
+    Ragged observations are padded with NaN. NaN is masked, and so is inf, with a
+    warning; a trial of NaN alone is *invalid*: the system ran and gave no measurement.
+    What is given is copied, and may change afterwards.
+
+    Args:
+        action: As commanded, shape (n, action_dim), or (n,) for scalar actions.
+        x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
+        role: "fit", or "held out" of everything that is fitted or chosen; one a
+            trial, or None for all "fit".
+        mask: True where x is a measurement, of the shape of x; None takes what is not
+            NaN.
+        index: Place of each trial in the order of execution, shape (n,); None counts
+            from 0.
+        sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
+        performed_at: When each trial was executed, in any unit, shape (n,).
+        repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
+            none; None takes trials of equal actions as repeats of the first. A repeat
+            of a repeat is one of the first.
+        covariates: Further numbers by name, shape (n,) each.
+        action_labels: What reports call each entry of the action, with its unit.
+        channel_labels: The same of each entry of x's last axis.
+
+    Raises:
+        ValueError: If shapes disagree, numbers are not real, actions or the index not
+            finite, all trials are invalid, or held-out data have no measurement.
+
+    Example:
+        >>> trials = Trials(torch.tensor([1.0, 2.0]), torch.tensor([0.3, 0.5]))
+        >>> len(trials), trials.action.shape, trials.x.shape
+        (2, torch.Size([2, 1]), torch.Size([2, 1]))
+    """
+
+    def __init__(
+        self,
+        action: Any,
+        x: Any,
+        *,
+        role: Sequence[Role] | None = None,
+        mask: Any = None,
+        index: Any = None,
+        sample_times: Any = None,
+        performed_at: Any = None,
+        repeat_of: Any = None,
+        covariates: Mapping[str, Any] | None = None,
+        action_labels: Sequence[str] | None = None,
+        channel_labels: Sequence[str] | None = None,
+    ) -> None:
+        self.action = copied(action)
+        if self.action.ndim == 1:
+            self.action = self.action[:, None]
+        self.x = padded(x)
+        n = len(self.x)
+        if self.action.ndim != 2 or len(self.action) != n or 0 in self.action.shape:
+            raise ValueError(
+                "expected actions (n, action_dim) and x with as many rows; got "
+                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; do give one "
+                "action a trial"
+            )
+        if not bool(self.action.isfinite().all()):
+            raise ValueError(
+                "expected finite actions; got NaN or inf; do give each trial the "
+                "action that was commanded"
+            )
+        if self.x.ndim == 1:
+            self.x = self.x[:, None]
+        if 0 in self.x.shape:
+            raise ValueError(
+                f"expected at least one number in x; got shape {tuple(self.x.shape)}; "
+                "pass what was measured, NaN for a trial without a measurement"
+            )
+        if mask is not None:
+            self.x = self.x.where(self._kept(mask), torch.nan)
+        self.x = _without_inf(self.x)
+        self.role = _roles(role, n)
+        self.index = self._rows("index", index, torch.arange(n))
+        if not bool(self.index.isfinite().all()):
+            raise ValueError(
+                f"expected finite places in index; got {self.index.tolist()}; pass the "
+                "place of each trial in the order of execution, or leave index out"
+            )
+        self.performed_at = (
+            None
+            if performed_at is None
+            else self._rows("performed_at", performed_at, None)
+        )
+        self.sample_times = self._times(sample_times)
+        self.repeat_of = (
+            repeated(self.action)
+            if repeat_of is None
+            else root(self._rows("repeat_of", repeat_of, None))
+        )
+        self.covariates = {
+            name: self._rows(name, value, None)
+            for name, value in (covariates or {}).items()
+        }
+        self.action_labels = require_labels(
+            "action_labels", action_labels, [self.action.shape[1]]
+        )
+        # A trajectory of one channel has none of its own axis.
+        one = [1] if self.x.ndim == 2 and self.sample_times is not None else []
+        self.channel_labels = require_labels(
+            "channel_labels", channel_labels, [self.x.shape[-1], *one]
+        )
+        if not bool(self.valid.any()):
+            raise ValueError(
+                f"expected at least one valid trial; got {n} trials without a "
+                "measurement; do check x and mask for NaN"
+            )
+        lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
+        if lost:
+            raise ValueError(
+                f"expected measurements in the held-out trials; got NaN in trials "
+                f"{lost}; do hold out other trials"
+            )
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | Path,
+        *,
+        columns: Mapping[str, str | Sequence[str]] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> Trials:
+        r"""Return the trials of a CSV file with one row a trial or one row a sample.
+
+        A row is a sample where there are columns "trial" and "time" (in s, or as in
+        "time_ms"). Either way "action_\*" is the action, which like all else that
+        belongs to a trial stands in each of its rows, and "x_\*" the observation.
+        Optional are "role", "index" (the place in the order of execution; without it
+        that of the first row) and "repeat_of" (the index of the trial that is
+        repeated). An empty cell of x is what was not measured. A unit stands in
+        brackets, as in "x_height[m]", and goes into reports.
+
+        Args:
+            path: Of the file; lines that begin with # are comments.
+            columns: Which columns are "trial", "time", "action", "x", "role", "index"
+                and "repeat_of", where they have other names; those left out are then
+                ignored. Several columns may name a trial together.
+            units: By column, where the header has none. Numbers are taken as they are,
+                but for the time, which is converted to seconds.
+
+        Raises:
+            ValueError: If the table is not understood; the text says where.
+        """
+        return cls(**read_table(path, columns=columns, units=units).arguments)
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: pd.DataFrame,
+        *,
+        columns: Mapping[str, str | Sequence[str]] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> Trials:
+        """Return the trials of a data frame, laid out as for :meth:`from_csv`.
+
+        Args:
+            frame: With one row a trial or one row a sample.
+            columns: As in :meth:`from_csv`.
+            units: As there.
+
+        Example:
+            >>> frame = pd.DataFrame(
+            ...     {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2.0, 4.0]}
+            ... )
+            >>> frame["mass"] = [0.1, 0.1, 0.2]
+            >>> trials = Trials.from_dataframe(
+            ...     frame,
+            ...     columns={"trial": "ball", "time": "t", "x": "h", "action": "mass"},
+            ...     units={"h": "m"},
+            ... )
+            >>> trials.x.shape, trials.channel_labels
+            (torch.Size([2, 2]), ('h [m]',))
+        """
+        return cls(**read_table(frame, columns=columns, units=units).arguments)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __repr__(self) -> str:
+        held = len(self.held_out_positions)
+        return (
+            f"Trials({len(self)} x {tuple(self.x.shape[1:])}, {held} held out, "
+            f"{int((~self.valid).sum())} invalid)"
+        )
+
+    def __getitem__(self, positions: Any) -> Trials:
+        return self.select(positions)
+
+    @property
+    def mask(self) -> Tensor:
+        """True where x is a measurement, of the shape of x."""
+        return self.x.isfinite()
+
+    @property
+    def valid(self) -> Tensor:
+        """Trials with a measurement, shape (n,), bool."""
+        return self.mask.flatten(1).any(-1)
+
+    @property
+    def held_out_positions(self) -> list[int]:
+        """Positions of the held-out trials."""
+        return [i for i, role in enumerate(self.role) if role == "held out"]
+
+    @property
+    def fit(self) -> Trials:
+        """The trials that may be fitted."""
+        return self._of("fit")
+
+    @property
+    def held_out(self) -> Trials | None:
+        """The held-out trials; None where there are none."""
+        return self._of("held out") if self.held_out_positions else None
+
+    def template(self) -> tuple[Tensor, Tensor | None]:
+        """Return a trial in which all is measured that any trial has, and its times.
+
+        Returns:
+            Zeros of the shape of one x, NaN where the longest trial has no sample; its
+            sample times, shape (k,), NaN there too, or None.
+        """
+        x, times = torch.zeros_like(self.x[0]), self.sample_times
+        if times is None or times.ndim == 1:
+            return x, times
+        longest = times[int(times.isfinite().sum(-1).argmax())]
+        sampled = longest.isfinite().reshape(-1, *[1] * (x.ndim - 1))
+        return x.where(sampled, torch.nan), longest
+
+    def select(self, positions: Any) -> Trials:
+        """Return some trials, with their indices.
+
+        Args:
+            positions: A slice, positions, or a bool a trial.
+        """
+        at = torch.arange(len(self))[
+            positions if isinstance(positions, slice) else torch.as_tensor(positions)
+        ].reshape(-1)
+        own = torch.arange(len(self))
+        first = torch.where(self.repeat_of < 0, own, self.repeat_of)[at]
+        # Where the first trial is left out, the others repeat the first that is kept.
+        new = {int(place): i for i, place in reversed([*enumerate(first)])}
+        new |= {int(old): i for i, old in enumerate(at)}
+        repeat_of = torch.tensor([new[int(place)] for place in first])
+        times = self.sample_times
+        return Trials(
+            self.action[at],
+            self.x[at],
+            role=[self.role[i] for i in at],
+            index=self.index[at],
+            sample_times=times if times is None or times.ndim == 1 else times[at],
+            performed_at=None if self.performed_at is None else self.performed_at[at],
+            repeat_of=repeat_of,
+            covariates={name: v[at] for name, v in self.covariates.items()},
+            action_labels=self.action_labels,
+            channel_labels=self.channel_labels,
+        )
+
+    def _of(self, role: Role) -> Trials:
+        positions = [i for i, r in enumerate(self.role) if r == role]
+        if not positions:
+            raise ValueError(
+                f"expected at least one trial of role {role!r}; got none of "
+                f"{len(self)}; do change role"
+            )
+        return self.select(positions)
+
+    def _rows(self, name: str, value: Any, default: Tensor | None) -> Tensor:
+        tensor = copied(default if value is None else value)
+        if tensor.shape != (len(self),):
+            raise ValueError(
+                f"expected {name} of shape ({len(self)},), one a trial; got "
+                f"{tuple(tensor.shape)}; do give one each"
+            )
+        return tensor
+
+    def _kept(self, mask: Any) -> Tensor:
+        """Return where x is a measurement; what pads a ragged mask is none."""
+        keep = padded(mask)
+        if keep.ndim == 1 and self.x.shape[1:] == (1,):
+            keep = keep[:, None]
+        if keep.shape != self.x.shape:
+            raise ValueError(
+                f"expected a mask of shape {tuple(self.x.shape)}, that of x; got "
+                f"{tuple(keep.shape)}; do give one an entry of x"
+            )
+        if not bool(((keep == 0) | (keep == 1) | keep.isnan()).all()):
+            wrong = float(keep[(keep != 0) & (keep != 1) & ~keep.isnan()][0])
+            raise ValueError(
+                f"expected a mask of True and False, or 1 and 0; got {wrong:g}; pass "
+                "True where x is a measurement"
+            )
+        return keep == 1
+
+    def _times(self, times: Any) -> Tensor | None:
+        if times is None:
+            return None
+        tensor = padded(times)
+        k = self.x.shape[1]
+        if tensor.shape not in ((k,), (len(self), k)):
+            raise ValueError(
+                f"expected sample_times of shape ({k},) or ({len(self)}, {k}) for x of "
+                f"shape {tuple(self.x.shape)}; got {tuple(tensor.shape)}; do give one "
+                "an entry of x's first axis"
+            )
+        stamps = tensor.expand(len(self), k)
+        measured = self.x.isfinite().reshape(len(self), k, -1).any(-1)
+        for i in range(len(self)):
+            if bool((measured[i] & ~stamps[i].isfinite()).any()):
+                raise ValueError(
+                    f"expected as many sample_times as samples in each trial; got "
+                    f"{int(stamps[i].isfinite().sum())} for "
+                    f"{int(measured[i].nonzero().max()) + 1} samples in trial {i}; do "
+                    "give one an entry of x's first axis"
+                )
+            own = stamps[i][stamps[i].isfinite()]
+            if bool((own.diff() <= 0).any()):
+                raise ValueError(
+                    f"expected sample_times that increase; got {own.tolist()[:6]}... "
+                    f"in trial {i}; do sort its samples by time"
+                )
+        return tensor
+
+
+def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
+    roles: list[Role] = ["fit"] * n if role is None else [*role]
+    if len(roles) != n or not {*roles} <= {"fit", "held out"}:
+        raise ValueError(
+            f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "
+            "do give one each"
+        )
+    return roles
+
+
+def _without_inf(x: Tensor) -> Tensor:
+    """Return x with NaN for inf, and say so: no sensor measures it."""
+    lost = x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
+    if lost:
+        warnings.warn(
+            f"x is inf in trials {lost}: taken as not measured, as NaN is",
+            stacklevel=3,
+        )
+    return x.where(x.isfinite(), torch.nan)

@@ -1,0 +1,71 @@
+"""An effect's ``apply`` on rows: what it gets, and what it may give back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_active.criticism.effects.effect import Context, Effect
+
+__all__ = ["applied"]
+
+
+def applied(
+    effect: Effect, value: Any, phi: Tensor, action: Tensor, context: Context
+) -> Any:
+    """Return what an effect makes of a value.
+
+    It gets copies, so that it may change them in place, and what it gives back is
+    copied, so that it may be a view of what it keeps.
+
+    Args:
+        effect: Of any hook.
+        value: As the hook says; a dict for "dynamics".
+        phi: Shape (n, phi_dim).
+        action: As commanded, shape (n, action_dim).
+        context: Of the rows.
+
+    Raises:
+        ValueError: If ``apply`` gives back another type, shape or kind of number, or a
+            standard deviation that is not positive.
+    """
+    times = None if context.times is None else context.times.clone()
+    own = Context(context.index.clone(), times)
+    changed = effect.apply(_copied(value), phi.clone(), action.clone(), own)
+    if effect.hook == "dynamics":
+        return _keywords(effect, changed)
+    try:
+        result = torch.as_tensor(changed)
+    except (TypeError, ValueError, RuntimeError):
+        result = None
+    if result is None or result.shape != value.shape:
+        got = type(changed).__name__ if result is None else tuple(result.shape)
+        raise ValueError(
+            f"expected apply of effect {effect.name!r} to return the changed "
+            f"{effect.hook} of shape {tuple(value.shape)}; got {got}; return one row "
+            "for each row, with phi of shape (n, phi_dim)"
+        )
+    if result.is_complex() or result.dtype == torch.bool:
+        raise ValueError(
+            f"expected apply of effect {effect.name!r} to return real numbers; got "
+            f"{result.dtype}; return the changed {effect.hook}"
+        )
+    return result.to(value.dtype, copy=True)
+
+
+def _keywords(effect: Effect, changed: Any) -> dict[str, Any]:
+    if not isinstance(changed, Mapping):
+        raise ValueError(
+            f"expected apply of effect {effect.name!r} to return a dict of keyword "
+            f"arguments; got {type(changed).__name__}; return {{**value, name: phi}}"
+        )
+    return {**changed}
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _copied(part) for name, part in value.items()}
+    return value.clone() if torch.is_tensor(value) else value

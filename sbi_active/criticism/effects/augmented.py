@@ -1,0 +1,377 @@
+"""A simulator with effects, itself a simulator."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_active.criticism.effects.application import applied
+from sbi_active.criticism.effects.declarations import require_distinct
+from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.seeding import forked_generators, row_seeds
+from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.model import NOISE_STREAM
+
+__all__ = ["AugmentedSimulator", "takes_times"]
+
+#: Rows on which an effect is compared with the simulator without it.
+NUM_CHECKED = 16
+#: Largest difference at the null, in deviations of x over the checked rows: single
+#: precision, with room for a formula's rounding.
+TOLERANCE = 1e-4
+
+
+class AugmentedSimulator(SimulatorModel):
+    r"""A simulator whose parameters are :math:`(\theta, \phi)`.
+
+    In order, effects change the parameters, the action, the keyword arguments of the
+    simulator's function, the noise-free x, and the noise:
+
+    .. math::
+        x = h_x\bigl(f(h_\theta(\theta), h_\xi(\xi); h_f)\bigr) + h_s(s)\,\epsilon .
+
+    Called as any simulator, with (theta, phi) and an action, the rows are those of the
+    *next* trial, whose index is ``next_index``: an effect that grows with the index
+    goes on from there. :meth:`evaluate` takes an index a row.
+
+    Args:
+        model: The simulator; an augmented one is extended.
+        effects: Effects, each adding its phi to the parameters in this order. Those of
+            scope "trial" add none: a call draws their phi for each row.
+        check: Parameters (n, theta_dim) and actions (n, action_dim) at which every
+            effect is compared with the simulator at its null; None compares in the
+            first evaluation.
+        next_index: Index of the trial that a plain call simulates.
+        sample_times: Times of x's first axis; None takes the model's.
+
+    Raises:
+        ValueError: If two effects share a name, or one does not vanish at its null.
+
+    Attributes:
+        base: The simulator without any effect.
+        effects: All effects.
+        takes_times: Whether the simulator's function has an argument ``times``, shape
+            (n, k), for the times at which each row is measured.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        effects: Sequence[Effect],
+        *,
+        check: tuple[Tensor, Tensor] | None = None,
+        next_index: int = 0,
+        sample_times: Tensor | None = None,
+    ) -> None:
+        base, before = model, []
+        if isinstance(model, AugmentedSimulator):
+            base, before = model.base, model.effects
+        self.base: SimulatorModel = base
+        self.takes_times = takes_times(base)
+        self.effects = [*before, *effects]
+        require_distinct(self.effects, base.parameter_names or ())
+        self.next_index = next_index
+        times = getattr(model, "sample_times", None)
+        times = times if sample_times is None else sample_times
+        self._times = None if times is None else torch.as_tensor(times).double().clone()
+        names = base.parameter_names
+        if names is not None:
+            campaign = [e for e in self.effects if e.scope == "campaign"]
+            names = [*names, *[n for e in campaign for n in e.phi_names]]
+        super().__init__(
+            base.fn,
+            noise=base.noise,
+            batched=base.is_batched,
+            setup=base.setup,
+            parameter_names=names,
+            channel_names=base.channel_names,
+            sample_times=self._times,
+        )
+        self._unchecked = [e for e in effects if e not in before]
+        if check is not None:
+            known = sum(e.phi_dim for e in before if e.scope == "campaign")
+            theta, action = check
+            self._check_null(theta[:, : theta.shape[1] - known], action)
+
+    def evaluate(
+        self,
+        theta: Tensor,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        *,
+        index: Tensor | None = None,
+        times: Tensor | None = None,
+        seeds: Tensor | None = None,
+        merge: bool = False,
+    ) -> Tensor:
+        """Return the output of the simulator's function with some effects switched on.
+
+        It is noise-free where the model declares its noise, else a draw.
+
+        Args:
+            theta: Parameters of the base simulator, shape (n, theta_dim).
+            phi: By effect, shape (n, phi_dim); effects that are left out vanish.
+            action: As commanded, shape (n, action_dim).
+            index: Place of each row's trial, shape (n,); None is ``next_index``.
+            times: Sample times, shape (k,) or (n, k); None takes the model's.
+            seeds: One a row, for a simulator that takes them; None gives each row 0
+                where the noise is declared.
+            merge: Simulate rows once that the simulator would be asked for twice, as
+                where an action was repeated.
+
+        Returns:
+            Shape (n, *x_shape).
+        """
+        if self._unchecked and len(theta):
+            self._check_null(theta[:NUM_CHECKED], action[:NUM_CHECKED])
+        context = self._row_context(action, index, times)
+        merge = merge and self.noise is not None  # a draw is another at each call
+        return self._evaluate(theta, phi, action, context, seeds, merge=merge)
+
+    def noise_scale(
+        self,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        sd: Tensor,
+        *,
+        index: Tensor | None = None,
+        times: Tensor | None = None,
+    ) -> Tensor:
+        """Return the noise's standard deviation with effects, of the shape of ``sd``.
+
+        Args:
+            phi: As in :meth:`evaluate`.
+            action: Shape (n, action_dim).
+            sd: Without effects, shape (n, *x_shape).
+            index: As in :meth:`evaluate`.
+            times: As in :meth:`evaluate`.
+        """
+        context = self._row_context(action, index, times)
+        for effect in self._active("noise", phi):
+            sd = applied(effect, sd, phi[effect.name], action, context)
+        return sd
+
+    def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return theta and phi by effect from (theta, phi), shape (n, dim)."""
+        campaign = [e for e in self.effects if e.scope == "campaign"]
+        sizes = [e.phi_dim for e in campaign]
+        theta_dim = parameters.shape[1] - sum(sizes)
+        if theta_dim < 1:
+            raise ValueError(
+                f"expected (theta, phi) with {sum(sizes)} numbers for the effects; got "
+                f"{parameters.shape[1]} columns; do draw from joint_prior"
+            )
+        theta, *phi = parameters.split([theta_dim, *sizes], -1)
+        return theta, {e.name: p for e, p in zip(campaign, phi, strict=True)}
+
+    def __call__(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor | None = None,
+        **effects: Any,
+    ) -> Tensor:
+        phi = self._trial_draws(len(theta), theta.dtype, seeds)
+        mean = self._run(theta, action, seeds, effects, phi)
+        if self.noise is None:
+            return mean
+        if self.fn_takes_seeds and seeds is not None:
+            seeds = seeds ^ NOISE_STREAM
+        x = self.noise.sample(mean, seeds)
+        _, phi = self.split(theta)
+        if self._active("noise", phi):
+            # The noise model draws; effects stretch what it drew.
+            x = mean + (x - mean) * self.noise_scale(phi, action, torch.ones_like(x))
+        return x
+
+    def _run(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor | None,
+        effects: Mapping[str, Any],
+        drawn: dict[str, Tensor] | None = None,
+    ) -> Tensor:
+        theta, phi = self.split(torch.as_tensor(theta))
+        phi |= drawn or {}
+        action = torch.as_tensor(action)
+        if self._unchecked and len(theta):
+            self._check_null(theta[:NUM_CHECKED], action[:NUM_CHECKED])
+        context = self._row_context(action, None, None)
+        return self._evaluate(theta, phi, action, context, seeds, effects)
+
+    def _trial_draws(
+        self, num: int, dtype: torch.dtype, seeds: Tensor | None
+    ) -> dict[str, Tensor]:
+        """Return draws of the effects of scope "trial", rows by their seeds."""
+        trial = [e for e in self.effects if e.scope == "trial"]
+        if not trial:
+            return {}
+        if seeds is None:
+            return {e.name: e.sample(num).to(dtype) for e in trial}
+        rows = []
+        for seed in seeds.tolist():
+            with forked_generators(seed, "trial effects"):
+                rows.append(torch.cat([e.sample(1) for e in trial], -1))
+        draws = torch.cat(rows).to(dtype).split([e.phi_dim for e in trial], -1)
+        return {e.name: d for e, d in zip(trial, draws, strict=True)}
+
+    def _row_context(
+        self, action: Tensor, index: Tensor | None, times: Tensor | None
+    ) -> Context:
+        if index is None:
+            index = torch.full((len(action),), float(self.next_index))
+        times = self._times if times is None else times
+        return Context(
+            index.to(action.dtype), None if times is None else times.to(action.dtype)
+        )
+
+    def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:
+        return [e for e in self.effects if e.hook == hook and e.name in phi]
+
+    def _evaluate(
+        self,
+        theta: Tensor,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        context: Context,
+        seeds: Tensor | None,
+        keywords: Mapping[str, Any] | None = None,
+        *,
+        merge: bool = False,
+    ) -> Tensor:
+        if seeds is None and self.noise is not None:
+            seeds = torch.zeros(len(theta), dtype=torch.int64)
+        commanded = action
+        for effect in self._active("parameter", phi):
+            theta = applied(effect, theta, phi[effect.name], commanded, context)
+        for effect in self._active("action", phi):
+            action = applied(effect, action, phi[effect.name], commanded, context)
+        changed: dict[str, Any] = {**(keywords or {})}
+        if self.takes_times and context.times is not None:
+            # The simulator is read where the trial was, not on a grid of its own.
+            changed.setdefault("times", context.times.expand(len(theta), -1))
+        for effect in self._active("dynamics", phi):
+            changed = applied(effect, changed, phi[effect.name], commanded, context)
+        run = self._run_merged if merge else self.base._run
+        x = run(theta, action, seeds, changed)
+        for effect in self._active("observation", phi):
+            x = applied(effect, x, phi[effect.name], commanded, context)
+        return x
+
+    def _run_merged(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        seeds: Tensor | None,
+        keywords: dict[str, Any],
+    ) -> Tensor:
+        """Run each distinct row once."""
+        by_row = {
+            k: v
+            for k, v in keywords.items()
+            if torch.is_tensor(v) and v.shape[:1] == theta.shape[:1]
+        }
+        columns = [theta, action, *([] if seeds is None else [seeds]), *by_row.values()]
+        rows = torch.cat([c.reshape(len(theta), -1).double() for c in columns], 1)
+        _, place = torch.unique(rows, dim=0, return_inverse=True)
+        first = torch.full((int(place.max()) + 1,), len(theta), dtype=torch.int64)
+        first = first.scatter_reduce(0, place, torch.arange(len(theta)), "amin")
+        some = {k: v[first] if k in by_row else v for k, v in keywords.items()}
+        x = self.base._run(
+            theta[first], action[first], None if seeds is None else seeds[first], some
+        )
+        return x[place]
+
+    def _check_null(self, theta: Tensor, action: Tensor) -> None:
+        """Raise where an effect at its null changes x."""
+        context = self._row_context(action, None, None)
+        x = self._seeded(theta, {}, action, context)
+        if len(x) in x.shape[1:] and len(x) > 1:
+            # As many rows as entries hide phi that is spread over the wrong axis.
+            self._check_null(theta[:-1], action[:-1])
+            return
+        finite = x[x.isfinite()]
+        spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
+        scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
+        for effect in self._unchecked:
+            if effect.hook == "noise":
+                one = torch.ones_like(x)
+                difference = _difference(
+                    one,
+                    lambda null, e=effect, one=one: applied(
+                        e, one, null, action, context
+                    ),
+                    effect,
+                )
+                allowed = TOLERANCE
+            else:
+                difference = _difference(
+                    x,
+                    lambda null, e=effect: self._seeded(
+                        theta, {e.name: null}, action, context
+                    ),
+                    effect,
+                )
+                allowed = TOLERANCE * scale
+            if difference > allowed:
+                changed = "the noise" if effect.hook == "noise" else "x"
+                raise ValueError(
+                    f"expected effect {effect.name!r} to vanish at its null "
+                    f"{effect.null}; got {changed} changed by up to "
+                    f"{difference:.3g}; do correct apply or null"
+                )
+            if effect.hook == "noise":
+                _require_positive(effect, torch.ones_like(x), action, context)
+        self._unchecked = []
+
+    def _seeded(
+        self, theta: Tensor, phi: dict[str, Tensor], action: Tensor, context: Context
+    ) -> Tensor:
+        """Evaluate under fixed seeds, so that a stochastic simulator repeats itself."""
+        seeds = row_seeds(0, len(theta))
+        with forked_generators(0, "null"):
+            return self._evaluate(theta, phi, action, context, seeds)
+
+
+def _difference(reference: Tensor, at_null: Any, effect: Effect) -> float:
+    """Return the largest change of x at the null; inf where it turns into NaN."""
+    difference = torch.inf
+    for finite in (False, True):
+        null = effect.null_phi(len(reference), finite=finite).to(reference.dtype)
+        x = torch.as_tensor(at_null(null))
+        same = (x == reference) | (x.isnan() & reference.isnan())
+        gap = (x - reference).abs().where(~same, torch.zeros_like(reference))
+        if bool(gap.isfinite().all()):
+            difference = min(difference, float(gap.max()))
+    return difference
+
+
+def _require_positive(
+    effect: Effect, one: Tensor, action: Tensor, context: Context
+) -> None:
+    """Raise where an effect on the noise makes a deviation that is none."""
+    with forked_generators(0, "noise of an effect"):
+        phi = effect.sample(len(one)).to(one.dtype)
+    sd = applied(effect, one, phi, action, context)
+    wrong = ~(sd > 0) & ~one.isnan()
+    if bool(wrong.any()):
+        row = int(wrong.flatten(1).any(1).nonzero()[0])
+        raise ValueError(
+            f"expected effect {effect.name!r} to keep the noise positive; got "
+            f"{float(sd[row].min()):.3g} times its size at phi = {phi[row].tolist()}; "
+            "pass a prior without such phi, or another apply"
+        )
+
+
+def takes_times(model: SimulatorModel) -> bool:
+    """Return whether the simulator is to be asked for each trial's own times.
+
+    A ``functools.partial`` that binds ``times`` has decided them.
+    """
+    bound = getattr(inspect.unwrap(model.fn), "keywords", {})
+    return "times" in model.effect_names and "times" not in bound

@@ -1,0 +1,184 @@
+"""Effects: named, parameterized extensions of a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.criticism.effects.declarations import (
+    require_finite_draws,
+    require_parts,
+    sound_null,
+)
+from sbi_active.seeding import forked_generators
+
+__all__ = ["Context", "Effect", "Hook"]
+
+Hook = Literal["action", "parameter", "dynamics", "observation", "noise"]
+
+#: Stands for an infinite null where the formula has no limit in floating point.
+LARGE = 1e9
+
+
+@dataclass(frozen=True)
+class Context:
+    """What an effect may know of the rows that it changes.
+
+    Attributes:
+        index: Place of each row's trial in the order of the trials, shape (n,).
+        times: Sample times, shape (k,) or (n, k); None for x without a time axis.
+    """
+
+    index: Tensor
+    times: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Effect:
+    r"""A nested extension of a simulator that vanishes at :math:`\phi = \phi_0`.
+
+    Args:
+        name: What reports call it; unique among the effects of a loop.
+        hook: What it changes: the "action" that is executed, the "parameter" vector
+            theta, the keyword arguments of the simulator's function ("dynamics"), the
+            "observation" x, or the standard deviation of the "noise".
+        prior: Distribution of phi, with event or batch shape (phi_dim,) or ().
+        null: Value of phi, a number or shape (phi_dim,), at which the effect vanishes;
+            may be infinite.
+        apply: ``apply(value, phi, action, context) -> value`` on rows: phi is
+            (n, phi_dim), action (n, action_dim) as commanded, ``context`` a
+            :class:`Context`. For "dynamics", value is a dict of keyword arguments. For
+            "noise", value is the standard deviation, of the shape of x.
+        units: Of phi.
+        family: Effects of one family share a prior probability, so that variants of an
+            idea dilute nobody; None takes the hook.
+        scope: "campaign" for one phi in all trials; "trial" for a nuisance that every
+            trial draws afresh and every rival model marginalizes.
+        describe: A sentence for the report.
+
+    Raises:
+        ValueError: If the hook or scope is unknown, a part is of another type, null and
+            prior have different sizes, the null is NaN, or draws of phi are not finite.
+
+    Example:
+        >>> from torch.distributions import Normal
+        >>> bias = Effect(
+        ...     "bias", hook="observation", prior=Normal(0.0, 2.0), null=0.0,
+        ...     apply=lambda x, phi, action, context: x + phi, units="m",
+        ... )
+        >>> bias.phi_dim, bias.family
+        (1, 'observation')
+    """
+
+    name: str
+    hook: Hook
+    prior: Distribution
+    null: float | Tensor
+    apply: Callable[[Any, Tensor, Tensor, Context], Any]
+    units: str = ""
+    family: str | None = None
+    scope: Literal["campaign", "trial"] = "campaign"
+    describe: str | None = None
+
+    def __post_init__(self) -> None:
+        require_parts(self)
+        if self.hook not in get_args(Hook):
+            raise ValueError(
+                f"expected a hook of {', '.join(get_args(Hook))}; got {self.hook!r}; "
+                f"do say what effect {self.name!r} changes"
+            )
+        if self.scope not in ("campaign", "trial"):
+            raise ValueError(
+                f"expected scope 'campaign' or 'trial'; got {self.scope!r}; do choose "
+                "one"
+            )
+        object.__setattr__(self, "null", sound_null(self))
+        require_finite_draws(self)
+        if self.family is None:
+            object.__setattr__(self, "family", self.hook)
+
+    @classmethod
+    def keyword(
+        cls, name: str, *keywords: str, prior: Distribution, **options: Any
+    ) -> Effect:
+        """Return an effect that the simulator's function already has.
+
+        Args:
+            name: Of the effect.
+            *keywords: Arguments of the simulator's function, one an entry of phi, each
+                of shape (n,); without any the name, its spaces underscored.
+            prior: Of phi.
+            **options: As in the constructor; the null is 0 unless given.
+
+        Raises:
+            ValueError: If there is not one keyword for each entry of phi.
+
+        Example:
+            >>> from torch.distributions import HalfNormal
+            >>> drag = Effect.keyword("drag", prior=HalfNormal(0.3), units="1/m")
+            >>> drag.hook, drag.null
+            ('dynamics', 0.0)
+        """
+        names = keywords or (name.replace(" ", "_"),)
+        options = {"null": 0.0, **options}
+        effect = cls(
+            name, hook="dynamics", prior=prior, apply=_Keywords(names), **options
+        )
+        if len(names) != effect.phi_dim:
+            raise ValueError(
+                f"expected {effect.phi_dim} keywords for effect {name!r}, one an entry "
+                f"of phi; got {', '.join(names)}; do name each"
+            )
+        return effect
+
+    @property
+    def phi_dim(self) -> int:
+        """Number of parameters of the effect."""
+        return max((self.prior.batch_shape + self.prior.event_shape).numel(), 1)
+
+    @property
+    def phi_names(self) -> list[str]:
+        """One name an entry of phi."""
+        if self.phi_dim == 1:
+            return [self.name]
+        return [f"{self.name}_{i + 1}" for i in range(self.phi_dim)]
+
+    def sample(self, num: int) -> Tensor:
+        """Return draws of phi by torch's generator, shape (num, phi_dim), float64."""
+        return self.prior.sample(torch.Size([num])).double().reshape(num, self.phi_dim)
+
+    def log_prob(self, phi: Tensor) -> Tensor:
+        """Return the log prior density, shape (n,), float64; -inf outside."""
+        shape = self.prior.batch_shape + self.prior.event_shape
+        value = phi.reshape(len(phi), *shape)
+        inside = self.prior.support.check(value)[:, None].flatten(1).all(-1)  # type: ignore[union-attr]
+        # Outside of its support a distribution raises or gives what it likes.
+        with forked_generators(0, "inside"):
+            some = self.prior.sample()
+        safe = torch.where(inside.reshape(-1, *[1] * len(shape)), value, some)
+        density = self.prior.log_prob(safe).double()[:, None].flatten(1).sum(-1)
+        return density.where(inside, -torch.inf)
+
+    def null_phi(self, num: int, *, finite: bool = False) -> Tensor:
+        """Return the null in each row, shape (num, phi_dim), float64."""
+        null = torch.as_tensor(self.null, dtype=torch.float64).reshape(-1)
+        if finite:
+            null = torch.nan_to_num(null, posinf=LARGE, neginf=-LARGE)
+        return null.expand(self.phi_dim).repeat(num, 1)
+
+
+@dataclass(frozen=True)
+class _Keywords:
+    """Hands phi to the simulator's function."""
+
+    names: tuple[str, ...]
+
+    def __call__(
+        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
+    ) -> dict[str, Any]:
+        return {**value, **dict(zip(self.names, phi.unbind(-1), strict=True))}

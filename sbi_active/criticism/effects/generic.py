@@ -1,0 +1,253 @@
+"""Effects of any black box: what its inputs and outputs may lack."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.distributions import (
+    Distribution,
+    HalfNormal,
+    Independent,
+    Normal,
+    Uniform,
+)
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.rivals.noise_grid import declared_sds
+from sbi_active.seeding import forked_generators, row_seeds
+from sbi_active.simulation import SimulatorModel
+
+__all__ = ["generic_effects"]
+
+#: Relative error of an actuator or sensor, one prior deviation.
+GAIN = 0.1
+#: Offset and dead zone of an actuator, in ranges of the action space.
+OFFSET = 0.05
+#: Bias of a sensor and its drift a trial, in standard deviations of its noise.
+BIAS, DRIFT = 5.0, 1.0
+#: Error of a clock, in spans of the recording.
+CLOCK = 0.02
+#: Where an actuator saturates, in largest actions.
+LIMIT = (0.3, 1.0)
+#: Where a sensor saturates, in deviations of the prior predictive.
+RANGE = (0.1, 10.0)
+NUM_ACTIONS, NUM_PRIOR = 256, 256
+
+
+def generic_effects(
+    model: SimulatorModel, actions: ActionSpace, *, prior: Distribution | None = None
+) -> list[Effect]:
+    r"""Return effects that wrap the inputs and outputs of a simulator.
+
+    Of the action: gain, offset, saturation and, where actions have both signs, a dead
+    zone. Of the observation: bias, gain, drift with the trial's index, an offset of
+    the clock where x has sample times, and saturation where the prior is given. Scales
+    come from the range of the actions, the noise, and the prior predictive. Noise
+    inflation needs no effect: it is always among the rivals.
+
+    Args:
+        model: The simulator.
+        actions: The permitted actions.
+        prior: Of the simulator's parameters, for the spread of its predictions; needed
+            where the simulator declares no noise.
+
+    Raises:
+        ValueError: If neither noise nor prior says how large x and its errors are.
+    """
+    if model.noise is None and prior is None:
+        raise ValueError(
+            "expected a simulator with declared noise, or its prior; got neither, so "
+            "nothing says how large a bias may be; do give prior="
+        )
+    spread = None
+    sd = None if model.noise is None else declared_sds(model.noise)
+    if prior is not None:
+        spread, within = _predictive_spread(model, actions, prior)
+        sd = within if sd is None else sd
+    assert sd is not None
+    return [
+        *_of_action(actions),
+        *_of_observation(sd, spread, model),
+    ]
+
+
+def _of_action(actions: ActionSpace) -> list[Effect]:
+    some = actions.sample((NUM_ACTIONS,), seed=0).double()
+    low, high = some.min(0).values, some.max(0).values
+    width = torch.where(high > low, high - low, high.abs().clamp(min=1e-12))
+    largest = some.abs().max(0).values.clamp(min=1e-12)
+    units = actions.units[0] if len({*actions.units}) == 1 else ""
+    found = [
+        Effect(
+            "action gain",
+            hook="action",
+            prior=_normal(torch.full_like(width, GAIN)),
+            null=0.0,
+            apply=_gain,
+            describe="the action that is executed is a multiple of the commanded one",
+        ),
+        Effect(
+            "action offset",
+            hook="action",
+            prior=_normal(OFFSET * width),
+            null=0.0,
+            apply=_add,
+            units=units,
+            describe="the action that is executed is shifted from the commanded one",
+        ),
+        Effect(
+            "action saturation",
+            hook="action",
+            prior=Independent(Uniform(LIMIT[0] * largest, LIMIT[1] * largest), 1),
+            null=torch.inf,
+            apply=_clamp,
+            units=units,
+            describe="actions beyond a limit are executed at that limit",
+        ),
+    ]
+    if bool(((low < 0) & (high > 0)).any()):
+        found.append(
+            Effect(
+                "dead zone",
+                hook="action",
+                prior=Independent(HalfNormal(OFFSET * width), 1),
+                null=0.0,
+                apply=_dead_zone,
+                units=units,
+                describe="actions are executed smaller by a constant, small ones not",
+            )
+        )
+    return found
+
+
+def _of_observation(
+    sd: Tensor, spread: Tensor | None, model: SimulatorModel
+) -> list[Effect]:
+    found = [
+        Effect(
+            "bias",
+            hook="observation",
+            prior=_normal(BIAS * sd),
+            null=0.0,
+            apply=_add,
+            describe="the sensor reads a constant too much",
+        ),
+        Effect(
+            "sensor gain",
+            hook="observation",
+            prior=_normal(torch.full_like(sd, GAIN)),
+            null=0.0,
+            apply=_gain,
+            describe="the sensor reads a multiple of the truth",
+        ),
+        Effect(
+            "drift",
+            hook="observation",
+            prior=_normal(DRIFT * sd),
+            null=0.0,
+            apply=_drift,
+            units="a trial",
+            describe="the sensor's bias grows from trial to trial",
+        ),
+    ]
+    if model.sample_times is not None:
+        span = float(model.sample_times.max() - model.sample_times.min())
+        found.append(
+            Effect(
+                "clock offset",
+                hook="observation",
+                prior=_normal(torch.tensor([CLOCK * span]).double()),
+                null=0.0,
+                apply=_shift_in_time,
+                units="s",
+                describe="the time stamps are late by a constant",
+            )
+        )
+    if spread is not None:
+        low, high = (torch.log(f * spread.reshape(1)) for f in RANGE)
+        found.append(
+            Effect(
+                "sensor saturation",
+                hook="observation",
+                prior=Independent(Uniform(low, high), 1),
+                null=torch.inf,
+                apply=_clamp_log,
+                units="log",
+                describe="readings beyond a limit are that limit",
+            )
+        )
+    return found
+
+
+def _normal(sd: Tensor) -> Distribution:
+    return Independent(Normal(torch.zeros_like(sd), sd), 1)
+
+
+def _lift(phi: Tensor, x: Tensor) -> Tensor:
+    """Return phi (n, k) shaped to act on the last axis of x."""
+    return phi.reshape(len(phi), *[1] * (x.ndim - 2), phi.shape[1])
+
+
+def _add(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+    return value + _lift(phi, value)
+
+
+def _gain(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+    return value * (1 + _lift(phi, value))
+
+
+def _drift(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+    return value + _lift(phi * context.index[:, None], value)
+
+
+def _clamp(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+    limit = _lift(phi, value)
+    return torch.minimum(torch.maximum(value, -limit), limit)
+
+
+def _clamp_log(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+    return _clamp(value, phi.exp(), action, context)
+
+
+def _dead_zone(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
+    return value.sign() * (value.abs() - _lift(phi, value)).clamp(min=0)
+
+
+def _shift_in_time(
+    value: Tensor, phi: Tensor, action: Tensor, context: Context
+) -> Tensor:
+    """Return x at times + phi, linear between samples and beyond the ends."""
+    if context.times is None:
+        raise ValueError(
+            "expected sample times for an offset of the clock; got none; do give "
+            "SimulatorModel(sample_times=...)"
+        )
+    times = context.times.expand(len(value), -1).contiguous()
+    wanted = (times + phi).contiguous()
+    last = times.shape[1] - 2
+    low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)
+    weight = (wanted - times.gather(1, low)) / (
+        times.gather(1, low + 1) - times.gather(1, low)
+    )
+    shape = (*low.shape, *[1] * (value.ndim - 2))
+    index = low.reshape(shape).expand_as(value)
+    weight = weight.reshape(shape)
+    return (1 - weight) * value.gather(1, index) + weight * value.gather(1, index + 1)
+
+
+def _predictive_spread(
+    model: SimulatorModel, actions: ActionSpace, prior: Distribution
+) -> tuple[Tensor, Tensor]:
+    """Return deviations of x over the prior, and within one parameter set."""
+    with forked_generators(0, "spread"):
+        theta = prior.sample(torch.Size([NUM_PRIOR]))
+        action = actions.sample((NUM_PRIOR,)).to(theta.dtype)
+        x = model(theta, action, seeds=row_seeds(0, NUM_PRIOR))
+        again = model(theta, action, seeds=row_seeds(1, NUM_PRIOR))
+    x, again = x.double(), again.double()
+    finite = x.flatten(1).isfinite().all(-1) & again.flatten(1).isfinite().all(-1)
+    within = (x - again)[finite].square().mean().sqrt().reshape(1) / 2**0.5
+    # A median: a spread that a few extreme actions make is not the typical one.
+    spread = (x[finite] - x[finite].median(0).values).abs().median() * 1.4826
+    return spread.clamp(min=float(within)), within

@@ -1,0 +1,125 @@
+"""The prior of an augmented simulator: theta and phi, independent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from sbi_active.criticism.effects.declarations import require_distinct
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.seeding import kept_generators
+
+__all__ = ["JointPrior", "joint_prior"]
+
+
+class JointPrior(Distribution):
+    r"""Prior of the parameters and the effects,
+    :math:`p(\theta, \phi) = p(\theta) \prod_e p_e(\phi_e)`.
+
+    Args:
+        prior: Of theta, event shape (theta_dim,); itself a joint prior where effects
+            were added before.
+        effects: Effects whose phi follow theta, in this order.
+    """  # noqa: D205
+
+    arg_constraints: dict[str, Any] = {}  # type: ignore[assignment]
+    has_rsample = False
+
+    def __init__(self, prior: Distribution, effects: Sequence[Effect]) -> None:
+        if isinstance(prior, JointPrior):
+            effects, prior = [*prior.effects, *effects], prior.prior
+        require_distinct(effects)
+        self.prior, self.effects = prior, [*effects]
+        self.theta_dim = int(prior.event_shape.numel())
+        self.sizes = [self.theta_dim, *[e.phi_dim for e in self.effects]]
+        super().__init__(event_shape=torch.Size([sum(self.sizes)]), validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:  # type: ignore[override]
+        parts = [_elementwise(d.support) for d in self._parts()]
+        return constraints.independent(
+            constraints.cat(parts, dim=-1, lengths=self.sizes), 1
+        )
+
+    @property
+    def mean(self) -> Tensor:
+        return torch.cat([_moment(d, "mean") for d in self._parts()])
+
+    @property
+    def variance(self) -> Tensor:
+        return torch.cat([_moment(d, "variance") for d in self._parts()])
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        shape = torch.Size(sample_shape)
+        num = shape.numel()
+        theta = self.prior.sample(torch.Size([num])).reshape(num, self.sizes[0])
+        phi = [effect.sample(num).to(theta.dtype) for effect in self.effects]
+        return torch.cat([theta, *phi], -1).reshape(*shape, sum(self.sizes))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        rows = value.reshape(-1, sum(self.sizes))
+        theta, *phi = rows.split(self.sizes, -1)
+        inside = _rows(self.prior.support.check(theta))  # type: ignore[union-attr]
+        with kept_generators():  # any place in the support will do
+            place = self.prior.sample(torch.Size([1]))
+        safe = torch.where(inside[:, None], theta, place)
+        total = self.prior.log_prob(safe)[:, None].flatten(1).sum(-1)
+        for effect, part in zip(self.effects, phi, strict=True):
+            total = total + effect.log_prob(part).to(total.dtype)
+        return total.where(inside, -torch.inf).reshape(value.shape[:-1])
+
+    def _parts(self) -> list[Distribution]:
+        return [self.prior, *[effect.prior for effect in self.effects]]
+
+
+def joint_prior(prior: Distribution, effects: Sequence[Effect]) -> JointPrior:
+    """Return the prior of theta and the effects' phi, never a posterior.
+
+    Args:
+        prior: Of theta, event shape (theta_dim,).
+        effects: Effects, in the order of their parameters; those of scope "trial" are
+            drawn by the simulator and are left out.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> from torch.distributions import Normal
+        >>> bias = Effect(
+        ...     "bias", hook="observation", prior=Normal(0.0, 2.0), null=0.0,
+        ...     apply=lambda x, phi, action, context: x + phi,
+        ... )
+        >>> joint = joint_prior(BoxUniform(torch.zeros(2), torch.ones(2)), [bias])
+        >>> joint.sample((4,)).shape
+        torch.Size([4, 3])
+    """
+    return JointPrior(prior, [e for e in effects if e.scope == "campaign"])
+
+
+def _rows(inside: Tensor) -> Tensor:
+    return inside[:, None].flatten(1).all(-1)
+
+
+def _elementwise(support: Any) -> constraints.Constraint:
+    """Return a constraint on single numbers, which torch can concatenate."""
+    while support.event_dim > 0 and hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    if support.event_dim > 0:
+        raise ValueError(
+            "expected priors whose numbers are bounded one by one; got a support "
+            f"{support}; do give parameters in coordinates without such a constraint"
+        )
+    return support
+
+
+def _moment(distribution: Distribution, name: str) -> Tensor:
+    """Return a mean or variance, by 10,000 draws where there is no formula."""
+    try:
+        return torch.as_tensor(getattr(distribution, name)).reshape(-1)
+    except NotImplementedError:
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(0)
+            draws = distribution.sample(torch.Size([10_000])).reshape(10_000, -1)
+        return draws.mean(0) if name == "mean" else draws.var(0)

@@ -1,0 +1,150 @@
+"""Whether a simulator jumps, and how far it then strays from any smooth function."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.evidence.least_squares import find_modes, local_proposal
+from sbi_active.criticism.rivals.error_models import NoiseGrid
+from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.seeding import derive_seed
+
+__all__ = ["look_for_jumps", "quadratic"]
+
+Array = NDArray[Any]
+
+#: Finite-difference steps in prior deviations, and where two of them count as one; a
+#: coarse one, whose slope is of the same kind where nothing jumps.
+STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2, 0.2), 0.1
+COARSE, SIMILAR_SLOPE = 5e-2, 0.5
+#: Deviations of the noise below which a roughness does not matter.
+SMALL = 0.1
+#: Draws a coefficient of the local regression, and draws at least.
+PER_COEFFICIENT, FEWEST_DRAWS = 3, 64
+#: Each round looks as far around the mode as the noise found by the one before says.
+ROUNDS = 2
+#: Median absolute deviation of a normal variable of unit variance.
+MEDIAN = 0.6745
+
+
+def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
+    """Return a step for finite differences, whether they mean anything, and roughness.
+
+    Args:
+        rival: The bare model, with the declared noise.
+        seed: Of all draws.
+
+    Returns:
+        The step, in prior deviations; whether the simulator is smooth; and the
+        deviation of its jumps, shape (N,), zero where it is.
+    """
+    noise = rival.error
+    assert isinstance(noise, NoiseGrid)
+    none = np.zeros(len(rival.simulator.measurements))
+    fine, is_steady = probe_step(rival, seed=derive_seed(seed, "probe"))
+    own = derive_seed(seed, "roughness")
+    if is_steady or rival.simulator.is_stochastic:
+        return fine or STEPS[-1], fine is not None, none
+    # Fine slopes differ from coarse ones as well where a smooth response bends within
+    # the coarse step.
+    if fine is not None:
+        rough = local_roughness(rival, step=fine, seed=own)
+        if (rough < SMALL * noise.typical_sd).all():
+            return fine, True, none
+    return STEPS[-1], False, local_roughness(rival, step=STEPS[-1], seed=own)
+
+
+def probe_step(rival: Rival, *, seed: int) -> tuple[float | None, bool]:
+    """Return a step for finite differences, and whether slopes hold over a coarse one.
+
+    The step is the smallest whose slope agrees with that of twice the step within 10 %
+    for most of four draws from the prior: below it rounding or a solver's tolerance
+    speaks, and where there is none the simulator jumps. It may jump as well where
+    slopes agree between two jumps and not with those across them.
+
+    Args:
+        rival: The bare model.
+        seed: Of the draws.
+    """
+    u = rival.coordinates.sample(4, seed=seed)
+    whiten = rival.error.start()
+
+    def slope(step: float) -> Array:
+        return rival.jacobian(u, whiten, step)[1]
+
+    def apart(one: Array, two: Array) -> float:
+        size = np.sqrt((one**2).sum((1, 2))) + 1e-12
+        return float(np.median(np.sqrt(((one - two) ** 2).sum((1, 2))) / size))
+
+    for step in STEPS:
+        fine = slope(step)
+        if apart(fine, slope(2 * step)) < SAME_SLOPE:
+            return step, step >= COARSE or apart(fine, slope(COARSE)) < SIMILAR_SLOPE
+    return None, False
+
+
+def local_roughness(rival: Rival, *, step: float, seed: int) -> Array:
+    r"""Return the standard deviation of what no smooth function follows, shape (N,).
+
+    A simulator of contact or chaos answers a change of its parameters that is far
+    within their posterior by a jump. Beside the error of measurement s, jumps of size r
+    change the log likelihood of N numbers by about :math:`N (r / s)^2`, and its peaks
+    are those of the jumps. Taken as an independent error of deviation r, as a nugget is
+    in the emulation of computer codes, they leave a likelihood that a search can climb
+    and importance sampling can integrate; it claims less than the simulator would, had
+    one the draws to resolve it.
+
+    r is estimated from the residuals of a quadratic regression on draws around the best
+    fit, as wide as the posterior there, by their median absolute deviation.
+
+    Args:
+        rival: The bare model, with the declared noise.
+        step: Of finite differences.
+        seed: Of the draws.
+
+    References:
+        Gramacy & Lee, Statistics and Computing 22 (2012), for the nugget of
+        deterministic codes; Kennedy & O'Hagan, J. R. Stat. Soc. B 63 (2001).
+    """
+    noise = rival.error
+    assert isinstance(noise, NoiseGrid)
+    modes = find_modes(rival, step=step, seed=seed)
+    rng = np.random.default_rng(seed)
+    dim, c = rival.dim, rival.coordinates
+    num = max(PER_COEFFICIENT * (dim + 1) * (dim + 2) // 2, FEWEST_DRAWS)
+    rough = np.zeros(len(rival.simulator.measurements))
+    for _ in range(ROUNDS):
+        wide = noise.with_extra(rough)
+        whiten = wide.whitener(rival.residual(modes.u[:1])[0][0])
+        u = local_proposal(rival, modes.u[:1], whiten, step).sample(num, rng)
+        u = np.clip(u, c.low, c.high)
+        mean, _, _ = rival.simulator.predict(*c.split(u))
+        rough = _beside_quadratic(u - modes.u[0], mean)
+    return rough
+
+
+def quadratic(z: Array) -> Array:
+    """Return 1, z and all products of two, shape (n, (dim + 1) (dim + 2) / 2)."""
+    i, j = np.triu_indices(z.shape[1])
+    return np.concatenate([np.ones((len(z), 1)), z, z[:, i] * z[:, j]], 1)
+
+
+def _beside_quadratic(u: Array, x: Array) -> Array:
+    """Return the deviation of x, shape (n, N), around a quadratic function of u."""
+    dim = u.shape[1]
+    scale = u.std(0)
+    basis = quadratic(u / np.where(scale > 0, scale, 1.0))
+    found = np.zeros(x.shape[1])
+    for k, column in enumerate(x.T):
+        has = np.isfinite(column)
+        freedom = int(has.sum()) - basis.shape[1]
+        if freedom < dim:
+            continue
+        fit = np.linalg.lstsq(basis[has], column[has], rcond=None)[0]
+        rest = np.abs(column[has] - basis[has] @ fit)
+        lost = np.sqrt(has.sum() / freedom)
+        found[k] = np.median(rest) / MEDIAN * lost
+    return found

@@ -1,0 +1,243 @@
+r"""One trial with a gross error: a slip of the hand, of the unit, of the record.
+
+.. math::
+    p(r) = \frac1t \sum_{k=1}^t p_k(r_k) \prod_{j \ne k} p(r_j),
+
+with the declared noise p of every trial but one, equally likely any of them. That one
+errs by more, to an unknown degree a: the whole trial scatters a times as widely, or,
+where it has several numbers, a smooth function along it is a times the noise. It takes
+the values 3, 9, 27, ... with probabilities in proportion to :math:`1 / i^2`, so that
+the density falls with the size of the error and ends nowhere.
+
+References:
+    Box & Tiao, Biometrika 55 (1968), 119-129: a Bayesian approach to outliers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.results import OUTLIER
+from sbi_active.criticism.rivals.error_models import (
+    LOG_2PI,
+    ErrorModel,
+    NoiseCell,
+    NoiseGrid,
+    Whitener,
+    log_sum_exp,
+    student,
+)
+from sbi_active.criticism.rivals.residual_process import smooth_features
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.evidence.rival_set import RivalSet
+
+__all__ = ["OneOutlier", "gross_errors"]
+
+Array = NDArray[Any]
+
+#: Ratio of neighboring sizes of a gross error, the smallest among them, and the number
+#: that any set of trials has.
+RATIO, FEWEST_SIZES = 3.0, 5
+#: Size that stands for any in a search, and trials that a search sets aside in turn.
+LARGE, MAX_ASIDE = 1e3, 8
+
+
+@dataclass(frozen=True)
+class _Smooth:
+    """A smooth error of one trial in whitened coordinates: cov = I + a^2 Q v Q^T."""
+
+    directions: Array  # Q, (numbers of the trial, m), orthonormal
+    variances: Array  # v, (m,)
+
+
+class OneOutlier(ErrorModel):
+    """The noise, with a gross error in one trial, whichever it is.
+
+    Args:
+        noise: The error of all other trials.
+        measurements: What the residuals are of.
+        largest: Size that an error may need to have, in standard deviations.
+
+    Attributes:
+        trials: Those with a measurement, shape (k,).
+        sizes: Of the gross error, in standard deviations of the noise, shape (s,).
+    """
+
+    def __init__(
+        self, noise: NoiseGrid, measurements: Measurements, *, largest: float
+    ) -> None:
+        self.noise, self.measurements = noise, measurements
+        self.trials = np.unique(measurements.trial)
+        self._member = measurements.trial[:, None] == self.trials  # (N, k)
+        needed = np.log(max(largest, 1.0)) / np.log(RATIO)
+        steps = 1 + np.arange(max(int(np.ceil(needed)), FEWEST_SIZES))
+        self.sizes = RATIO**steps
+        self._log_size = np.log(6 / np.pi**2) - 2 * np.log(steps)
+        self._smooth = [
+            [_smooth(cell, measurements, at) for at in self._member.T]
+            for cell in noise.cells
+        ]
+
+    def log_likelihood(self, residual: Array) -> Array:
+        parts = [
+            self._joint(residual, c).reshape(len(residual), -1)
+            for c in range(len(self.noise.cells))
+        ]
+        return log_sum_exp(np.concatenate(parts, 1), axis=1)
+
+    def responsibility(self, residual: Array) -> Array:
+        """Return the probability that each trial is the one, shape (n, k)."""
+        cells = range(len(self.noise.cells))
+        joint = np.stack([self._joint(residual, c) for c in cells], 1)
+        rows = np.moveaxis(joint, 2, 1).reshape(len(residual), len(self.trials), -1)
+        each = log_sum_exp(rows, axis=2)
+        return np.exp(each - log_sum_exp(each, axis=1)[:, None])
+
+    def without_each(self, residual: Array) -> Array:
+        """Return log densities of all trials but each one, shape (n, k).
+
+        Args:
+            residual: Shape (n, N).
+        """
+        parts = []
+        for cell, prior in zip(self.noise.cells, self.noise.log_prior, strict=True):
+            usual = self._density(cell.whiten(residual), cell, self.noise.scales)
+            others = usual @ (1 - np.eye(len(self.trials)))
+            own = np.log(cell.sd) + 0.5 * np.log1p(-(cell.rho**2))
+            scale = own.sum() - own @ self._member
+            weight = prior + self.noise.log_scale_prior[:, None]
+            parts.append(log_sum_exp(others + weight, axis=1) - scale)
+        return log_sum_exp(np.stack(parts), axis=0)
+
+    def noise_posterior(
+        self, residual: Array, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return a cell and a scale of the noise for each residual, at random."""
+        cells = range(len(self.noise.cells))
+        joint = np.stack([self._joint(residual, c) for c in cells], 1)
+        joint = np.moveaxis(joint, 2, 3)  # (n, cells, scales, trials, ...)
+        log_p = log_sum_exp(joint.reshape(*joint.shape[:3], -1), axis=3)
+        flat = log_p.reshape(len(residual), -1)
+        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
+        cell, scale = np.unravel_index(best, log_p.shape[1:])
+        return cell, self.noise.scales[scale]
+
+    def start(self) -> Whitener:
+        return self.noise.start()
+
+    def whitener(self, residual: Array) -> Whitener:
+        cells = range(len(self.noise.cells))
+        joint = np.stack([self._joint(residual[None], c)[0] for c in cells])
+        best = np.unravel_index(np.argmax(joint), joint.shape)
+        cell, trial, scale, kind, size = map(int, best)
+        return self._whitener(cell, trial, scale, kind, self.sizes[size])
+
+    def regimes(self, residual: Array) -> list[Whitener]:
+        # Without one trial the parameters may be elsewhere, and are less certain.
+        share = self.responsibility(residual[None])[0]
+        cell = int(np.argmax(self.noise.log_prior))
+        scale = len(self.noise.scales) // 2
+        return [
+            self._whitener(cell, int(trial), scale, 0, LARGE)
+            for trial in np.argsort(-share, kind="stable")[:MAX_ASIDE]
+        ]
+
+    def _whitener(
+        self, cell: int, trial: int, scale: int, kind: int, size: float
+    ) -> Whitener:
+        at = self._member[:, trial]
+        noise, unit = self.noise.cells[cell], self.noise.scales[scale]
+        smooth = self._smooth[cell][trial] if kind else None
+
+        def whiten(residual: Array) -> Array:
+            e = noise.whiten(residual) / unit
+            own = e[..., at]
+            if smooth is None:
+                e[..., at] = own / size
+            else:
+                shrink = 1 / np.sqrt(1 + size**2 * smooth.variances) - 1
+                q = smooth.directions
+                e[..., at] = own + ((own @ q) * shrink) @ q.T
+            return e
+
+        return whiten
+
+    def _joint(self, residual: Array, c: int) -> Array:
+        """Return log p(residual, trial, scale, kind, size) in a cell, (n, k, ...)."""
+        cell, scales = self.noise.cells[c], self.noise.scales
+        e = cell.whiten(residual)
+        usual = self._density(e, cell, scales)
+        others = usual @ (1 - np.eye(len(self.trials)))  # (n, scales, k)
+        wide = np.multiply.outer(scales, self.sizes)
+        as_wide = self._density(e, cell, wide.ravel())
+        as_wide = as_wide.reshape(len(e), *wide.shape, -1)
+        bend = np.full_like(as_wide, -np.inf)
+        for k, smooth in enumerate(self._smooth[c]):
+            if smooth is not None:
+                bend[..., k] = self._bent(e[:, self._member[:, k]], smooth)
+        kinds = np.stack([as_wide, bend], 2)  # (n, scales, kinds, sizes, k)
+        num = 1 + np.array([smooth is not None for smooth in self._smooth[c]])
+        prior = self.noise.log_prior[c] - cell.log_scale - np.log(len(self.trials))
+        prior = prior + self._log_size[:, None] - np.log(num)
+        joint = others[:, :, None, None] + kinds + prior
+        joint = joint + self.noise.log_scale_prior[:, None, None, None]
+        return np.moveaxis(joint, -1, 1)
+
+    def _density(self, e: Array, cell: NoiseCell, scales: Array) -> Array:
+        """Return log densities of each trial's numbers by scale, (n, scales, k)."""
+        member, num = self._member.astype(float), self._member.sum(0)
+        if np.isfinite(cell.df):
+            log_p = student(e[:, None] / scales[:, None], cell.df) @ member
+        else:
+            square = (e**2 @ member)[:, None]
+            log_p = -0.5 * square / scales[:, None] ** 2 - 0.5 * num * LOG_2PI
+        return log_p - num * np.log(scales)[:, None]
+
+    def _bent(self, e: Array, smooth: _Smooth) -> Array:
+        """Return log densities of one trial with a smooth error, (n, scales, sizes)."""
+        scales, num = self.noise.scales, e.shape[1]
+        q = (e @ smooth.directions) ** 2
+        rest = np.maximum((e**2).sum(1) - q.sum(1), 0.0)
+        total = 1 + self.sizes[:, None] ** 2 * smooth.variances  # (sizes, m)
+        square = rest[:, None] + q @ (1 / total).T
+        log_p = -0.5 * square[:, None] / scales[:, None] ** 2
+        log_p = log_p - 0.5 * np.log(total).sum(1) - num * np.log(scales)[:, None]
+        return log_p - 0.5 * num * LOG_2PI
+
+
+def gross_errors(rivals: RivalSet) -> dict[float, float]:
+    """Return the probability that each trial is the one, if one has a gross error.
+
+    Args:
+        rivals: The models, whose "outlier" has its evidence.
+
+    Returns:
+        By the trial's index, most probable first.
+    """
+    name = rivals.evidence(error=OUTLIER).name
+    sample, error = rivals.samples[name], rivals.one_outlier()
+    some = sample.weights > 0
+    residual = rivals.rivals[name].residual(sample.u[some], penalized=False)[0]
+    share = sample.weights[some] @ error.responsibility(residual)
+    order = np.argsort(-share, kind="stable")
+    index = rivals.trials.index.numpy()[error.trials]
+    return {float(index[k]): float(share[k]) for k in order}
+
+
+def _smooth(cell: NoiseCell, measurements: Measurements, at: Array) -> _Smooth | None:
+    """Return the smooth error of a trial; None where it has one number, or t noise."""
+    if at.sum() < 2 or np.isfinite(cell.df) or not measurements.has_time:
+        return None
+    own = smooth_features(measurements, at)
+    features = np.zeros((len(at), own.shape[1]))
+    features[at] = cell.sd[at, None] * own
+    whitened = cell.whiten(features.T).T[at]
+    q, size, _ = np.linalg.svd(whitened, full_matrices=False)
+    keep = size > 1e-3 * size.max()
+    return _Smooth(q[:, keep], size[keep] ** 2)

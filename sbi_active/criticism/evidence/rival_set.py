@@ -1,0 +1,385 @@
+"""All rivals over one set of trials, and their evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.evidence.importance import (
+    ENOUGH,
+    MAX_ROUNDS,
+    ImportanceSample,
+    importance_sample,
+)
+from sbi_active.criticism.evidence.jumps import look_for_jumps
+from sbi_active.criticism.evidence.least_squares import ROUGH, THOROUGH, find_modes
+from sbi_active.criticism.evidence.outliers import OneOutlier
+from sbi_active.criticism.evidence.proposals import regressions, ridges
+from sbi_active.criticism.evidence.starts import starts_near_parents
+from sbi_active.criticism.evidence.tempering import temper
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
+from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.error_models import ErrorModel
+from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.rivals.validity import DISAGREEMENT, UNKNOWN_RATES
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
+
+__all__ = ["RivalSet"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 400
+#: Trials from which their order may be what residuals follow.
+FEW_TRIALS = 5
+#: Below this effective sample size importance sampling is not trusted.
+TOO_FEW = 20.0
+#: Nats by which a largest likelihood stays below another model's evidence, so that its
+#: own evidence need not be precise.
+HOPELESS = 30.0
+#: The same, so that its evidence is worth no tempering.
+UNLIKELY = 10.0
+#: Particles and moves of the first cross-check by tempering, and the standard errors
+#: by which it may exceed the evidence before the full number runs.
+FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
+#: Nats by which an evidence is behind another, so that it need not be precise where
+#: the simulator jumps and precision is dear.
+BEHIND = 5.0
+#: Effective sample size that is enough where the simulator jumps, and the one below
+#: which importance sampling is not trusted there: tempering, which climbs over the same
+#: jumps, would have to do better.
+ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
+NUM_SPREAD = 200
+#: Deviations of the prior predictive beyond which a number counts as that far.
+FARTHEST = 1e3
+#: Draws of largest weight, among which the best fit is sought.
+NUM_TOP = 20
+
+
+class RivalSet:
+    """The bare model, its extensions by effects, and the catch-alls.
+
+    Args:
+        model: The bare simulator.
+        prior: Of its parameters.
+        trials: Those that may be fitted.
+        effects: Declared effects; of scope "trial" ones every rival has.
+        actions: The permitted ones, for the length scales of the residual process; None
+            takes the range of the trials.
+        seed: Of all draws.
+        reference: Log evidence of a model outside the set that these compete with.
+
+    Attributes:
+        effects: Effects of scope "campaign", by name.
+        noise: Distribution of the errors of the bare model.
+        center: Mean of the prior predictive, shape (N,).
+        spread: Its deviation, shape (N,).
+        can_fail: Whether a trial, or one of the prior predictive, has no outcome.
+        step: Of finite differences.
+        is_smooth: Whether derivatives mean anything.
+        roughness: Deviation of what no smooth function of the parameters follows, which
+            ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
+        evidences: Of the rivals that were asked for, by name.
+        samples: Weighted samples behind them.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        prior: Distribution,
+        trials: Trials,
+        effects: Sequence[Effect],
+        *,
+        actions: ActionSpace | None = None,
+        seed: int = 0,
+        reference: float = -np.inf,
+    ) -> None:
+        self.reference = reference
+        self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
+        self.actions = actions
+        self.effects = {e.name: e for e in effects if e.scope == "campaign"}
+        self.nuisances = [e for e in effects if e.scope == "trial"]
+        augmented = AugmentedSimulator(
+            model, effects, next_index=int(trials.index.max()) + 1
+        )
+        self.simulator = TrialSimulator(
+            augmented, trials, seed=derive_seed(seed, "trials")
+        )
+        self.measurements = self.simulator.measurements
+        self.noise = declared_noise(
+            model.noise, self.measurements, seed=derive_seed(seed, "noise")
+        )
+        self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
+        self.center, self.spread = self.prior_predictive(self.simulator)
+        reach = FARTHEST * np.hypot(self.spread, self.noise.typical_sd)
+        self.measurements = self.measurements.bounded(self.center, reach)
+        self.simulator.measurements = self.measurements
+        self.can_fail = not trials.valid.all() or self.simulator.failed
+        self.step, self.is_smooth, self.roughness = look_for_jumps(
+            self.rival(()), seed=seed
+        )
+        if self.roughness.any():
+            self.noise = self.noise.with_extra(self.roughness)
+        self.evidences: dict[str, Evidence] = {}
+        self.samples: dict[str, ImportanceSample] = {}
+        self.rivals: dict[str, Rival] = {}
+
+    def rival(self, names: Sequence[str], *, error: str | None = None) -> Rival:
+        """Return the simulator with some effects and an error model.
+
+        Args:
+            names: Of the effects.
+            error: None for the noise alone, "unexplained", "scatter" or "outlier".
+        """
+        parts = [*names, *([] if error is None else [error])]
+        return Rival(
+            " + ".join(parts) or NONE,
+            simulator=self.simulator,
+            prior=self.prior,
+            effects=[self.effects[name] for name in names],
+            nuisances=self.nuisances,
+            error=self._error_model(error),
+            spread=self.spread,
+            center=self.center,
+            disagreement=(
+                UNKNOWN_RATES
+                if error == UNEXPLAINED and self.can_fail
+                else (DISAGREEMENT,)
+            ),
+        )
+
+    def _error_model(self, error: str | None) -> ErrorModel:
+        if error == SCATTER:
+            return scattered(self.noise)
+        if error == UNEXPLAINED:
+            return self.residual_process()
+        return self.noise if error is None else self.one_outlier()
+
+    def one_outlier(self) -> OneOutlier:
+        """Return the noise with a gross error in one trial."""
+        if not hasattr(self, "_outlier"):
+            off = np.abs(self.measurements.x - self.center) / self.noise.typical_sd
+            self._outlier = OneOutlier(
+                self.noise, self.measurements, largest=float(off.max())
+            )
+        return self._outlier
+
+    @property
+    def has_known_noise(self) -> bool:
+        """Whether errors are declared as Gaussian with nothing unknown."""
+        gaussian = isinstance(self.model.noise, GaussianNoise | AutocorrelatedNoise)
+        return gaussian and self.noise.shape == (1, 1)
+
+    def residual_process(self) -> ResidualProcess:
+        """Return the noise with a smooth function of the action and time."""
+        if not hasattr(self, "_process"):
+            sd = self.noise.typical_sd
+            self._process = ResidualProcess(
+                self.noise,
+                self.measurements,
+                action=self.scaled_actions(),
+                order=self.scaled_order(),
+                largest=float(np.median(self.spread / sd)),
+                spread=None if self.simulator.is_stochastic else self.spread,
+            )
+        return self._process
+
+    def scaled_actions(self, trials: Trials | None = None) -> Array:
+        """Return actions in ranges of the action space, those of the fit first.
+
+        Args:
+            trials: Further trials.
+        """
+        action = some = self.trials.action.numpy()
+        if self.actions is not None:
+            draws = self.actions.sample((256,), seed=0).double().numpy()
+            some = np.concatenate([draws, action])
+        width = np.ptp(some, axis=0)
+        if trials is not None:
+            action = np.concatenate([action, trials.action.numpy()])
+        return action / np.where(width > 0, width, 1.0)
+
+    def scaled_order(self, trials: Trials | None = None) -> Array | None:
+        """Return the order of trials in the span of the fit; None where it has none.
+
+        Among a few trials it is no structure: any differences of theirs follow it.
+
+        Args:
+            trials: Further trials.
+        """
+        index = own = self.trials.index.double().numpy()
+        if trials is not None:
+            index = np.concatenate([own, trials.index.double().numpy()])
+        span = np.ptp(own)
+        if span == 0 or len(own) < FEW_TRIALS:
+            return None
+        return (index - own.min()) / span
+
+    def evidence(
+        self, names: Sequence[str] = (), *, error: str | None = None
+    ) -> Evidence:
+        """Return the evidence of one rival, computed once."""
+        rival = self.rival(names, error=error)
+        if rival.name not in self.evidences:
+            seed = derive_seed(self.seed, "evidence", rival.name)
+            before = self.simulator.num_simulations
+            sample, engine = self._estimate(rival, seed)
+            self._keep(rival, sample, engine, before, seed)
+        return self.evidences[rival.name]
+
+    def tempered(
+        self, names: Sequence[str] = (), *, error: str | None = None
+    ) -> Evidence:
+        """Return the evidence by tempering, and keep it where it is the larger.
+
+        A mode that the least-squares search missed is missing from its evidence, and
+        no effective sample size shows it. A few particles do the check; where they say
+        more than the evidence, the full number decides.
+        """
+        rival = self.rival(names, error=error)
+        own = self.evidence(names, error=error)
+        seed = derive_seed(self.seed, "tempering", rival.name)
+        before = self.simulator.num_simulations
+        sample = self._temper(rival, seed, few=True)
+        either = np.hypot(own.standard_error, sample.standard_error)
+        if not sample.log_evidence < own.log_evidence + TOLERATED * either:
+            sample = self._temper(rival, seed, few=False)
+        other = self._record(rival, sample, "tempering", before, seed)
+        both = float(np.hypot(own.standard_error, other.standard_error))
+        if other.log_evidence > own.log_evidence + 2 * both:
+            self.evidences[rival.name] = other
+            self.samples[rival.name] = sample
+        return other
+
+    def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
+        near = starts_near_parents(self.rivals, self.samples, rival, seed)
+        search = THOROUGH if self.is_smooth else ROUGH
+        modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
+        rng = np.random.default_rng(seed)
+        behind = self._behind(rival, modes.u)
+        if self.is_smooth:
+            better, options = ridges, {}
+            enough, too_few = ENOUGH, TOO_FEW
+        else:
+            better = regressions
+            enough, too_few = ENOUGH_ROUGH, TOO_FEW_ROUGH
+            options = {
+                "looks": range(MAX_ROUNDS),
+                "missed": np.inf,
+                "dismissed": self._best_evidence() - BEHIND,
+            }
+        sample = importance_sample(
+            rival,
+            modes.proposal,
+            rng=rng,
+            local=better(rival, modes, self.step, rng),
+            enough=1.0 if behind > HOPELESS else enough,
+            **options,
+        )
+        if not behind < UNLIKELY or sample.effective_sample_size >= too_few:
+            return sample, "least squares"
+        # Where the simulator jumps, all particles are dear, and most often behind.
+        for few in (False,) if self.is_smooth else (True, False):
+            other = self._temper(rival, seed, few=few)
+            both = np.hypot(sample.standard_error, other.standard_error)
+            if sample.log_evidence > other.log_evidence + 2 * both:
+                # Particles that lost a ridge do not find it again.
+                return sample, "least squares"
+        return other, "tempering"
+
+    def _temper(self, rival: Rival, seed: int, *, few: bool) -> ImportanceSample:
+        size = {"num_particles": FEW_PARTICLES, "num_moves": FEW_MOVES} if few else {}
+        return temper(rival, seed=seed, **size)
+
+    def _behind(self, rival: Rival, modes: Array) -> float:
+        """Return how far even the largest likelihood is below a known evidence, nats.
+
+        An evidence is an average of likelihoods, so that no precision of it matters
+        where it is much.
+        """
+        if rival.has_noise_effect:  # whose coordinates the search leaves alone
+            return -np.inf
+        return self._best_evidence() - float(rival.log_likelihood(modes).max())
+
+    def _best_evidence(self) -> float:
+        """Return the largest log evidence so far."""
+        known = [e.log_evidence for e in self.evidences.values()]
+        return float(max([*known, self.reference]))
+
+    def _keep(
+        self,
+        rival: Rival,
+        sample: ImportanceSample,
+        engine: str,
+        before: int,
+        seed: int,
+    ) -> None:
+        self.evidences[rival.name] = self._record(rival, sample, engine, before, seed)
+        self.samples[rival.name] = sample
+        self.rivals[rival.name] = rival
+
+    def _record(
+        self,
+        rival: Rival,
+        sample: ImportanceSample,
+        engine: str,
+        before: int,
+        seed: int,
+    ) -> Evidence:
+        u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
+        best = sample.u[np.argsort(sample.weights)[-NUM_TOP:]]
+        joint = rival.coordinates.joint
+        theta_names = self.model.parameter_names
+        if theta_names is None:
+            theta_names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
+        names = [*theta_names, *[n for e in rival.effects for n in e.phi_names]]
+        own = sum(joint.sizes)
+        residual = rival.residual(best, penalized=False)[0]
+        square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
+        return Evidence(
+            name=rival.name,
+            log_evidence=sample.log_evidence,
+            standard_error=sample.standard_error,
+            effective_sample_size=sample.effective_sample_size,
+            engine=engine,
+            num_simulations=self.simulator.num_simulations - before,
+            names=(*names,),
+            draws=rival.coordinates.to_z(u)[:, :own],
+            best_chi_square=float(min(square)),
+        )
+
+    def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
+        """Return mean and deviation of each number before the data, shapes (N,)."""
+        m = simulator.measurements
+        trials = simulator.trials
+        asked = (trials.action, trials.index, trials.sample_times, m.position)
+        key = tuple(None if a is None else np.asarray(a).tobytes() for a in asked)
+        if key not in self._predictives:
+            self._predictives[key] = self._prior_predictive(simulator)
+        return self._predictives[key]
+
+    def _prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
+        c = SearchCoordinates(self.prior, (), self.nuisances, len(simulator.trials))
+        u = c.sample(NUM_SPREAD, seed=derive_seed(self.seed, "spread"))
+        mean, _, _ = simulator.predict(*c.split(u))
+        finite = np.isfinite(mean).any(0)
+        center, spread = np.zeros((2, mean.shape[1]))
+        center[finite] = np.nanmean(mean[:, finite], axis=0)
+        spread[finite] = np.nanstd(mean[:, finite], axis=0)
+        typical = np.median(spread[spread > 0]) if (spread > 0).any() else 1.0
+        if finite.any() and not finite.all():
+            # No draw gives a number there: any that the others give is as good.
+            center[~finite] = np.mean(center[finite])
+            spread[~finite] = np.hypot(typical, np.std(center[finite]))
+        return center, np.maximum(spread, 1e-3 * typical)

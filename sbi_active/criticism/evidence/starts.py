@@ -1,0 +1,61 @@
+"""Where the search for a rival's posterior starts: at those of smaller rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.evidence.importance import ImportanceSample
+from sbi_active.criticism.results import NONE
+from sbi_active.criticism.rivals.rival import Rival
+
+__all__ = ["starts_near_parents"]
+
+Array = NDArray[Any]
+
+#: Searches that start at posteriors of smaller rivals.
+NUM_NEAR = 8
+
+
+def starts_near_parents(
+    rivals: Mapping[str, Rival],
+    samples: Mapping[str, ImportanceSample],
+    rival: Rival,
+    seed: int,
+) -> Array | None:
+    """Return points at posteriors of smaller rivals, the rest from the prior.
+
+    Those with one effect less are the parents; without effects, or behind a catch-all,
+    it is the bare model.
+
+    Args:
+        rivals: Those whose posterior is known, by name.
+        samples: Of these posteriors.
+        rival: Whose search starts.
+        seed: Of the draws.
+
+    Returns:
+        Shape (k, dim); None without a parent.
+    """
+    names = [e.name for e in rival.effects]
+    parents = [[n for n in names if n != left] for left in names] or [[]]
+    known = [p for p in parents if (" + ".join(p) or NONE) in rivals]
+    if not known or rival.name == NONE:
+        return None
+    rng = np.random.default_rng(seed)
+    parts = []
+    for own in known:
+        parent = rivals[" + ".join(own) or NONE]
+        each = max(NUM_NEAR // len(known), 1)
+        drawn = parent.coordinates.to_z(samples[parent.name].draws(each, rng))
+        z = rival.coordinates.to_z(rival.coordinates.sample(each, seed=seed))
+        shared, theta_dim = parent.columns(), parent.theta_dim
+        z[:, :theta_dim] = drawn[:, :theta_dim]
+        for name, place in rival.columns().items():
+            if name in shared:
+                z[:, place] = drawn[:, shared[name]]
+        parts.append(rival.coordinates.from_z(z))
+    return np.concatenate(parts)

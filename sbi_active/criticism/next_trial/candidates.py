@@ -1,0 +1,60 @@
+"""Actions at which rivals are compared, each as if it were the next trial."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.steps.predictive import predict
+from sbi_active.seeding import derive_seed
+
+__all__ = ["following", "permitted_candidates", "simulated"]
+
+MAX_CANDIDATES = 64
+
+
+def permitted_candidates(rivals: RivalSet, actions: ActionSpace) -> Tensor:
+    """Return all permitted actions, or as many at random, shape (a, action_dim)."""
+    if isinstance(actions, DiscreteActions) and len(actions) <= MAX_CANDIDATES:
+        return actions.values
+    seed = derive_seed(rivals.seed, "candidates")
+    return actions.sample((MAX_CANDIDATES,), seed=seed)
+
+
+def simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
+    """Return the candidates at which the bare model gives numbers.
+
+    Beyond the permitted range a simulator may fail in any way.
+    """
+    kept = []
+    with torch.no_grad():
+        for action in candidates:
+            try:
+                prediction = predict(
+                    rivals,
+                    following(rivals, action[None]),
+                    num_draws=4,
+                    scored=False,
+                )
+            except Exception:  # noqa: BLE001  (a user's simulator)
+                continue
+            if np.isfinite(prediction.x).all() and prediction.valid.all():
+                kept.append(action)
+    return torch.stack(kept) if kept else candidates[:0]
+
+
+def following(rivals: RivalSet, candidates: Tensor) -> Trials:
+    """Return each candidate as if it were the next trial."""
+    own, num = rivals.trials, len(candidates)
+    x, times = own.template()
+    return Trials(
+        candidates.double(),
+        x.expand(num, *x.shape),
+        index=torch.full((num,), float(own.index.max()) + 1),
+        sample_times=times,
+        repeat_of=torch.full((num,), -1),
+    )

@@ -1,0 +1,204 @@
+"""The next action: the one whose outcome tells most about which rival is right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.next_trial.candidates import (
+    following,
+    permitted_candidates,
+    simulated,
+)
+from sbi_active.criticism.next_trial.outside import outside_candidates
+from sbi_active.criticism.results import CATCH_ALLS, NextAction, Tracing
+from sbi_active.criticism.steps.predictive import predict
+from sbi_active.design.design import Design
+from sbi_active.design.designer import InformationGainDesigner
+from sbi_active.seeding import derive_seed
+
+__all__ = ["PredictedRival", "choose_action"]
+
+Array = NDArray[Any]
+
+#: Rivals below this probability are left out.
+NEGLIGIBLE = 0.01
+MAX_RIVALS = 8
+#: Information below which no action is worth a trial, nats.
+NOTHING = 0.02
+#: Candidates beyond the permitted range, where the best is not asked for.
+MAX_OUTSIDE = 24
+#: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
+#: three quarters fit a density, which needs some tens.
+SAMPLES_PER_RIVAL = 160
+
+
+class PredictedRival:
+    """A rival of the closed loop, as the designer wants it.
+
+    Args:
+        rivals: The models.
+        name: Of this one, as in ``tracing.probabilities``.
+        probability: Of this one, those of all rivals adding up to one.
+        candidates: All actions that will be asked for, shape (a, action_dim). They are
+            predicted together, each as the next trial.
+    """
+
+    def __init__(
+        self, rivals: RivalSet, name: str, probability: float, candidates: Tensor
+    ) -> None:
+        self.rivals, self.name, self.probability = rivals, name, probability
+        self.candidates = candidates
+        self._trials = following(rivals, candidates)
+        self._draws: tuple[tuple[int, int], Tensor] | None = None
+
+    def predict(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
+        """Return draws from the posterior predictive, shape (n, q).
+
+        Args:
+            action: One of the candidates, shape (action_dim,).
+            num_samples: n.
+            seed: Of the draws.
+        """
+        return self._at(action, num_samples, seed)[0]
+
+    def predict_mean(
+        self, action: Tensor, num_samples: int, seed: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return these draws without noise, and its standard deviations, (n, q).
+
+        Args:
+            action: As in :meth:`predict`.
+            num_samples: As there.
+            seed: As there.
+        """
+        _, mean, sd = self._at(action, num_samples, seed)
+        return mean, sd
+
+    def _at(self, action: Tensor, num_samples: int, seed: int) -> Tensor:
+        if self._draws is None or self._draws[0] != (num_samples, seed):
+            self._draws = (num_samples, seed), self._predict(num_samples, seed)
+        same = (self.candidates == action.to(self.candidates)).all(-1)
+        return self._draws[1][:, :, int(same.int().argmax())]
+
+    def _predict(self, num_samples: int, seed: int) -> Tensor:
+        """Return outcomes, means and deviations, shape (3, n, a, q).
+
+        Outcomes are NaN where there is none.
+        """
+        parts = self.name.split(" + ")
+        prediction = predict(
+            self.rivals,
+            self._trials,
+            names=tuple(n for n in parts if n in self.rivals.effects),
+            error=self.name if self.name in CATCH_ALLS else None,
+            num_draws=num_samples,
+            seed=seed,
+            scored=False,
+        )
+        num = len(self._trials)
+        x = np.where(prediction.valid[:, prediction.trial], prediction.x, np.nan)
+        every = np.stack([x, prediction.mean, prediction.sd])
+        each = np.split(
+            np.arange(len(prediction.trial)),
+            np.cumsum(np.bincount(prediction.trial, minlength=num))[:-1],
+        )
+        return torch.from_numpy(np.stack([every[:, :, at] for at in each], 2))
+
+
+def choose_action(
+    rivals: RivalSet, tracing: Tracing, actions: ActionSpace, *, beyond: bool = True
+) -> NextAction:
+    r"""Return the action of the largest information about the model index.
+
+    It is a lower bound on :math:`I(k; x | \xi)` from draws of each rival's posterior
+    predictive, chosen on one half of them and reported on the other. Where it is below
+    .02 nats for every permitted action, or some of the rivals are equivalent, actions
+    beyond the permitted range are tried: one that separates them is named.
+
+    Args:
+        rivals: The models.
+        tracing: Their probabilities.
+        actions: The permitted ones.
+        beyond: Whether to try others where these separate nothing.
+    """
+    candidates = permitted_candidates(rivals, actions)
+    named = [n for n, p in tracing.probabilities.items() if p > NEGLIGIBLE][:MAX_RIVALS]
+    gain = np.zeros(len(candidates))
+    action = None
+    if len(named) > 1:
+        p = np.array([tracing.probabilities[n] for n in named])
+        design = _select(rivals, named, p / p.sum(), candidates)
+        gain = design.expected_information_gain.clamp_min(0.0).numpy()
+        if gain[design.index] >= NOTHING:
+            action = design.action.double().numpy()
+    found = NextAction(
+        action=action,
+        candidates=candidates.double().numpy(),
+        information_gain=gain,
+        separates=(*named,),
+    )
+    if len(named) < 2:
+        return found
+    groups = [g & {*named} for g in tracing.equivalent]
+    if action is None:
+        groups = [frozenset(named)]
+    groups = [g for g in groups if len(g) > 1]
+    found = replace(found, inseparable=(*groups,))
+    if not beyond:
+        return found
+    return _look_outside(rivals, found, groups, actions, candidates)
+
+
+def _look_outside(
+    rivals: RivalSet,
+    found: NextAction,
+    groups: Sequence[frozenset[str]],
+    actions: ActionSpace,
+    candidates: Tensor,
+) -> NextAction:
+    """Return the choice with an action that is not permitted, if one separates."""
+    if not groups:
+        return found
+    others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
+    others = simulated(rivals, others)
+    if len(others) == 0:
+        return found
+    for group in groups:
+        names = [n for n in found.separates if n in group]
+        equal = np.full(len(names), 1 / len(names))
+        design = _select(rivals, names, equal, others)
+        gain = float(design.expected_information_gain[design.index])
+        error = float(design.standard_error[design.index])
+        if gain - 2 * error >= NOTHING and gain > found.outside_gain:
+            found = replace(
+                found,
+                outside=design.action.double().numpy(),
+                outside_separates=(*names,),
+                outside_gain=gain,
+            )
+    return found
+
+
+def _select(
+    rivals: RivalSet, names: Sequence[str], p: Array, candidates: Tensor
+) -> Design:
+    models = [
+        PredictedRival(rivals, name, float(share), candidates)
+        for name, share in zip(names, p, strict=True)
+    ]
+    designer = InformationGainDesigner(
+        DiscreteActions(candidates),
+        num_samples=SAMPLES_PER_RIVAL * len(models),
+        eliminate=False,  # a part of the samples would be too few for densities
+    )
+    seed = derive_seed(rivals.seed, "next action", *names)
+    return designer.select(models, target="model", seed=seed)

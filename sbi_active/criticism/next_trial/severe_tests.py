@@ -1,0 +1,113 @@
+r"""Actions at which a verdict would be put to the test most.
+
+A verdict may be the alias of an effect that nobody declared: it explains the trials at
+hand about as well, with other parameters. The data cannot tell, another action can. The
+rival without a cause is a free residual, the bare model and the residual process as
+fitted to the trials. Where it expects an outcome far from the verdict's prediction, the
+verdict stands or falls by the trial:
+
+.. math::
+    d^2 = \frac{1}{N} \sum_i \frac{(\mu_i - \mu^r_i)^2 + (s^r_i)^2}{s_i^2} - 1
+
+with means and standard deviations, noise included, of the verdict's prediction of the N
+numbers of x and, with r, of the residual's. A prediction equal to the verdict's has
+d = 0.
+
+References:
+    Mayo, Error and the Growth of Experimental Knowledge (1996), on severe tests.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.next_trial.candidates import (
+    following,
+    permitted_candidates,
+    simulated,
+)
+from sbi_active.criticism.next_trial.outside import extrapolated
+from sbi_active.criticism.results import UNEXPLAINED, SevereTest, Tracing
+from sbi_active.criticism.steps.predictive import Prediction, predict
+
+__all__ = ["severe_tests"]
+
+Array = NDArray[Any]
+
+#: Permitted candidates, and as many beyond; one costs some hundred simulated trials.
+MAX_TESTS = 16
+NUM_DRAWS = 50
+#: Covariances of the residual process between candidates and measurements.
+MAX_ENTRIES = 10_000_000
+
+
+def severe_tests(
+    rivals: RivalSet, tracing: Tracing, actions: ActionSpace
+) -> tuple[SevereTest, ...]:
+    """Return the permitted action that tests a named verdict most, and one beyond.
+
+    Args:
+        rivals: The models.
+        tracing: The verdict; one that names no effect has none.
+        actions: The permitted ones.
+    """
+    if not tracing.chosen:
+        return ()
+    candidates = permitted_candidates(rivals, actions)
+    few = min(MAX_TESTS, _affordable(rivals))
+    beyond = extrapolated(actions, candidates, limit=few)
+    tested = (
+        (_spread_out(candidates, few), True),
+        (simulated(rivals, beyond), False),
+    )
+    return tuple(
+        _most_severe(rivals, tracing.chosen, some, is_permitted=is_permitted)
+        for some, is_permitted in tested
+        if len(some)
+    )
+
+
+def _most_severe(
+    rivals: RivalSet, names: tuple[str, ...], candidates: Tensor, *, is_permitted: bool
+) -> SevereTest:
+    trials = following(rivals, candidates)
+    options = {"num_draws": NUM_DRAWS, "scored": False}
+    verdict = predict(rivals, trials, names=names, **options)
+    free = predict(rivals, trials, error=UNEXPLAINED, **options)
+    difference = _difference(verdict, free, len(candidates))
+    best = int(np.argmax(difference))
+    return SevereTest(
+        action=candidates[best].double().numpy(),
+        is_permitted=is_permitted,
+        difference=float(difference[best]),
+    )
+
+
+def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
+    """Return d of each trial, shape (num,)."""
+    mean, sd = verdict.moments()
+    other, spread = free.moments()
+    square = ((other - mean) ** 2 + spread**2) / sd**2
+    total = np.bincount(verdict.trial, square, minlength=num)
+    size = np.bincount(verdict.trial, minlength=num)
+    return np.sqrt(np.maximum(total / np.maximum(size, 1) - 1, 0.0))
+
+
+def _affordable(rivals: RivalSet) -> int:
+    """Return how many candidates the residual process predicts in passable memory."""
+    m = rivals.measurements
+    return max(MAX_ENTRIES // (len(m) * int(np.prod(m.shape[1:]))), 2)
+
+
+def _spread_out(candidates: Tensor, limit: int) -> Tensor:
+    """Return at most so many, evenly in their order, with the first and the last."""
+    if len(candidates) <= limit:
+        return candidates
+    return candidates[torch.linspace(0, len(candidates) - 1, limit).round().long()]

@@ -1,0 +1,95 @@
+"""What a named verdict is conditional on, and the actions that would test it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sbi_active.criticism.report.headline import number, summary_sentence
+from sbi_active.criticism.report.section import named_entries, setting
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.report.report import Report
+
+__all__ = ["conditions", "first_paragraph"]
+
+#: Parameters and entries of the action that a sentence names at most.
+MOST_NAMED = 3
+
+
+def first_paragraph(report: Report) -> str:
+    """Return what was found, and what a verdict that names effects does not know."""
+    return " ".join([summary_sentence(report), *conditions(report)])
+
+
+def conditions(report: Report) -> Iterator[str]:
+    """Yield what a verdict that names effects does not know, a sentence each.
+
+    An effect that nobody declared can pass for declared ones, with parameters that are
+    wrong and residuals that are as small. The data at hand cannot tell.
+    """
+    if not report.tracing.chosen:
+        return
+    yield (
+        "P holds among the declared effects alone: an effect that nobody declared may "
+        "pass for them."
+    )
+    yield _moved(report)
+    yield _tried(report)
+    if report.severe_tests:
+        tests = ", and ".join(_tests(report))
+        yield f"The verdict would be put to the test most {tests}."
+
+
+def _tests(report: Report) -> Iterator[str]:
+    """Yield each severe test, with how far a free residual's prediction is there."""
+    between = "where its prediction and that of a free residual differ by "
+    unit = " of its standard deviations"
+    for test in report.severe_tests:
+        where = "at " if test.is_permitted else "beyond the permitted range at "
+        action = setting(report.action_labels, test.action)
+        yield f"{where}{action}, {between}{number(test.difference)}{unit}"
+        between, unit = "by ", ""
+
+
+def _moved(report: Report) -> str:
+    """Return how far the parameters moved from the bare fit, the farthest first."""
+    table = report.parameters.dropna(subset=["before", "after"])
+    shift = (table["after"] - table["before"]).to_numpy()
+    sd = np.maximum(table["before_sd"].to_numpy(), np.finfo(float).tiny)
+    far = np.abs(shift) / sd
+    order = [i for i in np.argsort(-far) if far[i] >= 1]
+    if not order:
+        return "No parameter moves by more than its standard deviation in the bare fit."
+    moves = [
+        f"{table['parameter'].iloc[i]} by {shift[i]:+.3g} to "
+        f"{number(table['after'].iloc[i])} ({_times(float(far[i]))})"
+        for i in order[:MOST_NAMED]
+    ]
+    rest = len(order) - len(moves)
+    more = f", and {rest} more by at least one" if rest else ""
+    return f"Against the bare fit the verdict moves {', '.join(moves)}{more}."
+
+
+def _times(far: float) -> str:
+    many = "more than 1000" if far > 1_000 else f"{far:.2g}"
+    return f"{many} of its standard deviations"
+
+
+def _tried(report: Report) -> str:
+    """Return which actions were executed."""
+    action = np.unique(report.residuals.action, axis=0)
+    if len(action) == 1:
+        only = setting(report.action_labels, action[0])
+        return f"No other action was tried than {only}."
+    entries = [*zip(named_entries(report.action_labels), action.T, strict=True)]
+    ranges = [
+        f"{name} from {column.min():.4g} to {column.max():.4g} {unit}".rstrip()
+        for (name, unit), column in entries[:MOST_NAMED]
+    ]
+    rest = len(entries) - len(ranges)
+    more = f", and {rest} more entries" if rest else ""
+    tried = ", ".join(ranges) + more
+    return f"No other action was tried than these {len(action)}: {tried}."

@@ -1,0 +1,179 @@
+"""What a report says of the models: their probabilities, and what they leave."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sbi_active.criticism.report.headline import added, probability, with_error
+from sbi_active.criticism.report.section import Section, joined
+from sbi_active.criticism.report.suspects import label
+from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.report.report import Report
+
+__all__ = ["effects", "equivalences", "leave_one_out", "residuals"]
+
+SHOWN = 0.01  # probability from which a set of several effects stands in the table
+SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
+
+
+def effects(report: Report) -> Section:
+    """Return every model alone, and the sets of effects that have a share."""
+    tracing = report.tracing
+    any_set = any(" + " in name for name in tracing.probabilities)
+    shares = ("P in any set",) if any_set else ()
+    header = ("model", "P", *shares, "phi", "log BF", "ESS", "90 % set")
+    estimates = {e.name: e for e in tracing.estimates}
+    null = tracing.evidences[NONE].log_evidence
+    rows, left_out = [], 0
+    for name, p in tracing.probabilities.items():
+        if " + " in name and p < SHOWN and name != tracing.verdict:
+            left_out += 1
+            continue
+        inclusion, phi, fit, order = ("",) * any_set, "", ("", ""), -np.inf
+        if name in estimates:
+            e = estimates[name]
+            pairs = zip(e.mean, e.sd, strict=True)
+            phi = ", ".join(with_error(m, sd) for m, sd in pairs) + f" {e.units}"
+            share = probability(tracing.inclusion.get(name, p))
+            inclusion = (share,) * any_set
+        if name in tracing.evidences:
+            found = tracing.evidences[name]
+            order = found.log_evidence - null
+            fit = f"{order:.1f}", f"{found.effective_sample_size:.0f}"
+        inside = "yes" if name in tracing.credible_set else ""
+        cells = (
+            label(tracing, name),
+            probability(p),
+            *inclusion,
+            phi.strip(),
+            *fit,
+            inside,
+        )
+        rows.append((-p, -order, cells))
+    rows.sort(key=lambda row: row[:2])
+    text = [
+        "P: probability of the model given the trials. phi: strength of the effect "
+        "if it alone is added. log BF: log Bayes factor against the bare model, nats. "
+        "ESS: effective samples behind it. 90 % set: the smallest set of models that "
+        "holds 90 % of the probability."
+    ]
+    if any_set:
+        text.append(
+            "P in any set: probability that the effect is there, alone or with others."
+        )
+    if left_out:
+        sets, verb = ("set", "has") if left_out == 1 else ("sets", "have")
+        text.append(f"{left_out} more {sets} of several effects {verb} P < {SHOWN:g}.")
+    if report.guess is not None:
+        text.append(
+            f"A guess, not declared: {report.guess}, "
+            f"{tracing.guesses[0][1]:.1f} nats above the residual process."
+        )
+    return Section(
+        "Effects",
+        tuple(text),
+        header=header,
+        rows=tuple(cells for *_, cells in rows),
+        figure="probabilities",
+    )
+
+
+def equivalences(report: Report) -> Section:
+    """Return the groups of models that nothing separates, or not these trials."""
+    tracing = report.tracing
+    items = [
+        f"{joined(group)}: no permitted action separates them"
+        for group in tracing.equivalent
+    ]
+    items += [
+        f"{joined(group)}: not separated by these trials; another action may"
+        for group in tracing.near
+        if group not in tracing.equivalent
+    ]
+    items += [
+        f"{joined(group)}: nearly the same here, apart by less than the noise; "
+        "repeated trials may separate them"
+        for group in tracing.aliases
+    ]
+    by = "these trials" if report.next_action is None else "a permitted action"
+    text = () if items else (f"Every pair of models is separated by {by}.",)
+    return Section("Equivalence sets", text=text, items=tuple(items))
+
+
+def residuals(report: Report) -> Section:
+    """Return the size of the residuals before and after."""
+    before, detection = report.residuals, report.detection
+    rows = [("bare model", *_sizes(before.refitted), *_sizes(before.prequential))]
+    if report.residuals_after is not None:
+        z = report.residuals_after
+        sizes = *_sizes(z.refitted), *_sizes(z.prequential)
+        rows.append((f"with {added(report)}", *sizes))
+    noise = {
+        "declared": "The noise is declared.",
+        "estimated": "The noise is uncertain, and what it may be is summed over.",
+        "stochastic": "The noise is the simulator's own.",
+    }[before.noise]
+    p = detection.p_value
+    text = [
+        "Observation minus prediction, in standard deviations of the prediction: a "
+        "root mean square of about 1, and 5 % beyond 2, where the model holds. "
+        "Refitted to all trials, and each trial predicted from those before it.",
+        f"{noise} Chi-square of the bare model "
+        f"{detection.chi_square:.1f} on {detection.degrees_of_freedom:.1f} degrees of "
+        f"freedom, p {f'= {p:.2g}' if p >= SMALLEST_P else f'< {SMALLEST_P:g}'}.",
+    ]
+    if before.times is not None:
+        text.append(f"Correlation of neighboring errors {before.correlation:.2f}.")
+    return Section(
+        "Residuals",
+        tuple(text),
+        header=("residuals [sd]", "refitted", "beyond 2", "predicted", "beyond 2"),
+        rows=tuple(rows),
+        figure="residuals",
+    )
+
+
+def leave_one_out(report: Report) -> Section:
+    """Return how well each trial is predicted from the others."""
+    found = report.leave_one_out
+    limit = found[0].largest_k
+    titles = ["bare model", f"with {added(report)}"]
+    rows: list[tuple[str, ...]] = [
+        (
+            title,
+            f"{one.total:.1f}",
+            f"{one.pareto_k.max():.2f}",
+            ", ".join(map(str, one.unreliable)) or "none",
+        )
+        for title, one in zip(titles, found, strict=False)
+    ]
+    text = [
+        "Log density of each trial given the others, nats, summed over the "
+        f"{report.num_trials} trials: PSIS-LOO, which depends less on the priors of "
+        "the effects than log BF does."
+    ]
+    if len(found) > 1:
+        gain = found[1].density - found[0].density
+        error = np.sqrt(len(gain)) * gain.std(ddof=1)
+        rows.append(("difference", with_error(gain.sum(), error), "", ""))
+    elif report.verdict == UNEXPLAINED:
+        text.append("The residual process joins the trials, and has no such density.")
+    if any(one.unreliable for one in found):
+        text.append(
+            f"Where the Pareto shape k exceeds {limit:.2f}, a trial decides so much of "
+            "the posterior that its density is a guess, too high as a rule."
+        )
+    header = ("model", "log density", "largest k", f"trials with k > {limit:.2f}")
+    return Section("Leave one out", tuple(text), header=header, rows=tuple(rows))
+
+
+def _sizes(z: Array) -> tuple[str, str]:
+    """Return the root mean square, and the share beyond 2."""
+    z = z[np.isfinite(z)]
+    if not z.size:
+        return "", ""
+    return f"{np.sqrt((z**2).mean()):.2f}", f"{100 * np.mean(np.abs(z) > 2):.0f} %"

@@ -1,0 +1,175 @@
+"""What a report says of the error, the parameters, and what to do next."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sbi_active.criticism.report.figures import METRICS
+from sbi_active.criticism.report.headline import added, number, with_error
+from sbi_active.criticism.report.section import Section, joined, setting
+from sbi_active.criticism.results import (
+    NONE,
+    SCATTER,
+    UNEXPLAINED,
+    Evaluation,
+    NextAction,
+)
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.report.report import Report
+
+__all__ = ["errors", "next_action", "parameters"]
+
+SEVERE = (
+    "The first paragraph names the actions that put the verdict to the test most. The "
+    "free residual is the bare model and a smooth function of the action, both as "
+    "fitted to the trials; the difference is the root mean square over x, in standard "
+    "deviations of the verdict's prediction, noise included."
+)
+FEW_PAIRS = 8  # scored trials below which the pairs stand in place of an interval
+
+
+def errors(report: Report) -> Section:
+    """Return the error before and after, on trials that had no part in it."""
+    evaluation, title = report.evaluation, "Error before and after"
+    if evaluation is None:
+        return Section(title, ("No trial was scored.",))
+    rows = [
+        (
+            METRICS.get(str(name), str(name)),
+            number(before),
+            number(after),
+            number(ratio),
+            "" if interval is None else " to ".join(map(number, interval)),
+        )
+        for name, before, after, ratio, interval in report.before_after.itertuples(
+            index=False
+        )
+    ]
+    num = len(evaluation.trials)
+    if evaluation.scheme == "held out":
+        text = [f"{num} held-out trials, which had no part in choosing or fitting."]
+    else:
+        same = sum(verdict == report.verdict for verdict in evaluation.selected)
+        text = [
+            f"{num} trials, each predicted by models that were chosen and fitted "
+            f"without it ({evaluation.scheme}); {same} of {num} such verdicts are "
+            f"{report.verdict}, that of all trials."
+        ]
+    text.append(
+        "RMSE and energy score are in units of x: less is better, and their ratio is "
+        "after / before. Of the other two it is the difference, after - before: more "
+        "density is better, and the share should be 0.9."
+    )
+    pairs: list[str] = []
+    if num < FEW_PAIRS:
+        text.append(
+            f"Below {FEW_PAIRS} trials an interval over trials covers too little; "
+            "these are the pairs:"
+        )
+        pairs = _pairs(evaluation)
+    header = ("metric", "before", "after", "ratio or difference", "90 % interval")
+    return Section(
+        title,
+        tuple(text),
+        items=tuple(pairs),
+        header=header,
+        rows=tuple(rows),
+        figure="before_after",
+    )
+
+
+def parameters(report: Report) -> Section:
+    """Return theta before and after, and phi."""
+    units = {e.name: e.units for e in report.tracing.estimates if e.units}
+    header = ["parameter", "bare model", f"with {added(report)}"]
+    rows = []
+    for name, before, before_sd, after, after_sd in report.parameters.itertuples(
+        index=False
+    ):
+        label = f"{name} [{units[name]}]" if name in units else str(name)
+        cells = with_error(before, before_sd), with_error(after, after_sd)
+        rows.append((label, *cells))
+    if report.verdict == NONE:
+        return Section(
+            "Parameters",
+            header=(*header[:2],),
+            rows=tuple(row[:2] for row in rows),
+        )
+    return Section("Parameters before and after", header=(*header,), rows=tuple(rows))
+
+
+def next_action(report: Report) -> Section:
+    """Return the action that tells most, and what no permitted action tells."""
+    chosen, title = report.next_action, "Next action"
+    if chosen is None:
+        return Section(
+            title, ("None was asked for: there is no set of permitted actions.",)
+        )
+    best = float(np.nanmax(chosen.information_gain, initial=0.0))
+    if chosen.action is not None:
+        question = f" between {joined(chosen.separates)}" if chosen.separates else ""
+        action = setting(report.action_labels, chosen.action)
+        text = [f"{action}: at least {best:.2f} nats{question} (a lower bound)."]
+    else:
+        text = [_nothing_to_tell(report, chosen, best)]
+    if report.severe_tests:
+        text.append(SEVERE)
+    return Section(title, tuple(text), items=tuple(_inseparable(report, chosen)))
+
+
+def _nothing_to_tell(report: Report, chosen: NextAction, best: float) -> str:
+    """Return why no action is chosen; it is the end only where the bare model holds."""
+    found = (
+        "no permitted action tells more about which declared model is right than "
+        f"{max(best, 0.001):.3f} nats."
+    )
+    if len(chosen.separates) == 1:
+        found = f"of the declared models only {chosen.separates[0]} is left."
+    if report.verdict == NONE:
+        return f"Stop: {found}"
+    rest = {
+        UNEXPLAINED: " Declare what else the simulator may lack.",
+        SCATTER: " Repeat an action to see how large it is.",
+    }
+    return found[0].upper() + found[1:] + rest.get(report.verdict, "")
+
+
+def _inseparable(report: Report, chosen: NextAction) -> list[str]:
+    """Return each group that no permitted action separates, and what would."""
+    beyond = None if chosen.outside is None else frozenset(chosen.outside_separates)
+    groups = [*chosen.inseparable]
+    if beyond is not None and beyond not in groups:
+        groups.append(beyond)
+    items = []
+    for group in groups:
+        item = f"no permitted action separates {_in_words(group)}"
+        if group == beyond and chosen.outside is not None:
+            item += (
+                f"; {setting(report.action_labels, chosen.outside)}, which is not "
+                "permitted, would: "
+                f"at least {chosen.outside_gain:.2f} nats"
+            )
+        items.append(item)
+    return items
+
+
+def _in_words(group: frozenset[str]) -> str:
+    *first, last = sorted(group)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _pairs(evaluation: Evaluation) -> list[str]:
+    """Return the RMSE and the log density of each scored trial, before and after."""
+    found = []
+    for i, trial in enumerate(evaluation.trials):
+        each = [
+            f"{METRICS[name]} {number(float(evaluation.before[name][i]))} -> "
+            f"{number(float(evaluation.after[name][i]))}"
+            for name in ("rmse", "log predictive density")
+        ]
+        which = "held-out trial" if evaluation.scheme == "held out" else "trial"
+        found.append(f"{which} {int(trial)}: {', '.join(each)}")
+    return found

@@ -1,0 +1,52 @@
+"""What a report says, part by part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from sbi_active.criticism.report import findings, outlook
+from sbi_active.criticism.report.section import Section
+
+if TYPE_CHECKING:
+    from sbi_active.criticism.report.report import Report
+
+__all__ = ["sections"]
+
+
+def sections(report: Report) -> Iterator[Section]:
+    """Yield the parts of a report in order."""
+    if report.warnings:
+        yield Section("Warnings", items=report.warnings)
+    yield findings.effects(report)
+    yield findings.equivalences(report)
+    yield findings.residuals(report)
+    yield outlook.errors(report)
+    if report.leave_one_out:
+        yield findings.leave_one_out(report)
+    yield outlook.parameters(report)
+    yield outlook.next_action(report)
+    yield _record(report)
+
+
+def _record(report: Report) -> Section:
+    evidences = report.tracing.evidences
+    spent = sum(e.num_simulations for e in evidences.values())
+    items = [f"evidence cost {spent:,} simulated trials"]
+    tempered = [name for name, e in evidences.items() if e.engine == "tempering"]
+    if len(tempered) < len(evidences):
+        items.append("evidence by least squares and importance sampling")
+    if tempered:
+        which = ", ".join(sorted(tempered))
+        items.append(f"evidence by tempering, where that did not serve: {which}")
+    if report.detection.null_cross_check is not None:
+        items.append(
+            f"log evidence of the bare model {report.detection.null_log_evidence:.2f}, "
+            f"by tempering {report.detection.null_cross_check:.2f}"
+        )
+    if report.digest:
+        items.append(
+            f"hash of noise, effects and priors, declared before the data: "
+            f"{report.digest}"
+        )
+    return Section("Record", items=tuple(items))

@@ -1,0 +1,190 @@
+"""Coordinates in which a search has steps of unit size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.joint_prior import JointPrior
+from sbi_active.seeding import forked_generators
+
+__all__ = ["SearchCoordinates"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 1_000
+#: A positive number whose prior spans this ratio (5 % to 95 %) is searched in logs.
+WIDE = 100.0
+
+
+class SearchCoordinates:
+    r"""Maps (theta, phi, nuisances) to u, and the prior to its density.
+
+    .. math::
+        u_j = (t_j(z_j) - a_j) / b_j, \qquad t_j = \log \text{ or identity},
+
+    with a and b the mean and deviation of the prior's draws. Bounds stay bounds.
+
+    Args:
+        prior: Of theta.
+        effects: Effects of the rival, of scope "campaign".
+        nuisances: Effects of scope "trial": one phi in each of the trials.
+        num_trials: t.
+
+    Attributes:
+        dim: Number of coordinates.
+        low: Lower bounds in u, shape (dim,).
+        high: Upper bounds in u, shape (dim,).
+        center: Of the Gaussian that stands for the prior in a search, shape (dim,).
+        precision: Its inverse variance, 0 between two bounds, shape (dim,).
+    """
+
+    def __init__(
+        self,
+        prior: Distribution,
+        effects: Sequence[Effect],
+        nuisances: Sequence[Effect],
+        num_trials: int,
+    ) -> None:
+        self.joint = JointPrior(prior, effects)
+        self.nuisances, self.num_trials = [*nuisances], num_trials
+        z = self._raw(NUM_DRAWS, seed=0)
+        self.dim = z.shape[1]
+        low, high = self._bounds()
+        q = np.quantile(z, [0.05, 0.95], axis=0)
+        self.is_log = (low >= 0) & (q[1] > WIDE * q[0])
+        t = self._forward(z)
+        self.shift, self.scale = t.mean(0), np.maximum(t.std(0), 1e-300)
+        with np.errstate(divide="ignore"):
+            self.low = (
+                np.where(self.is_log, np.log(low.clip(0)), low) - self.shift
+            ) / (self.scale)
+            self.high = (
+                np.where(self.is_log, np.log(high.clip(0)), high) - self.shift
+            ) / self.scale
+        u = (t - self.shift) / self.scale
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        # A prior with one bound is taken for a half Gaussian from there.
+        edge = np.where(below, self.low, np.where(above, self.high, 0.0))
+        self.center = np.where(below == above, 0.0, edge)
+        spread = np.maximum(((u - self.center) ** 2).mean(0), 1e-12)
+        self.precision = np.where(below & above, 0.0, 1 / spread)
+
+    def sample(self, num: int, *, seed: int) -> Array:
+        """Return prior draws, shape (num, dim)."""
+        return self.from_z(self._raw(num, seed=seed))
+
+    def from_z(self, z: Array) -> Array:
+        """Return u, shape (n, dim), of natural values."""
+        return (self._forward(z) - self.shift) / self.scale
+
+    def to_z(self, u: Array) -> Array:
+        """Return natural values (theta, phi, nuisances), shape (n, dim)."""
+        t = u * self.scale + self.shift
+        return np.where(self.is_log, np.exp(np.where(self.is_log, t, 0.0)), t)
+
+    def split(self, u: Array) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return theta and phi by effect, as the simulator takes them."""
+        z = torch.from_numpy(self.to_z(u))
+        sizes = [e.phi_dim * self.num_trials for e in self.nuisances]
+        own, *rest = z.split([sum(self.joint.sizes), *sizes], -1)
+        theta, *parts = own.split(self.joint.sizes, -1)
+        phi = {e.name: p for e, p in zip(self.joint.effects, parts, strict=True)}
+        for effect, p in zip(self.nuisances, rest, strict=True):
+            phi[effect.name] = p.reshape(len(z), self.num_trials, effect.phi_dim)
+        return theta, phi
+
+    def log_prob(self, u: Array) -> Array:
+        """Return log prior densities with respect to u, shape (n,)."""
+        inside = ((u >= self.low) & (u <= self.high)).all(1)
+        density = np.full(len(u), -np.inf)
+        if not inside.any():
+            return density
+        u = u[inside]
+        z = torch.from_numpy(self.to_z(u))
+        own = sum(self.joint.sizes)
+        log_p = self.joint.log_prob(z[:, :own]).double()
+        at = own
+        for effect in self.nuisances:
+            size = effect.phi_dim * self.num_trials
+            phi = z[:, at : at + size].reshape(-1, effect.phi_dim)
+            log_p = log_p + effect.log_prob(phi).reshape(len(z), -1).sum(-1)
+            at += size
+        jacobian = np.log(self.scale).sum()
+        jacobian = jacobian + (u * self.scale + self.shift)[:, self.is_log].sum(1)
+        density[inside] = log_p.numpy() + jacobian
+        return density
+
+    def groups(self) -> list[Array]:
+        """Return directions for finite differences, each of shape (dim,), 0 or 1.
+
+        The nuisances of different trials change different numbers of x, so that one
+        step serves them all.
+        """
+        own = sum(self.joint.sizes)
+        rows = [*np.eye(self.dim)[:own]]
+        at = own
+        for effect in self.nuisances:
+            for j in range(effect.phi_dim):
+                row = np.zeros(self.dim)
+                row[at + j : at + effect.phi_dim * self.num_trials : effect.phi_dim] = 1
+                rows.append(row)
+            at += effect.phi_dim * self.num_trials
+        return rows
+
+    def trial_of(self) -> NDArray[np.int64]:
+        """Return the trial that each coordinate belongs to, -1 for all, (dim,)."""
+        own = sum(self.joint.sizes)
+        parts = [np.full(own, -1)]
+        for effect in self.nuisances:
+            parts.append(np.repeat(np.arange(self.num_trials), effect.phi_dim))
+        return np.concatenate(parts).astype(np.int64)
+
+    def _raw(self, num: int, *, seed: int) -> Array:
+        with forked_generators(seed):
+            parts = [self.joint.sample((num,)).double()]
+            for effect in self.nuisances:
+                parts.append(effect.sample(num * self.num_trials).reshape(num, -1))
+        return torch.cat(parts, -1).numpy()
+
+    def _forward(self, z: Array) -> Array:
+        safe = np.where(self.is_log, np.maximum(z, 1e-300), 1.0)
+        return np.where(self.is_log, np.log(safe), z)
+
+    def _bounds(self) -> tuple[Array, Array]:
+        pairs = [
+            _interval(part.support, size)
+            for part, size in zip(self.joint._parts(), self.joint.sizes, strict=True)
+        ]
+        for e in self.nuisances:
+            low, high = _interval(e.prior.support, e.phi_dim)
+            pairs.append(
+                (np.tile(low, self.num_trials), np.tile(high, self.num_trials))
+            )
+        low, high = zip(*pairs, strict=True)
+        return np.concatenate(low), np.concatenate(high)
+
+
+def _interval(support: Any, size: int) -> tuple[Array, Array]:
+    """Return the bounds of each number of a support, infinite where there are none."""
+    while hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    if hasattr(support, "cseq"):
+        parts = [
+            _interval(c, k) for c, k in zip(support.cseq, support.lengths, strict=True)
+        ]
+        low, high = zip(*parts, strict=True)
+        return np.concatenate(low), np.concatenate(high)
+    ends = []
+    for name, default in (("lower_bound", -np.inf), ("upper_bound", np.inf)):
+        end = getattr(support, name, default)
+        end = np.asarray(torch.as_tensor(end).double()).reshape(-1)
+        ends.append(np.broadcast_to(end, (size,)).copy())
+    return ends[0], ends[1]

@@ -1,0 +1,177 @@
+"""The grid over what is unknown of the noise, from what a model declares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.distributions import Distribution
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import NoiseModel
+from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
+
+__all__ = ["declared_noise", "declared_sds", "scattered"]
+
+Array = NDArray[Any]
+
+#: Cells of the correlation time, from half a sample step to twice the recording, and
+#: the prior probability of no correlation at all.
+NUM_TIMES, INDEPENDENT = 14, 0.3
+#: Draws that stand for a posterior over noise parameters.
+NUM_DRAWS = 24
+NUM_SAMPLES = 4_096
+#: Inflation of the noise, 1 + |N(0, 2.5^2)|, by its quantiles.
+INFLATION_SD, NUM_INFLATIONS = 2.5, 14
+
+
+def declared_noise(
+    noise: NoiseModel | None, measurements: Measurements, *, seed: int = 0
+) -> NoiseGrid:
+    """Return the errors that a declared noise model gives to the measurements.
+
+    Along a time axis, noise that says nothing of a correlation has an unknown one: the
+    correlation time is log-uniform, or zero. A posterior over the noise's parameters is
+    represented by draws, or summed if it is a grid of a size and a correlation time.
+
+    Args:
+        noise: The simulator's; None where the simulator is the draw, and its own
+            deviation is the unit.
+        measurements: What is measured.
+        seed: Of the draws of the posterior.
+
+    Raises:
+        ValueError: If a declared standard deviation is zero.
+    """
+    if noise is None:
+        one = np.ones(len(measurements))
+        return NoiseGrid(_correlated(measurements, one))
+    names = noise.parameter_names
+    if "correlation_time" in names:
+        grid = _product(noise.posterior, measurements)
+        if grid is not None:
+            return grid
+    if noise.posterior is None:
+        rows = noise.parameters[None]
+    else:
+        with forked_generators(seed, "noise"):
+            rows = noise.posterior.sample(torch.Size([NUM_DRAWS])).double()
+    cells: list[NoiseCell] = []
+    weight = -np.log(len(rows))
+    for row in rows:
+        values = dict(zip(names, row.tolist(), strict=True))
+        sds = np.array([v for k, v in values.items() if k.startswith("sd")])
+        if not len(sds):  # a noise model of the user's, taken as Gaussian of its size
+            sds = declared_sds(noise).numpy()
+        if (sds <= 0).any():
+            raise ValueError(
+                "expected measurement noise with a standard deviation > 0; got "
+                f"{noise}; do declare the error of the measurement, since without one "
+                "any residual is an effect"
+            )
+        sd = sds[_channel_of(measurements, len(sds))]
+        df = values.get("df", np.inf)
+        tau = values.get("correlation_time")
+        if tau is not None:
+            cells.append(
+                NoiseCell.of(
+                    measurements, sd=sd, correlation_time=tau, log_weight=weight
+                )
+            )
+        elif measurements.has_time and np.isinf(df):
+            cells += _correlated(measurements, sd, weight)
+        else:
+            cells.append(NoiseCell.of(measurements, sd=sd, df=df, log_weight=weight))
+    return NoiseGrid(cells)
+
+
+def _product(
+    posterior: Distribution | None, measurements: Measurements
+) -> NoiseGrid | None:
+    """Return the sum over a grid of one standard deviation times a correlation time.
+
+    None unless the posterior is such a grid with independent parts, as one is that
+    stands for noise of unknown size: a few draws of it would miss what the trials tell
+    of the size to some percent.
+    """
+    if not isinstance(posterior, NoisePosterior) or posterior.shared is None:
+        return None
+    sd, shared = posterior.sd, posterior.shared
+    if not isinstance(sd, SdGrid) or sd.num_channels > 1:
+        return None
+    weights = sd.log_weight[:, 0]
+    if not torch.equal(weights, weights[:1].expand_as(weights)):
+        return None
+    nodes = sd.nodes[0]
+    middle = float((weights[0].exp() * nodes.log()).sum().exp())
+    unit = np.full(len(measurements), middle)
+    times = (shared.edges[1:] * shared.edges[:-1]).sqrt().tolist()
+    cells = [
+        NoiseCell.of(measurements, sd=unit, correlation_time=tau, log_weight=w)
+        for tau, w in zip(times, shared.log_weight.tolist(), strict=True)
+    ]
+    scales = (nodes / middle).numpy()
+    return NoiseGrid(cells, scales=scales, log_weights=weights[0].numpy())
+
+
+def declared_sds(noise: NoiseModel) -> torch.Tensor:
+    """Return the standard deviations of a noise model, shape (1,) or (channels,).
+
+    One that has no such parameter is sampled around zero.
+    """
+    sds = [
+        v
+        for name, v in zip(noise.parameter_names, noise.parameters, strict=True)
+        if name.startswith("sd")
+    ]
+    if sds:
+        return torch.stack(sds).double()
+    with forked_generators(0, "sd"):
+        draws = noise.sample(torch.zeros(NUM_SAMPLES, 1, dtype=torch.float64))
+    return draws.std().reshape(1).double()
+
+
+def scattered(noise: NoiseGrid) -> NoiseGrid:
+    """Return the noise inflated by 1 + |N(0, 2.5^2)|, summed out by its quantiles."""
+    levels = torch.arange(0.5, NUM_INFLATIONS) / NUM_INFLATIONS
+    half_normal = torch.distributions.Normal(0.0, 1.0).icdf(0.5 + 0.5 * levels)
+    scales = 1 + INFLATION_SD * half_normal.double().numpy()
+    weights = np.full(NUM_INFLATIONS, -np.log(NUM_INFLATIONS))
+    return noise.scaled(scales, weights)
+
+
+def _correlated(
+    measurements: Measurements, sd: Array, log_weight: float = 0.0
+) -> list[NoiseCell]:
+    if not measurements.has_time or not np.isfinite(measurements.gap).any():
+        return [NoiseCell.of(measurements, sd=sd, log_weight=log_weight)]
+    step, span = measurements.step, measurements.span
+    times = np.geomspace(0.5 * step, 2 * span, NUM_TIMES)
+    each = log_weight + np.log1p(-INDEPENDENT) - np.log(NUM_TIMES)
+    independent = NoiseCell.of(
+        measurements, sd=sd, log_weight=log_weight + np.log(INDEPENDENT)
+    )
+    return [
+        independent,
+        *[
+            NoiseCell.of(measurements, sd=sd, correlation_time=t, log_weight=each)
+            for t in times
+        ],
+    ]
+
+
+def _channel_of(measurements: Measurements, num: int) -> NDArray[np.int64]:
+    """Return which of the declared standard deviations each number has."""
+    if num == 1:
+        return np.zeros(len(measurements), dtype=np.int64)
+    last = measurements.shape[-1]
+    if last != num:
+        raise ValueError(
+            f"expected a standard deviation for each of {last} channels; got {num}; do "
+            "give one an entry of x's last axis"
+        )
+    return measurements.position % last

@@ -1,0 +1,271 @@
+r"""A Gaussian process over action, time and order: what no declared effect explains.
+
+.. math::
+    r = a\, b\, g(\xi, t) + \epsilon, \qquad
+    g \sim \mathcal{GP}\Bigl(0, \exp\bigl(-\tfrac{|\Delta\xi|^2}{2 \ell^2}
+    - \tfrac{\Delta t^2}{2 \ell_t^2}\bigr)\Bigr),
+
+independent in each channel. The unit b is the noise's standard deviation, or it is
+proportional to the deviation of the prior predictive: what is missing from a simulator
+that multiplies or shifts an input grows with the output. The length :math:`\ell` takes
+two values. In a third process the order of the trials takes the place of the action:
+what warms or wears has structure, if not one of the action. The amplitude a is
+log-uniform from the size of the noise to that of the prior predictive. All are summed
+out.
+
+References:
+    Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.rivals.error_models import (
+    LOG_2PI,
+    ErrorModel,
+    NoiseGrid,
+    Whitener,
+    log_sum_exp,
+)
+
+__all__ = ["LENGTHS", "ResidualProcess", "smooth_features"]
+
+Array = NDArray[Any]
+
+#: Length scales, in ranges of the action space: a local and a global misfit.
+LENGTHS = (0.1, 0.3)
+#: Length scale along the order of the trials, in their span.
+ORDER_LENGTH = 0.3
+#: Length scale along a trajectory, in its span.
+TIME_LENGTH = 0.3
+NUM_AMPLITUDES = 10
+#: Points that represent the process; as many as there are up to here.
+MAX_POINTS = 300
+#: Directions of less than this share of the variance are left out.
+NEGLIGIBLE = 1e-5
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """The process in whitened coordinates: cov = I + a^2 Q diag(v) Q^T."""
+
+    cell: int
+    kind: int  # of the process: one a length, then that of the order
+    is_relative: bool
+    log_weight: float
+    directions: Array  # Q, (N, m), orthonormal
+    variances: Array  # v, (m,)
+
+
+class ResidualProcess(ErrorModel):
+    """Noise plus a smooth function of the action and time.
+
+    Args:
+        noise: The error without the process.
+        measurements: What the residuals are of.
+        action: Of each trial, in ranges of the action space, shape (t, action_dim).
+        order: Of each trial, in the span of those at hand, shape (t,); None for no
+            process over it.
+        largest: Upper end of the amplitude, in standard deviations of the noise.
+        lengths: Length scales, in ranges of the action space.
+        spread: Deviation of the prior predictive, shape (N,); None has the noise as the
+            only unit.
+    """
+
+    def __init__(
+        self,
+        noise: NoiseGrid,
+        measurements: Measurements,
+        *,
+        action: Array,
+        order: Array | None = None,
+        largest: float,
+        lengths: tuple[float, ...] = LENGTHS,
+        spread: Array | None = None,
+    ) -> None:
+        self.noise, self.measurements, self.spread = noise, measurements, spread
+        self.lengths = lengths
+        self.amplitudes = np.geomspace(1.0, max(largest, 3.0), NUM_AMPLITUDES)
+        # With an unknown size of the noise, the amplitude is a multiple of it.
+        self._log_amplitude = -np.log(NUM_AMPLITUDES)
+        typical = noise.typical_sd
+        self._bases: list[_Basis] = []
+        units = {False: typical}
+        if spread is not None:
+            units[True] = self._relative(spread, typical)
+        inputs = self._inputs(action, order)
+        for kind, relative in product(range(len(inputs)), units):
+            points = _coordinates(measurements, inputs[kind], measurements.span)
+            features = units[relative][:, None] * _features(*points)
+            for k, cell in enumerate(noise.cells):
+                whitened = cell.whiten(features.T).T
+                values, vectors = np.linalg.eigh(whitened.T @ whitened)
+                keep = values > NEGLIGIBLE * max(values.max(), 1e-300)
+                self._bases.append(
+                    _Basis(
+                        k,
+                        kind,
+                        relative,
+                        float(noise.log_prior[k] - np.log(len(inputs) * len(units))),
+                        whitened @ (vectors[:, keep] / np.sqrt(values[keep])),
+                        values[keep],
+                    )
+                )
+
+    def log_likelihood(self, residual: Array) -> Array:
+        parts = [self._joint(residual, basis) for basis in self._bases]
+        return log_sum_exp(np.stack(parts, 1).reshape(len(residual), -1), axis=1)
+
+    def start(self) -> Whitener:
+        return self.noise.start()
+
+    def whitener(self, residual: Array) -> Whitener:
+        joint = np.stack([self._joint(residual[None], b)[0] for b in self._bases])
+        place = np.unravel_index(np.argmax(joint), joint.shape)
+        basis = self._bases[place[0]]
+        return self._whitener(
+            basis, self.amplitudes[place[1]], self.noise.scales[place[2]]
+        )
+
+    def regimes(self, residual: Array) -> list[Whitener]:
+        # A large process leaves the parameters wide, a small one narrow.
+        cell = int(np.argmax(self.noise.log_prior))
+        scale = float(np.median(self.noise.scales))
+        return [
+            self._whitener(basis, a, scale)
+            for basis in self._bases
+            if basis.cell == cell
+            for a in self.amplitudes[::2]
+        ]
+
+    def _whitener(self, basis: _Basis, a: float, scale: float) -> Whitener:
+        cell = self.noise.cells[basis.cell]
+        shrink = 1 / np.sqrt(1 + a**2 * basis.variances) - 1
+
+        def whiten(residual: Array) -> Array:
+            e = cell.whiten(residual) / scale
+            return e + ((e @ basis.directions) * shrink) @ basis.directions.T
+
+        return whiten
+
+    def condition(
+        self,
+        residual: Array,
+        new: Measurements,
+        action: Array,
+        *,
+        order: Array | None = None,
+        spread: Array | None = None,
+    ) -> tuple[Array, Array]:
+        r"""Return the process at new actions, given residuals, by its best amplitude.
+
+        .. math::
+            E[g_* | r] = K_* (K + R)^{-1} r, \qquad
+            V[g_* | r] = K_{**} - K_* (K + R)^{-1} K_*^T
+
+        Args:
+            residual: Of the measurements at hand, shape (n, N).
+            new: Measurements to predict, M.
+            action: Of all trials, those at hand first, in ranges of the action space.
+            order: Of all trials, likewise, in the span of those at hand; needed where
+                there is a process over it.
+            spread: Of the new measurements, shape (M,), where there is one of the old.
+
+        Returns:
+            Means, shape (n, M), and standard deviations, shape (M,).
+        """
+        middle = residual.mean(0)
+        joint = np.stack([self._joint(middle[None], b)[0] for b in self._bases])
+        place = np.unravel_index(np.argmax(joint), joint.shape)
+        basis, a = self._bases[place[0]], self.amplitudes[place[1]]
+        cell, scale = self.noise.cells[basis.cell], self.noise.scales[place[2]]
+        place_of = self._inputs(action, order)[basis.kind]
+        own = _coordinates(self.measurements, place_of, self.measurements.span)
+        there = _coordinates(new, place_of[-new.shape[0] :], self.measurements.span)
+        sd, new_sd = cell.sd * scale, np.full(len(new), np.median(cell.sd) * scale)
+        unit, new_unit = sd, new_sd
+        if basis.is_relative and spread is not None and self.spread is not None:
+            unit = self._relative(self.spread, sd)
+            new_unit = unit[0] / self.spread[0] * spread
+        within = a**2 * _kernel(own, own) * np.outer(unit, unit)
+        across = a**2 * _kernel(there, own) * np.outer(new_unit, unit)
+        whitened = cell.whiten(cell.whiten(within).T) / scale**2
+        inverse = np.linalg.inv(whitened + np.eye(len(sd)))
+        weight = (cell.whiten(across) / scale) @ inverse
+        mean = (cell.whiten(residual) / scale) @ weight.T
+        explained = np.einsum("mi,mi->m", weight, cell.whiten(across) / scale)
+        return mean, np.sqrt(np.maximum((a * new_unit) ** 2 - explained, 0.0))
+
+    def noise_posterior(
+        self, residual: Array, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return a cell and a scale of the noise for each residual, at random."""
+        joint = np.stack([self._joint(residual, basis) for basis in self._bases], 1)
+        flat = joint.reshape(len(residual), -1)
+        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
+        basis, _, scale = np.unravel_index(best, joint.shape[1:])
+        cells = np.array([b.cell for b in self._bases])[basis]
+        return cells, self.noise.scales[scale]
+
+    def _relative(self, spread: Array, sd: Array) -> Array:
+        """Return the spread, in the median as large as the noise."""
+        return spread * np.median(sd / spread)
+
+    def _inputs(self, action: Array, order: Array | None) -> list[Array]:
+        """Return where trials lie for each process, in its lengths, (t, columns)."""
+        inputs = [action / length for length in self.lengths]
+        if order is not None:
+            inputs.append(order[:, None] / ORDER_LENGTH)
+        return inputs
+
+    def _joint(self, residual: Array, basis: _Basis) -> Array:
+        """Return log p(residual, amplitude, scale), shape (n, amplitudes, scales)."""
+        cell, num = self.noise.cells[basis.cell], residual.shape[1]
+        e = cell.whiten(residual)
+        q = (e @ basis.directions) ** 2
+        rest = np.maximum(np.einsum("ni,ni->n", e, e) - q.sum(1), 0.0)
+        total = 1 + self.amplitudes[:, None] ** 2 * basis.variances  # (amplitudes, m)
+        square = rest[:, None] + q @ (1 / total).T
+        scales = self.noise.scales
+        log_p = -0.5 * square[..., None] / scales**2 - num * np.log(scales)
+        log_p = log_p - 0.5 * np.log(total).sum(1)[:, None] - cell.log_scale
+        log_p = log_p - 0.5 * num * LOG_2PI + self.noise.log_scale_prior
+        return log_p + basis.log_weight + self._log_amplitude
+
+
+def _coordinates(m: Measurements, place: Array, span: float) -> tuple[Array, Array]:
+    """Return points in length scales, shape (N, columns + 1), and channels."""
+    time = (m.time - m.time.min()) / (TIME_LENGTH * span)
+    return np.column_stack([place[m.trial], time]), m.channel
+
+
+def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
+    distance = ((rows[0][:, None] - columns[0][None]) ** 2).sum(-1)
+    return np.exp(-0.5 * distance) * (rows[1][:, None] == columns[1][None])
+
+
+def smooth_features(m: Measurements, at: Array) -> Array:
+    """Return features of a smooth function along one trial alone, shape (n, m).
+
+    Args:
+        m: The measurements of all trials.
+        at: Which of them are the trial's n, bool, shape (N,).
+    """
+    points, channel = _coordinates(m, np.zeros((m.shape[0], 0)), m.span)
+    return _features(points[at], channel[at])
+
+
+def _features(points: Array, channel: Array) -> Array:
+    """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
+    some = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
+    few = points[some], channel[some]
+    values, vectors = np.linalg.eigh(_kernel(few, few))
+    keep = values > NEGLIGIBLE * values.max()
+    return _kernel((points, channel), few) @ (vectors[:, keep] / np.sqrt(values[keep]))

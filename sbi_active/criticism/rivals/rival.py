@@ -1,0 +1,178 @@
+"""A rival: the simulator with some effects and a distribution of its errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.distributions import Distribution
+
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid, Whitener
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.rivals.validity import DISAGREEMENT, log_outcomes
+
+__all__ = ["Rival"]
+
+Array = NDArray[Any]
+
+#: Bound on a residual, so that its square is finite.
+LARGEST = 1e100
+
+
+class Rival:
+    r"""A model of the trials, :math:`p(x | z)\, p(z)` with z = (theta, phi).
+
+    Args:
+        name: Of the rival.
+        simulator: Of the trials, shared by all rivals.
+        prior: Of theta.
+        effects: Effects that this rival has.
+        nuisances: Effects of scope "trial", which every rival has.
+        error: Distribution of the residual.
+        spread: Deviation of the prior predictive, shape (N,), which is the density of a
+            number where the simulator gives none.
+        center: Its mean, shape (N,).
+        disagreement: Probabilities, equally likely, that a trial has no outcome where
+            the simulator has one, or vice versa.
+
+    Attributes:
+        coordinates: Of z.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        simulator: TrialSimulator,
+        prior: Distribution,
+        effects: Sequence[Effect],
+        nuisances: Sequence[Effect] = (),
+        error: ErrorModel,
+        spread: Array,
+        center: Array | None = None,
+        disagreement: Sequence[float] = (DISAGREEMENT,),
+    ) -> None:
+        self.name, self.effects = name, (*effects,)
+        self.simulator, self.error, self.spread = simulator, error, spread
+        self.center = np.zeros(len(spread)) if center is None else center
+        self.disagreement = disagreement
+        self.coordinates = SearchCoordinates(
+            prior, effects, nuisances, len(simulator.trials)
+        )
+        self.has_noise_effect = any(e.hook == "noise" for e in effects)
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates."""
+        return self.coordinates.dim
+
+    @property
+    def theta_dim(self) -> int:
+        """Number of coordinates of the simulator's own parameters."""
+        phi = sum(place.stop - place.start for place in self.columns().values())
+        return self.dim - phi
+
+    def columns(self) -> dict[str, slice]:
+        """Return where each effect's phi stands among the coordinates, by name."""
+        sizes = [(e.name, e.phi_dim) for e in self.effects]
+        num = self.coordinates.num_trials
+        sizes += [(e.name, e.phi_dim * num) for e in self.coordinates.nuisances]
+        at = self.dim - sum(size for _, size in sizes)
+        found = {}
+        for name, size in sizes:
+            found[name] = slice(at, at + size)
+            at += size
+        return found
+
+    @property
+    def searched(self) -> NDArray[np.bool_]:
+        """Coordinates that a least-squares search may move: not those of the noise."""
+        joint = self.coordinates.joint
+        own = [e.hook != "noise" for e in joint.effects]
+        flags = np.repeat([True, *own], joint.sizes)
+        return np.concatenate([flags, np.ones(self.dim - len(flags), bool)])
+
+    def residual(
+        self, u: Array, *, penalized: bool = True
+    ) -> tuple[Array, Array, Array]:
+        """Return residuals in units of the declared noise.
+
+        Args:
+            u: Shape (n, dim).
+            penalized: Where the simulator gives no number, a search needs a residual
+                that drives it away: the spread of the prior predictive, in units of the
+                noise. False gives what the likelihood has there, the prior predictive
+                itself as the number's distribution.
+
+        Returns:
+            Observation minus prediction divided by the effects' factor on the noise,
+            shape (n, N); log of these factors, summed, shape (n,); log probability of
+            which trials have an outcome, shape (n,).
+        """
+        theta, phi = self.coordinates.split(u)
+        mean, sd, probability = self.simulator.predict(theta, phi)
+        m, missing = self.simulator.measurements, ~np.isfinite(mean)
+        residual = np.where(missing, self.spread, m.x - mean)
+        log_scale = np.zeros(len(u))
+        scale = self.simulator.noise_scale(phi, len(u))
+        if sd is not None:
+            sd = np.where(np.isfinite(sd), sd, self.spread)
+            scale = sd if scale is None else scale * sd
+        if missing.any() and not penalized:
+            residual = np.where(missing, m.x - self.center, residual)
+            wide = self.spread / self._unit
+            scale = np.where(missing, wide, 1.0 if scale is None else scale)
+        if scale is not None:
+            scale = np.maximum(scale, 1e-12)
+            residual, log_scale = residual / scale, np.log(scale).sum(1)
+        flags = log_outcomes(probability, m.valid, self.disagreement)
+        residual = np.clip(residual, -LARGEST, LARGEST)
+        return residual, log_scale, flags
+
+    @property
+    def _unit(self) -> Array:
+        """Typical standard deviation of the noise, shape (N,)."""
+        noise = getattr(self.error, "noise", self.error)
+        assert isinstance(noise, NoiseGrid)
+        return noise.typical_sd
+
+    def log_likelihood(self, u: Array) -> Array:
+        """Return log p(x | z), shape (n,)."""
+        residual, log_scale, flags = self.residual(u, penalized=False)
+        log_p = self.error.log_likelihood(residual) - log_scale + flags
+        return np.where(np.isfinite(log_p), log_p, -np.inf)
+
+    def log_prior(self, u: Array) -> Array:
+        """Return log p(z) with respect to u, shape (n,)."""
+        return self.coordinates.log_prob(u)
+
+    def jacobian(self, u: Array, whiten: Whitener, step: float) -> tuple[Array, Array]:
+        """Return whitened residuals and their derivatives by finite differences.
+
+        Args:
+            u: Shape (n, dim).
+            whiten: Maps (..., N) to (..., N).
+            step: In u.
+
+        Returns:
+            Shapes (n, N) and (n, N, dim).
+        """
+        c = self.coordinates
+        groups = [g for g in c.groups() if self.searched[g > 0].any()]
+        sign = np.where(u + step > c.high, -1.0, 1.0)
+        stack = [u, *[u + step * sign * g for g in groups]]
+        all_r = whiten(self.residual(np.concatenate(stack))[0])
+        r = all_r.reshape(len(stack), *u.shape[:1], -1)
+        trial_of, trial = c.trial_of(), self.simulator.measurements.trial
+        jac = np.zeros((*r[0].shape, self.dim))
+        for k, group in enumerate(groups):
+            change = (r[k + 1] - r[0]) / step
+            for j in np.flatnonzero(group):
+                part = sign[:, j, None] * change
+                mine = trial_of[j] < 0
+                jac[:, :, j] = part if mine else part * (trial == trial_of[j])
+        return r[0], jac

@@ -1,0 +1,263 @@
+"""Simulates all trials for many parameters at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.rivals.row_cache import SimulatedRows
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+
+__all__ = ["TrialSimulator"]
+
+Array = NDArray[Any]
+
+#: Draws a row from which a stochastic simulator's mean and deviation are taken.
+NUM_REPLICATES = 32
+#: Draws with a number from which a mean and a deviation are taken, at least.
+FEWEST = 4
+#: Numbers of x in memory at once, and predicted numbers that are kept.
+CHUNK = KEPT = 8_000_000
+
+
+class TrialSimulator:
+    r"""Predicts the measured numbers of all trials, for n parameters in one batch.
+
+    A simulator without declared noise is its own draw. Its mean and standard deviation
+    then come from 32 draws under fixed seeds, the same for all parameters: the
+    synthetic likelihood, Gaussian given these two, is a smooth function of the
+    parameters wherever the simulator is one of its parameters and seeds.
+
+    Args:
+        model: With every effect that any rival has.
+        trials: The trials.
+        seed: Of the replicates.
+
+    Attributes:
+        measurements: What is predicted.
+        num_simulations: Trials predicted so far; a deterministic simulator runs once
+            for those with the same inputs.
+        failed: Whether any of them had no outcome.
+        is_stochastic: Whether the simulator is the draw.
+
+    References:
+        Wood, Nature 466 (2010); Price et al., J. Comput. Graph. Stat. 27 (2018).
+    """
+
+    def __init__(
+        self, model: AugmentedSimulator, trials: Trials, *, seed: int = 0
+    ) -> None:
+        self.model, self.trials, self.seed = model, trials, seed
+        times = model.sample_times
+        if model.takes_times and trials.sample_times is not None:
+            times = None  # it is asked for the trials' own
+        self._model_times = None if times is None else times.double().numpy()
+        names = () if model.noise is None else model.noise.parameter_names
+        self.measurements = Measurements.of(
+            trials, self._model_times, is_sequence="correlation_time" in names
+        )
+        self.is_stochastic = model.noise is None
+        self.num_simulations, self.failed = 0, False
+        self._dtype = torch.float64
+        self._known = SimulatedRows(KEPT)
+        self._has_repeats = len(torch.unique(trials.action, dim=0)) < len(trials)
+        # The scale of a declared noise is no part of the mean.
+        self._of_noise = {
+            e.name
+            for e in model.effects
+            if e.hook == "noise" and not self.is_stochastic
+        }
+
+    def __len__(self) -> int:
+        return len(self.trials)
+
+    def predict(
+        self, theta: Tensor, phi: dict[str, Tensor]
+    ) -> tuple[Array, Array | None, Array]:
+        """Return what the simulator predicts for the measured numbers.
+
+        Args:
+            theta: Shape (n, theta_dim).
+            phi: By effect, shape (n, phi_dim), or (n, t, phi_dim) of scope "trial".
+
+        Returns:
+            The mean, shape (n, N), NaN where the simulator gives no number; the
+            deviation, shape (n, N), None where the noise is declared; the probability
+            that each trial has an outcome, shape (n, t).
+        """
+        names = [name for name in phi if name not in self._of_noise]
+        columns = [theta, *[phi[name].reshape(len(theta), -1) for name in names]]
+        rows = torch.cat([part.double() for part in columns], 1).numpy()
+
+        def simulate(at: Array) -> tuple[Array, Array | None, Array]:
+            return self._predict_all(theta[at], {k: p[at] for k, p in phi.items()})
+
+        return self._known.get(names, rows, simulate)
+
+    def _predict_all(
+        self, theta: Tensor, phi: dict[str, Tensor]
+    ) -> tuple[Array, Array | None, Array]:
+        m = self.measurements
+        repeats = NUM_REPLICATES if self.is_stochastic else 1
+        size = max(1, int(np.prod(m.shape)) * repeats)
+        most = max(1, CHUNK // size)
+        parts = []
+        for start in range(0, len(theta), most):
+            rows = slice(start, start + most)
+            some = {name: p[rows] for name, p in phi.items()}
+            parts.append(self._predict(theta[rows], some, repeats))
+        mean, sd, valid = zip(*parts, strict=True)
+        joined = None if sd[0] is None else np.concatenate(sd)
+        return np.concatenate(mean), joined, np.concatenate(valid)
+
+    def noise_scale(self, phi: dict[str, Tensor], num: int) -> Array | None:
+        """Return the factor on the noise, shape (n, N); None without such effects."""
+        if not any(e.hook == "noise" and e.name in phi for e in self.model.effects):
+            return None
+        action, index, times = self._rows(num, 1)
+        shape = self.measurements.shape
+        one = torch.ones(num * shape[0], *shape[1:], dtype=self._dtype)
+        scale = self.model.noise_scale(
+            self._tiled(phi, 1), action, one, index=index, times=times
+        )
+        flat = scale.double().numpy().reshape(num, -1)
+        return flat[:, self.measurements.position]
+
+    def _predict(
+        self, theta: Tensor, phi: dict[str, Tensor], repeats: int
+    ) -> tuple[Array, Array | None, Array]:
+        n, t = len(theta), len(self.trials)
+        self.num_simulations += n * t * repeats
+        action, index, times = self._rows(n, repeats)
+        seeds = None
+        if self.is_stochastic:
+            seeds = row_seeds(self.seed, t * repeats).repeat(n)
+        rows = theta.repeat_interleave(t * repeats, 0).to(self._dtype)
+        tiled = self._tiled(phi, repeats)
+        with forked_generators(derive_seed(self.seed, "replicates")):
+            x = self._simulate(rows, tiled, action, index, times, seeds)
+        x = x.reshape(n, repeats, t, *x.shape[1:])
+        flat = self._at_measured_times(x)  # (n, repeats, t * numbers)
+        valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1)
+        self.failed |= bool((valid < 1).any())
+        picked = flat[..., self.measurements.position]
+        if not self.is_stochastic:
+            return picked[:, 0], None, valid
+        return *_moments(picked), valid
+
+    def _simulate(
+        self,
+        theta: Tensor,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        index: Tensor,
+        times: Tensor | None,
+        seeds: Tensor | None,
+    ) -> Tensor:
+        def run(dtype: torch.dtype) -> Tensor:
+            return self.model.evaluate(
+                theta.to(dtype),
+                {name: p.to(dtype) for name, p in phi.items()},
+                action.to(dtype),
+                index=index,
+                times=times,
+                seeds=seeds,
+                merge=self._has_repeats,
+            )
+
+        if self._dtype == torch.float64:
+            try:
+                return run(torch.float64)
+            except RuntimeError as error:
+                # A simulator that holds single-precision tensors of its own.
+                if "dtype" not in str(error) and "Double" not in str(error):
+                    raise
+                self._dtype = torch.float32
+        return run(torch.float32)
+
+    def _rows(self, num: int, repeats: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return action, index and times, one row a trial, for all parameters."""
+        tiles = num * repeats
+        action = self.trials.action.to(self._dtype).repeat(tiles, 1)
+        index = self.trials.index.repeat(tiles)
+        times = self.trials.sample_times
+        if times is not None and times.ndim == 2:
+            times = _held(times).repeat(tiles, 1)
+        return action, index, times if self._model_times is None else None
+
+    def _tiled(self, phi: dict[str, Tensor], repeats: int) -> dict[str, Tensor]:
+        t = len(self.trials)
+        return {
+            name: (
+                p.repeat_interleave(t * repeats, 0)
+                if p.ndim == 2
+                else p.repeat_interleave(repeats, 0).reshape(-1, p.shape[-1])
+            ).to(self._dtype)
+            for name, p in phi.items()
+        }
+
+    def _at_measured_times(self, x: Tensor) -> Array:
+        """Return x at the trials' sample times, shape (n, repeats, t * numbers)."""
+        simulated = x.double().numpy()
+        n, repeats, t = simulated.shape[:3]
+        shape = self.measurements.shape[1:]
+        times, own = self.trials.sample_times, self._model_times
+        if times is not None and own is not None:
+            stamps = np.broadcast_to(times.double().numpy(), (t, shape[0]))
+            if stamps.shape[1] != len(own) or not np.allclose(stamps, own[None]):
+                simulated = _interpolate(simulated, own, stamps)
+        if simulated.shape[3:] != shape:
+            raise ValueError(
+                f"expected trials of the simulator's shape {simulated.shape[3:]}; got "
+                f"x of shape {shape} a trial; do measure what the simulator returns, "
+                "or give sample_times to both"
+            )
+        return simulated.reshape(n, repeats, -1)
+
+
+def _held(times: Tensor) -> Tensor:
+    """Return times, shape (t, k), with the last of each row in place of its padding."""
+    last = times.nan_to_num(-torch.inf).amax(-1, keepdim=True)
+    last = last.where(last.isfinite(), torch.zeros_like(last))
+    return times.where(times.isfinite(), last)
+
+
+def _moments(x: Array) -> tuple[Array, Array]:
+    """Return mean and deviation over replicates, shape (n, r, N), of those with x.
+
+    NaN where fewer than a quarter of them, and at least 4, give a number.
+    """
+    finite = np.isfinite(x)
+    count = finite.sum(1)
+    enough = count >= max(FEWEST, x.shape[1] // 4)
+    safe = np.maximum(count, 2)
+    mean = np.where(finite, x, 0.0).sum(1) / safe
+    square = np.where(finite, x - mean[:, None], 0.0) ** 2
+    sd = np.sqrt(square.sum(1) / (safe - 1)) + 1e-12
+    return np.where(enough, mean, np.nan), np.where(enough, sd, np.nan)
+
+
+def _interpolate(x: Array, own: Array, stamps: Array) -> Array:
+    """Return x, shape (n, r, t, k, ...), linearly at stamps (t, m); ends are held."""
+    step = np.diff(own).max()
+    low, high = np.nanmin(stamps), np.nanmax(stamps)
+    if low < own[0] - step or high > own[-1] + step:
+        raise ValueError(
+            f"expected sample_times within those of the simulator, {own[0]:g} to "
+            f"{own[-1]:g}; got {low:g} to {high:g}; do simulate for longer, or leave "
+            "the samples beyond out"
+        )
+    safe = np.where(np.isfinite(stamps), stamps, own[0])
+    at = np.clip(np.searchsorted(own, safe, side="right") - 1, 0, len(own) - 2)
+    weight = np.clip((safe - own[at]) / (own[at + 1] - own[at]), 0.0, 1.0)
+    trial = np.arange(len(stamps))[:, None]
+    low, high = x[:, :, trial, at], x[:, :, trial, at + 1]
+    weight = weight.reshape(1, 1, *weight.shape, *[1] * (x.ndim - 4))
+    return (1 - weight) * low + weight * high

@@ -1,0 +1,68 @@
+"""Likelihood of which trials have an outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.results import Residuals
+from sbi_active.criticism.rivals.error_models import log_sum_exp
+
+__all__ = ["DISAGREEMENT", "UNKNOWN_RATES", "log_outcomes", "surprising_outcomes"]
+
+Array = NDArray[Any]
+
+#: Probability that a trial has no outcome where the simulator has one, or vice versa.
+DISAGREEMENT = 0.02
+#: The same where nothing declared explains the outcomes, equally likely.
+UNKNOWN_RATES = (DISAGREEMENT, 0.1, 0.3, 0.5)
+#: Probability below which an outcome is named.
+SURPRISING = 0.05
+
+
+def log_outcomes(
+    probability: Array, valid: Array, rates: Sequence[float] = (DISAGREEMENT,)
+) -> Array:
+    r"""Return the log probability of the trials' validity flags.
+
+    .. math::
+        \log \frac1R \sum_{\epsilon} \prod_t
+        \bigl[(1 - \epsilon)\, q_t + \epsilon\, (1 - q_t)\bigr]
+
+    less its value where all agree for sure, so that flags which say nothing count
+    nothing, with :math:`q_t = P(v_t | \theta, \phi, \xi_t)` of the flag :math:`v_t`:
+    0 or 1 from a deterministic simulator, the share of its draws from a random one.
+
+    Args:
+        probability: Of an outcome by the simulator, shape (n, t).
+        valid: Which trials have one, shape (t,).
+        rates: :math:`\epsilon`, the R probabilities of disagreement, equally likely.
+
+    Returns:
+        Shape (n,), nats.
+    """
+    q = np.where(valid, probability, 1 - probability)
+    each = [np.log((1 - e) * q + e * (1 - q)).sum(-1) for e in rates]
+    agreed = len(valid) * np.log1p(-DISAGREEMENT)
+    return log_sum_exp(np.stack(each), axis=0) - np.log(len(rates)) - agreed
+
+
+def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
+    """Return places of trials whose validity the model holds for improbable.
+
+    Args:
+        residuals: With the probability of a measurement in each trial.
+
+    Returns:
+        Those without a measurement and those with one, of a probability below 1/20.
+    """
+    p = residuals.probability_valid
+    if p is None:
+        return [], []
+    valid = np.isfinite(residuals.x.reshape(len(p), -1)).any(1)
+    lost = np.flatnonzero(~valid & (p > 1 - SURPRISING))
+    kept = np.flatnonzero(valid & (p < SURPRISING))
+    return lost.tolist(), kept.tolist()

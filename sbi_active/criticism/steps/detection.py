@@ -1,0 +1,168 @@
+"""Whether the bare model, refitted, misses the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection
+from sbi_active.criticism.rivals.error_models import log_sum_exp
+
+__all__ = ["REFUTED", "THRESHOLD", "alternatives", "detect"]
+
+#: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
+#: at any stopping time, with a probability of at most 1/20.
+THRESHOLD = float(np.log(20.0))
+#: Standard errors by which the Bayes factor must exceed the threshold.
+MARGIN = 2.0
+#: Tail probability of the refitted chi-square that is an alarm by itself.
+LEVEL = 0.01
+#: That of what a verdict leaves over, below which it is not all that is missing.
+REFUTED = 0.001
+
+
+def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detection:
+    r"""Return the Bayes factor of everything else against the bare model.
+
+    .. math::
+        \log B = \log \sum_k w_k Z_k - \log Z_0
+
+    over effects with priors of unknown scale, the residual process and noise
+    inflation, with the weights of :func:`alternatives`. Where the declared noise is
+    Gaussian with nothing unknown, the refitted bare model's chi-square is an alarm as
+    well: weak effects spend much of their Bayes factor on where among the alternatives
+    they are, and the chi-square does not ask. Its false alarms, 1 in 100, are those of
+    one look at the data; the Bayes factor's bound holds at any stopping time.
+
+    Before an alarm, the bare model's evidence is computed again by tempering, since a
+    mode that the least-squares search missed would be a false alarm.
+
+    Args:
+        rivals: The models.
+        equivalent: Groups that no permitted action separates, found without the data.
+
+    References:
+        Ville, Etude critique de la notion de collectif (1939), for any stopping time.
+    """
+    null = rivals.evidence()
+    # First what can explain anything: beside it, a hopeless effect is soon dismissed.
+    weights = alternatives([*rivals.effects], equivalent)
+    found = {e: log_evidence(rivals, error=e) for e in (UNEXPLAINED, SCATTER)}
+    found |= {name: log_evidence(rivals, (name,)) for name in rivals.effects}
+    others = [
+        (found[name][0] + float(np.log(w)), found[name][1])
+        for name, w in weights.items()
+    ]
+    first = null.log_evidence
+    log_b, error = bayes_factor(others, log_evidence(rivals))
+    freedom = max(len(rivals.measurements) - num_determined(rivals), 1.0)
+    level = LEVEL if rivals.has_known_noise else 0.0
+    p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
+    if log_b - MARGIN * error > THRESHOLD or p_value < level:
+        check = rivals.tempered().log_evidence
+        null = rivals.evidence()
+        log_b, error = bayes_factor(others, log_evidence(rivals))
+        p_value = float(chi2.sf(null.best_chi_square, freedom))
+    lower = log_b - MARGIN * error
+    least, lower_p = _least_chi_square(rivals)
+    return Detection(
+        log_bayes_factor=log_b,
+        standard_error=error,
+        lower=lower,
+        threshold=THRESHOLD,
+        chi_square=null.best_chi_square,
+        degrees_of_freedom=freedom,
+        p_value=p_value,
+        level=level,
+        null_log_evidence=first,
+        null_cross_check=check,
+        least_chi_square=least,
+        lower_p_value=lower_p,
+    )
+
+
+def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
+    """Return the smallest chi-square of the bare model, and how probable one is.
+
+    Errors of t noise are taken as Gaussian of its core, which are no larger.
+    """
+    noise, own = rivals.noise, rivals.model.noise
+    name = rivals.evidence().name
+    rival, sample = rivals.rivals[name], rivals.samples[name]
+    declared = own is not None and own.posterior is None and len(noise.scales) == 1
+    spare = len(rivals.measurements) - rival.dim
+    if not declared or rivals.roughness.any() or spare < 1:
+        return np.nan, 1.0
+    residual = rival.residual(sample.u, penalized=False)[0]
+    best = residual[int(np.argmin(((residual / noise.typical_sd) ** 2).sum(1)))]
+    least = float((noise.whitener(best)(best) ** 2).sum())
+    df = noise.cells[0].df
+    core = df / (df - 2) if np.isfinite(df) else 1.0
+    return least, float(chi2.cdf(core * least, spare))
+
+
+def num_determined(rivals: RivalSet) -> float:
+    r"""Return how many of the bare model's parameters the data determine.
+
+    .. math::
+        \gamma = \sum_i (1 - \lambda_i)_+
+
+    with the eigenvalues of the posterior covariance in units of the prior's. What the
+    data leave as it was takes up no residual.
+
+    References:
+        MacKay, Neural Computation 4, 1992, 415-447 (the evidence framework).
+    """
+    sample = rivals.samples[rivals.evidence().name]
+    weights = sample.weights / sample.weights.sum()
+    center = sample.u - weights @ sample.u
+    variances = np.linalg.eigvalsh((weights[:, None] * center).T @ center)
+    return float(np.clip(1 - variances, 0.0, None).sum())
+
+
+def alternatives(
+    effects: Sequence[str], equivalent: Sequence[frozenset[str]]
+) -> dict[str, float]:
+    """Return the weights of the alternatives to the bare model, which sum to one.
+
+    The residual process, noise inflation and each effect count alike, effects that
+    nothing separates as one. What nothing separates from the bare model is none.
+
+    Args:
+        effects: Their names.
+        equivalent: Groups that nothing separates, with "none" for the bare model.
+
+    Example:
+        >>> groups = [frozenset({"none", "gain"}), frozenset({"bias", "offset"})]
+        >>> alternatives(["gain", "bias", "offset"], groups)["bias"]  # 1 / 2 of 1 / 3
+        0.16666666666666666
+    """
+    shares = {UNEXPLAINED: 1.0, SCATTER: 1.0}
+    for name in effects:
+        group = next((g for g in equivalent if name in g), frozenset({name}))
+        if NONE not in group:
+            shares[name] = 1 / len(group & {*effects})
+    total = sum(shares.values())
+    return {name: share / total for name, share in shares.items()}
+
+
+def bayes_factor(
+    others: list[tuple[float, float]], null: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the log Bayes factor of a mixture, and its standard error.
+
+    Args:
+        others: Log of weight times evidence and its error, of each part.
+        null: The same of the bare model.
+    """
+    log_z, errors = np.array(others).T
+    total = log_sum_exp(log_z)
+    share = np.exp(log_z - total)
+    errors = np.where(share > 0, errors, 0.0)
+    variance = (share**2 * errors**2).sum() + null[1] ** 2
+    log_b = total - null[0]
+    return float(log_b), float(np.sqrt(variance))

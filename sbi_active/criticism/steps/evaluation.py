@@ -1,0 +1,165 @@
+"""The error before and after, on trials used neither to fit nor to choose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import CATCH_ALLS, NONE, Evaluation, Tracing
+from sbi_active.criticism.steps.predictive import Prediction, predict
+
+__all__ = ["Fold", "evaluate_held_out", "evaluate_left_out"]
+
+Array = NDArray[Any]
+#: The models fitted to some trials, and what was traced in them.
+Fold = Callable[[Trials], tuple[RivalSet, Tracing]]
+
+COVERAGE = 0.9
+#: Trials below which a bootstrap interval is not what it claims to be.
+ENOUGH_TRIALS = 8
+NUM_BOOTSTRAP = 2_000
+#: Metrics whose "ratio" is a difference, after minus before.
+DIFFERENCES = ("log predictive density", "coverage")
+
+
+def evaluate_held_out(
+    rivals: RivalSet, tracing: Tracing, held_out: Trials
+) -> Evaluation:
+    """Return the error on held-out trials.
+
+    Args:
+        rivals: The models, fitted to other trials.
+        tracing: What was traced in those.
+        held_out: Trials to score.
+    """
+    before, after = _predictions(rivals, tracing, held_out)
+    num = len(held_out)
+    return _summary(
+        "held out",
+        np.arange(num),
+        _scores(before, held_out),
+        _scores(after, held_out),
+        (tracing.verdict,) * num,
+    )
+
+
+def evaluate_left_out(trials: Trials, fold: Fold) -> Evaluation:
+    """Return the error on each trial of models chosen and fitted without it.
+
+    Args:
+        trials: Those that may be fitted.
+        fold: Fits and traces some trials; called once a trial.
+    """
+    valid = np.flatnonzero(trials.valid.numpy())
+    before, after, selected = [], [], []
+    for i in valid:
+        rest = [j for j in range(len(trials)) if j != i]
+        rivals, tracing = fold(trials.select(rest))
+        one = trials.select([int(i)])
+        for scores, prediction in zip(
+            (before, after), _predictions(rivals, tracing, one), strict=True
+        ):
+            scores.append(_scores(prediction, one))
+        selected.append(tracing.verdict)
+    return _summary(
+        "leave one out", valid, _joined(before), _joined(after), (*selected,)
+    )
+
+
+def _predictions(
+    rivals: RivalSet, tracing: Tracing, trials: Trials
+) -> tuple[Prediction, Prediction]:
+    before = predict(rivals, trials)
+    if tracing.verdict == NONE:
+        return before, before
+    error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
+    names = tracing.chosen or tracing.beside
+    return before, predict(rivals, trials, names=names, error=error)
+
+
+def _scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
+    """Return one value a trial of each metric, and squares and counts for the RMSE."""
+    x = trials.x.numpy().reshape(-1)[prediction.position]
+    middle = prediction.mean.mean(0)
+    tail = 0.5 * (1 - COVERAGE)
+    low, high = np.quantile(prediction.x, [tail, 1 - tail], axis=0)
+    rows = []
+    for t in range(len(trials)):
+        at = prediction.trial == t
+        y, own = prediction.x[:, at], x[at]
+        square = float(((middle[at] - own) ** 2).sum())
+        half = len(y) // 2
+        distance = np.linalg.norm(y - own, axis=1).mean()
+        within = np.linalg.norm(y[:half] - y[half : 2 * half], axis=1).mean()
+        inside = ((own >= low[at]) & (own <= high[at])).mean()
+        rows.append(
+            (
+                np.sqrt(square / at.sum()),
+                distance - 0.5 * within,
+                prediction.log_density[t],
+                inside,
+                square,
+                at.sum(),
+            )
+        )
+    columns = np.array(rows, dtype=float).T
+    names = ("rmse", "energy score", *DIFFERENCES, "square", "count")
+    return dict(zip(names, columns, strict=True))
+
+
+def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
+    return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+
+
+def _summary(
+    scheme: Any,
+    positions: Array,
+    before: dict[str, Array],
+    after: dict[str, Array],
+    selected: tuple[str, ...],
+) -> Evaluation:
+    rng = np.random.default_rng(0)
+    num = len(positions)
+    resampled = rng.integers(num, size=(NUM_BOOTSTRAP, num))
+    rows = []
+    for metric in ("rmse", "energy score", *DIFFERENCES):
+        first, second = (_total(s, metric, np.arange(num)) for s in (before, after))
+        ratio = _contrast(metric, first, second)
+        low = high = np.nan
+        if num >= ENOUGH_TRIALS:
+            many = _contrast(
+                metric,
+                _total(before, metric, resampled),
+                _total(after, metric, resampled),
+            )
+            low, high = np.quantile(many, [0.05, 0.95])
+        rows.append((metric, float(first), float(second), float(ratio), low, high))
+    names = ["metric", "before", "after", "ratio", "low", "high"]
+    keep = ("rmse", "energy score", *DIFFERENCES)
+    return Evaluation(
+        scheme=scheme,
+        trials=positions,
+        before={name: before[name] for name in keep},
+        after={name: after[name] for name in keep},
+        table=pd.DataFrame(rows, columns=pd.Index(names)),
+        selected=selected,
+    )
+
+
+def _total(scores: dict[str, Array], metric: str, which: Array) -> Any:
+    if metric == "rmse":
+        square, count = (scores[name][which].sum(-1) for name in ("square", "count"))
+        return np.sqrt(square / count)
+    return scores[metric][which].mean(-1)
+
+
+def _contrast(metric: str, before: Any, after: Any) -> Any:
+    if metric in DIFFERENCES:
+        return after - before
+    return after / np.maximum(before, 1e-300)

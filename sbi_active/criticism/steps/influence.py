@@ -1,0 +1,136 @@
+r"""What a verdict rests on: its Bayes factor with each trial left out.
+
+.. math::
+    Z(x_{-k}) = Z(x)\, E_{p(z | x)}\left[\frac{p(x_{-k} | z)}{p(x | z)}\right],
+
+from the weighted sample behind the evidence, which costs no simulation. Where a trial
+decides so much of the posterior that few draws are left, the posterior under a gross
+error of any one trial takes its place, since it reaches all of those without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.results import (
+    OUTLIER,
+    UNEXPLAINED,
+    Evaluation,
+    Tracing,
+)
+from sbi_active.criticism.rivals.error_models import log_sum_exp
+from sbi_active.criticism.steps.detection import THRESHOLD
+
+__all__ = ["is_left_to_chance", "needed_trials", "unless_refuted", "withdrawn"]
+
+Array = NDArray[Any]
+
+#: Effective draws below which an evidence without a trial is computed anew.
+FEWEST = 20.0
+#: Odds against a gross error from which one trial may speak for an effect alone.
+DECISIVE = 150.0
+
+
+def needed_trials(rivals: RivalSet, names: Sequence[str]) -> tuple[float, ...]:
+    """Return the trials without which the data do not point to some effects.
+
+    Without any one of them the Bayes factor against the bare model is below 20; none
+    where it is below with all trials, or where effects or the simulator have an error
+    of their own.
+
+    Args:
+        rivals: The models.
+        names: Of the effects.
+
+    Returns:
+        Indices of the trials.
+    """
+    own = rivals.rivals[rivals.evidence(names).name]
+    log_b = log_evidence(rivals, names)[0] - log_evidence(rivals)[0]
+    if own.has_noise_effect or rivals.simulator.is_stochastic or log_b < THRESHOLD:
+        return ()
+    without = log_b + _change(rivals, names) - _change(rivals, ())
+    index = rivals.trials.index.numpy()[rivals.one_outlier().trials]
+    return (*index[without < THRESHOLD].tolist(),)
+
+
+def is_left_to_chance(tracing: Tracing) -> bool:
+    """Return whether the effects of a verdict may be one trial's gross error.
+
+    So it is where the verdict falls without the trial that a gross error would be in,
+    and the odds of declared effects against such an error are below 150.
+    """
+    if not tracing.chosen or not tracing.outliers:
+        return False
+    suspect = next(iter(tracing.outliers))
+    p = tracing.probabilities
+    declared = sum(
+        v for name, v in p.items() if {*name.split(" + ")} & {*tracing.inclusion}
+    )
+    return suspect in tracing.needed and declared < DECISIVE * p[OUTLIER]
+
+
+def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
+    """Return what was traced, its effects withdrawn where further trials refute them.
+
+    Their squared error is then the larger with the effects, and their density the
+    smaller by a Bayes factor of 20.
+
+    Args:
+        tracing: Which effect the data point to.
+        evaluation: Error before and after on trials that had no part in it.
+    """
+    if not tracing.chosen or evaluation is None:
+        return tracing
+    density = "log predictive density"
+    change = evaluation.after[density] - evaluation.before[density]
+    rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
+    if rmse["ratio"] <= 1 or change.sum() >= -THRESHOLD:
+        return tracing
+    return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+
+
+def withdrawn(tracing: Tracing) -> Tracing:
+    """Return what was traced with the effects of the verdict not to be added."""
+    p = tracing.probabilities
+    by_chance = is_left_to_chance(tracing) or p.get(OUTLIER, 0.0) > p[UNEXPLAINED]
+    return replace(
+        tracing,
+        verdict=OUTLIER if by_chance else UNEXPLAINED,
+        chosen=(),
+        beside=(),
+        instead_of=" + ".join(tracing.chosen),
+    )
+
+
+def _change(rivals: RivalSet, names: Sequence[str]) -> Array:
+    """Return the log evidence without each trial less that of all, shape (k,)."""
+    change, effective = _reweighted(rivals, names, None)
+    if effective.min() < FEWEST:
+        other, number = _reweighted(rivals, names, OUTLIER)
+        change = np.where(number > effective, other, change)
+    return change
+
+
+def _reweighted(
+    rivals: RivalSet, names: Sequence[str], error: str | None
+) -> tuple[Array, Array]:
+    """Return these changes by one sample, and how many draws are left, (k,) each."""
+    evidence = rivals.evidence(names, error=error)
+    rival, sample = rivals.rivals[evidence.name], rivals.samples[evidence.name]
+    some = sample.weights > 0
+    residual = rival.residual(sample.u[some], penalized=False)[0]
+    rest = rivals.one_outlier().without_each(residual)
+    full = rival.error.log_likelihood(residual)
+    log_w = np.log(sample.weights[some])[:, None] + rest - full[:, None]
+    total = log_sum_exp(log_w, axis=0)
+    effective = np.exp(2 * total - log_sum_exp(2 * log_w, axis=0))
+    all_trials = rivals.evidence(names).log_evidence
+    return evidence.log_evidence + total - all_trials, effective

@@ -1,0 +1,102 @@
+r"""Leave-one-out density by Pareto-smoothed importance sampling, beside the evidence.
+
+.. math::
+    \mathrm{elpd} = \sum_t \log p(x_t | x_{-t}), \qquad
+    p(x_t | x_{-t}) \approx \sum_i w_{it}\, p(x_t | z_i), \qquad
+    w_{it} \propto 1 / p(x_t | z_i)
+
+over posterior draws :math:`z_i`, the largest weights smoothed. It asks how well trials
+are predicted from the others, and depends less on the priors of the effects than the
+evidence does. Trials must be independent given z, so that the residual process, which
+joins them, has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, Tracing
+from sbi_active.criticism.rivals.error_models import log_sum_exp
+from sbi_active.criticism.steps.predictive import predict
+
+__all__ = ["LeaveOneOut", "leave_one_out"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 400
+#: Pareto shape above which no number of draws helps.
+LARGEST_SHAPE = 0.7
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeaveOneOut:
+    """How well one model predicts each trial from the others.
+
+    Attributes:
+        name: Of the model.
+        density: Log predictive density of each trial, shape (t,), nats.
+        pareto_k: Shape of the largest weights, (t,).
+        num_draws: From the posterior.
+
+    References:
+        Vehtari, Gelman & Gabry, Statistics and Computing 27 (2017).
+    """
+
+    name: str
+    density: Array
+    pareto_k: Array
+    num_draws: int
+
+    @property
+    def total(self) -> float:
+        """Expected log predictive density, summed over the trials, nats."""
+        return float(self.density.sum())
+
+    @property
+    def largest_k(self) -> float:
+        r""":math:`\min(1 - 1 / \log_{10} n, .7)`, up to which weights average well."""
+        return float(min(1 - 1 / np.log10(self.num_draws), LARGEST_SHAPE))
+
+    @property
+    def unreliable(self) -> tuple[int, ...]:
+        """Trials whose k exceeds the largest that the draws allow."""
+        return (*np.flatnonzero(~(self.pareto_k <= self.largest_k)).tolist(),)
+
+
+def leave_one_out(rivals: RivalSet, tracing: Tracing) -> tuple[LeaveOneOut, ...]:
+    """Return the densities of the bare model and of the one that was chosen.
+
+    Args:
+        rivals: The models.
+        tracing: Their verdict. "unexplained" and "outlier" have the bare model alone.
+    """
+    found = [_density(rivals)]
+    if tracing.verdict == SCATTER:
+        found.append(_density(rivals, error=SCATTER))
+    elif tracing.verdict not in (NONE, UNEXPLAINED, OUTLIER):
+        found.append(_density(rivals, tracing.chosen))
+    return (*found,)
+
+
+def _density(
+    rivals: RivalSet, names: tuple[str, ...] = (), *, error: str | None = None
+) -> LeaveOneOut:
+    # ArviZ takes seconds to import.
+    from sbi_active.export import pareto_smoothed
+
+    evidence = rivals.evidence(names, error=error)
+    prediction = predict(rivals, names=names, error=error, num_draws=NUM_DRAWS)
+    log_p = prediction.log_likelihood
+    efficiency = np.clip(evidence.effective_sample_size, 1.0, NUM_DRAWS) / NUM_DRAWS
+    log_w, k = pareto_smoothed(log_p, relative_efficiency=float(efficiency))
+    return LeaveOneOut(
+        name=evidence.name,
+        density=log_sum_exp(log_w + log_p, axis=0),
+        pareto_k=k,
+        num_draws=NUM_DRAWS,
+    )

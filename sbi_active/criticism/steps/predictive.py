@@ -1,0 +1,220 @@
+"""Posterior predictive of a rival, in trials that it was or was not fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.outliers import OneOutlier
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.rivals.error_models import (
+    LOG_2PI,
+    NoiseCell,
+    NoiseGrid,
+    log_sum_exp,
+)
+from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.rivals.validity import log_outcomes
+from sbi_active.seeding import derive_seed, forked_generators
+
+__all__ = ["Prediction", "predict"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a rival predicts for measured numbers.
+
+    Attributes:
+        mean: Noise-free predictions, one a posterior draw, shape (n, N).
+        sd: Standard deviation of the error of each number given a draw, shape (n, N).
+        x: Draws with errors, shape (n, N).
+        log_likelihood: Of the measurements of each trial given the draw, noise
+            included, shape (n, t), nats.
+        trial: Trial of each number, shape (N,).
+        position: Of each number in the flattened x, shape (N,).
+        valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
+        probability_valid: That it has one, given the draw, shape (n, t).
+    """
+
+    mean: Array
+    sd: Array
+    x: Array
+    log_likelihood: Array
+    trial: Array
+    position: Array
+    valid: Array
+    probability_valid: Array
+
+    @property
+    def log_density(self) -> Array:
+        """Of the measurements of each trial, shape (t,), nats."""
+        each = self.log_likelihood
+        return log_sum_exp(each, axis=0) - np.log(len(each))
+
+    def moments(self) -> tuple[Array, Array]:
+        """Return mean and standard deviation of each number, noise included, (N,)."""
+        variance = self.mean.var(0) + (self.sd**2).mean(0)
+        return self.mean.mean(0), np.sqrt(variance)
+
+
+def predict(
+    rivals: RivalSet,
+    trials: Trials | None = None,
+    *,
+    names: tuple[str, ...] = (),
+    error: str | None = None,
+    num_draws: int = NUM_DRAWS,
+    seed: int | None = None,
+    scored: bool = True,
+) -> Prediction:
+    """Return the posterior predictive of a rival.
+
+    Args:
+        rivals: The models; the rival is fitted to their trials.
+        trials: Trials to predict, taken as unseen; None takes those that were fitted,
+            with the residual process of "unexplained" conditioned on them.
+        names: Effects of the rival.
+        error: None, "unexplained", "scatter" or "outlier".
+        num_draws: From the posterior, n.
+        seed: Of the draws; None is that of the models.
+        scored: Whether to compute ``log_likelihood``, which is empty without.
+    """
+    name = rivals.evidence(names, error=error).name
+    rival, sample = rivals.rivals[name], rivals.samples[name]
+    seed = rivals.seed if seed is None else seed
+    rng = np.random.default_rng(derive_seed(seed, "predictive", name))
+    u = sample.draws(num_draws, rng)
+    own_residual = rival.residual(u, penalized=False)[0]
+    target = rivals.trials if trials is None else trials
+    simulator = TrialSimulator(
+        rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")
+    )
+    m = simulator.measurements
+    theta, phi = rival.coordinates.split(u)
+    if trials is not None:
+        with forked_generators(seed, "fresh nuisances"):
+            for effect in rivals.nuisances:  # an unseen trial draws its own
+                fresh = effect.sample(num_draws * len(target))
+                phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
+    mean, unit, probability = simulator.predict(theta, phi)
+    noise = declared_noise(
+        rivals.model.noise, m, seed=derive_seed(rivals.seed, "noise")
+    )
+    factor = simulator.noise_scale(phi, num_draws)
+    factor = np.ones_like(mean) if factor is None else factor
+    factor = factor if unit is None else factor * unit
+    center, spread = rivals.prior_predictive(simulator)
+    missing = ~np.isfinite(mean)
+    if missing.any():  # all that is known of such a number is the prior predictive
+        wide = spread / noise.typical_sd
+        mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
+    flags = [
+        log_outcomes(p[:, None], v[None])
+        for p, v in zip(probability.T, m.valid, strict=True)
+    ]
+    extra = np.zeros(len(m))
+    if isinstance(rival.error, ResidualProcess):
+        shift, extra = rival.error.condition(
+            own_residual,
+            m,
+            rivals.scaled_actions(target),
+            order=rivals.scaled_order(target),
+            spread=spread,
+        )
+        mean = mean + shift
+    cells, scales = _drawn_cells(rival, own_residual, rng)
+    errors, sd = _errors(noise, cells, scales, mean.shape, rng)
+    errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
+    errors = errors + extra * rng.normal(size=mean.shape)
+    each = np.empty((num_draws, len(target) if scored else 0))
+    for t in range(each.shape[1]):
+        at = m.trial == t
+        residual = (m.x - mean)[:, at]
+        if extra[at].any():
+            each[:, t] = _independent(residual, sd[:, at])
+        else:
+            log_scale = np.log(factor[:, at]).sum(1)
+            e = residual / factor[:, at]
+            each[:, t] = _log_density(noise, cells, scales, e, at) - log_scale
+        each[:, t] += flags[t]
+    return Prediction(
+        mean,
+        sd,
+        mean + errors,
+        each,
+        m.trial,
+        m.position,
+        rng.uniform(size=probability.shape) < probability,
+        probability,
+    )
+
+
+def _drawn_cells(
+    rival: Rival, residual: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return a cell and a scale of the noise for each draw, given its residual."""
+    grid = rival.error
+    if not isinstance(grid, NoiseGrid):
+        assert isinstance(grid, ResidualProcess | OneOutlier)
+        return grid.noise_posterior(residual, rng)
+    joint = grid.joint(residual)
+    flat = joint.reshape(len(residual), -1)
+    gumbel = rng.gumbel(size=flat.shape)  # the maximum is a draw from softmax
+    best = np.argmax(flat + gumbel, axis=1)
+    cell, scale = np.unravel_index(best, joint.shape[1:])
+    return cell, grid.scales[scale]
+
+
+def _errors(
+    noise: NoiseGrid,
+    cells: Array,
+    scales: Array,
+    shape: tuple[int, ...],
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return errors along each trial, and their deviations, shape (n, N)."""
+    e = rng.normal(size=shape)
+    for i, cell in enumerate(cells):
+        df = noise.cells[cell].df
+        if np.isfinite(df):
+            e[i] = rng.standard_t(df, size=shape[1]) * np.sqrt((df - 2) / df)
+    rho = np.stack([noise.cells[c].rho for c in cells])
+    u = e
+    if rho.any():
+        u = np.empty_like(e)
+        u[:, 0] = e[:, 0]
+        for k in range(1, shape[1]):
+            step = np.sqrt(1 - rho[:, k] ** 2) * e[:, k]
+            u[:, k] = rho[:, k] * u[:, k - 1] + step
+    sd = np.stack([noise.cells[c].sd for c in cells]) * scales[:, None]
+    return u * sd, sd
+
+
+def _log_density(
+    noise: NoiseGrid, cells: Array, scales: Array, residual: Array, at: Array
+) -> Array:
+    """Return log densities of one trial's residuals, each in its cell, shape (n,)."""
+    log_p = np.empty(len(residual))
+    for cell, scale in {*zip(cells.tolist(), scales.tolist(), strict=True)}:
+        whole = noise.cells[cell]
+        part = NoiseCell(0.0, whole.sd[at], whole.rho[at], whole.df)
+        own = (cells == cell) & (scales == scale)
+        grid = NoiseGrid([part], scales=np.array([scale]))
+        log_p[own] = grid.log_likelihood(residual[own])
+    return log_p
+
+
+def _independent(residual: Array, sd: Array) -> Array:
+    """Return log densities of independent numbers, as beside the residual process."""
+    return (-0.5 * (residual / sd) ** 2 - np.log(sd) - 0.5 * LOG_2PI).sum(1)

@@ -1,0 +1,139 @@
+"""From estimates of the candidates to a design."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace
+from sbi_active.design.design import Design, action_name
+from sbi_active.design.elimination import Estimates
+from sbi_active.information_gain.base import Bound
+from sbi_active.information_gain.race import Race, paired_errors, standard_error
+from sbi_active.seeding import derive_seed
+
+__all__ = ["as_batch", "choose", "pricing"]
+
+
+def choose(
+    estimates: Estimates,
+    actions: ActionSpace,
+    *,
+    cost: Tensor | None,
+    exponent: float,
+    estimator: str,
+    bound: Bound,
+    num_simulations: int,
+    num_missing: int,
+    seed: int,
+) -> Design:
+    r"""Return the design.
+
+    A finite exponent k draws the action, :math:`P(\xi) \propto \max(U(\xi), 0)^k`.
+
+    Args:
+        estimates: Of the candidates.
+        actions: The space.
+        cost: Of the candidates, shape (a,); None for none.
+        exponent: k; inf takes the leader.
+        estimator: Name of the class that estimated.
+        bound: Side of the information that the estimates lie on.
+        num_simulations: Spent.
+        num_missing: Of them.
+        seed: Of the draw and those behind probabilities.
+    """
+    price = torch.ones(len(estimates.action)) if cost is None else cost
+    chosen = estimates.leader
+    eligible = estimates.eligible
+    if math.isfinite(exponent):
+        mean = torch.stack([row.nanmean() for row in estimates.choosing])
+        utility = (mean / price).clamp_min(0.0)
+        log_weight = exponent * utility.log().nan_to_num(neginf=-1e300)
+        if not bool((utility[eligible] > 0).any()):  # nothing is learned anywhere
+            log_weight = torch.zeros_like(log_weight)
+        weight = torch.where(eligible, log_weight, -torch.inf).softmax(0)
+        generator = torch.Generator().manual_seed(derive_seed(seed, "choice"))
+        chosen = int(torch.multinomial(weight, 1, generator=generator))
+    report = estimates.reporting
+    both = zip(estimates.choosing, report, eligible, price, strict=True)
+    probability_best = torch.zeros(len(price), dtype=torch.float64)
+    probability_best[eligible] = Race.run(
+        [torch.cat([a, b]) / c for a, b, e, c in both if e], seed
+    ).probability_best
+    return Design(
+        action=estimates.action[chosen],
+        candidates=estimates.action,
+        expected_information_gain=torch.stack([row.nanmean() for row in report]),
+        standard_error=torch.stack([standard_error(row) for row in report]),
+        difference_standard_error=paired_errors(report, chosen),
+        probability_best=probability_best,
+        probability_valid=estimates.probability_valid,
+        bound=bound,
+        index=chosen,
+        num_simulations=num_simulations,
+        name=action_name(actions),
+        estimator=estimator,
+        num_samples=estimates.num_samples,
+        stopped=estimates.stopped,
+        num_missing=num_missing,
+        notes=estimates.notes,
+        cost=cost,
+    )
+
+
+def as_batch(steps: list[Design]) -> Design:
+    """Return the design of several actions, or the only step itself."""
+    if len(steps) == 1:
+        return steps[0]
+    return replace(
+        steps[-1],
+        action=torch.stack([step.action for step in steps]),
+        num_simulations=sum(step.num_simulations for step in steps),
+        num_missing=sum(step.num_missing for step in steps),
+        notes=tuple(dict.fromkeys(note for step in steps for note in step.notes)),
+        steps=tuple(steps),
+    )
+
+
+def pricing(
+    cost: Callable[[Tensor], Tensor] | Tensor | None, actions: ActionSpace
+) -> Callable[[Tensor], Tensor] | None:
+    """Return the cost as a function of actions (n, action_dim) -> (n,), float64.
+
+    Args:
+        cost: The same, or one number an action of a list, shape (a,); None for none.
+        actions: The space.
+
+    Raises:
+        ValueError: If the shape is another, or when called if a cost is not positive.
+    """
+    if cost is None:
+        return None
+    of = cost if callable(cost) else _listed_cost(torch.as_tensor(cost), actions)
+
+    def price(action: Tensor) -> Tensor:
+        given = torch.as_tensor(of(action)).double()
+        if given.shape != (len(action),) or not bool((given > 0).all()):
+            raise ValueError(
+                f"expected positive costs of shape ({len(action)},); got shape "
+                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; do return "
+                "one positive number an action"
+            )
+        return given
+
+    return price
+
+
+def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tensor]:
+    values = actions.listed()
+    if values is None or table.shape != (len(values),):
+        raise ValueError(
+            "expected a cost of shape (a,), one number an action of a list; got "
+            f"shape {tuple(table.shape)} for {actions!r}; do pass a function of "
+            "actions (n, action_dim)"
+        )
+    return lambda action: table[torch.cdist(action, values).argmin(1)]

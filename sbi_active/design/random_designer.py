@@ -1,0 +1,162 @@
+"""Choose the next action at random."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.design.design import Design, action_name
+from sbi_active.design.eligibility import (
+    Permission,
+    excluded_note,
+    reaches,
+    rows_of,
+    warn_missing,
+)
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
+
+__all__ = ["RandomDesigner"]
+
+FEW = 32  # draws that are simulated for their share of measurements
+
+
+class RandomDesigner:
+    """Choose an action uniformly at random, the design of NSBI and NLHI.
+
+    Args:
+        actions: The action space.
+        num_samples: Simulations a candidate where ``min_probability_valid`` asks for
+            its share of measurements; otherwise nothing is simulated.
+        num_workers: Of these simulations, with the next two as in
+            :class:`.InformationGainDesigner`.
+        time_limit: Seconds a simulated row may take.
+        num_retries: How often a row that a fault lost is tried again.
+    """
+
+    def __init__(
+        self,
+        actions: ActionSpace,
+        *,
+        num_samples: int = 200,
+        num_workers: int = 1,
+        time_limit: float | None = None,
+        num_retries: int = 0,
+    ) -> None:
+        self.actions = actions
+        self.num_samples = num_samples
+        self.engine: dict[str, Any] = {
+            "num_workers": num_workers,
+            "time_limit": time_limit,
+            "num_retries": num_retries,
+        }
+
+    def select(
+        self,
+        model: Any = None,
+        simulator: Callable[..., Any] | None = None,
+        *,
+        belief: Distribution | None = None,
+        constraint: Callable[[Tensor], Tensor] | None = None,
+        exclude: Tensor | None = None,
+        min_probability_valid: float = 0.0,
+        seed: int | None = None,
+    ) -> Design:
+        """Return a random action.
+
+        Args:
+            model: Only its belief is used, see below.
+            simulator: ``simulator(theta, action)``; only used, and then needed, with
+                ``min_probability_valid``.
+            belief: Of the parameters, at which candidates are simulated; None is
+                ``model.belief``.
+            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
+                bool.
+            exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
+                within a hundredth of its width.
+            min_probability_valid: Candidates that give a measurement less often are
+                excluded; 0 excludes none. Of a space without end, 32 actions are
+                simulated.
+            seed: Of the choice and the simulations; None draws one from torch's global
+                generator.
+
+        Returns:
+            The design. Of a space without end the candidates are those drawn.
+
+        Raises:
+            ValueError: If a share of measurements is asked for without a simulator or a
+                belief, or no candidate reaches it.
+        """
+        permission = Permission(
+            self.actions, constraint, rows_of(self.actions, exclude, "exclude")
+        )
+        candidates, notes = permission.listed()
+        if candidates is None:
+            own = None if seed is None else derive_seed(seed, "candidates")
+            candidates = permission.drawn(own)[
+                : FEW if min_probability_valid > 0 else 1
+            ]
+        num = len(candidates)
+        unknown = torch.full((num,), torch.nan, dtype=torch.float64)
+        valid, num_simulations, num_missing = unknown, 0, 0
+        eligible = torch.ones(num).bool()
+        if min_probability_valid > 0:
+            belief = getattr(model, "belief", None) if belief is None else belief
+            if simulator is None or belief is None:
+                raise ValueError(
+                    "expected a simulator and a belief with min_probability_valid; got "
+                    f"{'no simulator' if simulator is None else 'no belief'}; do pass "
+                    "both, or leave min_probability_valid at 0"
+                )
+            seed = int(torch.randint(2**62, ())) if seed is None else seed
+            status = self._outcomes(simulator, belief, candidates, seed)
+            counted = (status != Outcome.MISSING).sum(1)
+            valid = (status == Outcome.OK).sum(1).double() / counted
+            num_simulations = status.numel()
+            num_missing = num_simulations - int(counted.sum())
+            warn_missing(num_missing, num_simulations)
+            eligible = reaches(valid, min_probability_valid)
+        with forked_generators(seed):
+            remaining = torch.nonzero(eligible)[:, 0]
+            chosen = int(remaining[int(torch.randint(len(remaining), ()))])
+        return Design(
+            action=candidates[chosen],
+            candidates=candidates,
+            expected_information_gain=unknown,
+            standard_error=unknown,
+            difference_standard_error=unknown,
+            probability_best=unknown,
+            probability_valid=valid,
+            bound="none",
+            index=chosen,
+            num_simulations=num_simulations,
+            name=action_name(self.actions),
+            num_samples=torch.full((num,), num_simulations // num).long(),
+            num_missing=num_missing,
+            notes=(*excluded_note(eligible, min_probability_valid), *notes),
+        )
+
+    def _outcomes(
+        self,
+        simulator: Callable[..., Any],
+        belief: Distribution,
+        values: Tensor,
+        seed: int,
+    ) -> Tensor:
+        """Simulate candidates at the same parameters; statuses, shape (a, n)."""
+        n = self.num_samples
+        with forked_generators(seed, "theta"):
+            theta = belief.sample(torch.Size([n]))
+        rows = theta.repeat(len(values), 1), values.repeat_interleave(n, 0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+            drawn = simulate(
+                simulator, *rows, seed=derive_seed(seed, "x"), **self.engine
+            )
+        return drawn.status.reshape(len(values), n)

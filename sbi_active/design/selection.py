@@ -1,0 +1,198 @@
+"""The choice of one action, by simulation or by simulations at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_active.design.choice import choose
+from sbi_active.design.design import Design
+from sbi_active.design.eligibility import Permission
+from sbi_active.design.elimination import eliminate
+from sbi_active.design.evaluator import GainEvaluator
+from sbi_active.design.given import GivenGains
+from sbi_active.design.target import Target
+from sbi_active.information_gain import CandidateSimulations, InformationGainEstimator
+from sbi_active.information_gain.estimators.automatic import choose_estimator
+from sbi_active.information_gain.race import standard_error
+from sbi_active.search import Evaluations, Objective, Search
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation import Simulations
+
+__all__ = ["Selection"]
+
+SHARE = 12  # of num_samples, that an action evaluated by a search gets one of
+FEW = 256  # given rows by which to choose the estimator
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What one action is chosen by; see :class:`.InformationGainDesigner`.
+
+    Attributes:
+        target: What to learn about.
+        permission: Of actions.
+        price: Cost of actions (n, action_dim), shape (n,); None for none.
+        search: For the candidates.
+        num_samples: Simulations a candidate on average.
+        early: Whether candidates begin with half of them.
+        exponent: Of the choice.
+        engine: Options of simulations.
+        least: Share of measurements that a choice needs.
+        seed: Of everything random.
+    """
+
+    target: Target
+    permission: Permission
+    price: Callable[[Tensor], Tensor] | None
+    search: Search
+    num_samples: int
+    early: bool
+    exponent: float
+    engine: Mapping[str, Any]
+    least: float
+    seed: int
+
+    def by_simulation(self, others: Tensor, budget: int | None) -> Design:
+        """Return the design of one action.
+
+        Args:
+            others: Actions whose outcomes will be known as well, shape (p, action_dim).
+            budget: Simulations in all; None is ``num_samples`` a candidate.
+
+        Raises:
+            ValueError: If the budget is too small.
+        """
+        actions, target = self.permission.actions, self.target
+        listed, notes = self.permission.listed()
+        if budget is None:
+            size = self.search.size(actions) if listed is None else len(listed)
+            budget = self.num_samples * size
+        if listed is not None and budget < 8 * len(listed):
+            raise ValueError(
+                f"expected a budget >= {8 * len(listed)}, 8 a candidate; got {budget}; "
+                "do allow more simulations or fewer candidates"
+            )
+        probed = listed
+        if probed is None:
+            probed = actions.sample((16,), seed=derive_seed(self.seed, "probed"))
+        sampler, estimator = target.sampler(probed, others, self.seed, self.engine)
+        evaluator = GainEvaluator(sampler, estimator, target.model, target.belief)
+        num_samples = max(8, self.num_samples // SHARE // 4 * 4)
+        action = self.search.finalists(
+            Objective(
+                actions=actions,
+                permitted=self.permission,
+                evaluate=lambda rows: self._evaluate(evaluator, rows, num_samples),
+                num_evaluations=self.search.num_evaluations(budget, num_samples),
+                seed=derive_seed(self.seed, "search"),
+                min_probability_valid=self.least,
+            )
+        )
+        cost = self._cost(action)
+        estimates = eliminate(
+            evaluator,
+            action,
+            num_samples=self.num_samples,
+            early=self.early,
+            budget=budget,
+            min_probability_valid=self.least,
+            weight=cost.mean() / cost,
+            seed=self.seed,
+        )
+        return choose(
+            replace(estimates, notes=(*estimates.notes, *notes)),
+            actions,
+            cost=None if self.price is None else cost,
+            exponent=self.exponent,
+            estimator=type(evaluator.estimator).__name__,
+            bound=evaluator.bound,
+            num_simulations=sampler.num_drawn,
+            num_missing=sampler.num_missing,
+            seed=self.seed,
+        )
+
+    def by_given(self, simulations: Simulations) -> Design:
+        """Return the design by rows at hand; nothing is simulated.
+
+        Raises:
+            TypeError: If they are no simulations.
+            ValueError: If they are of other actions, or the estimator cannot be made
+                from single rows.
+        """
+        target, actions = self.target, self.permission.actions
+        if not isinstance(simulations, Simulations):
+            raise TypeError(
+                "expected Simulations(theta, action, x) for simulations=; got "
+                f"{type(simulations).__name__}; do wrap the rows in it"
+            )
+        if simulations.action.shape[1] != actions.action_dim:
+            raise ValueError(
+                f"expected simulations of actions (n, {actions.action_dim}); got "
+                f"{tuple(simulations.action.shape)}; do pass those of this space"
+            )
+        listed, notes = self.permission.listed()
+        estimator = target.gain() or _by_model(target.model, simulations)
+        assert target.belief is not None
+        given = GivenGains(
+            simulations, estimator, target.model, target.belief, self.seed
+        )
+        if listed is None:
+            estimates = given.of_space(
+                actions,
+                self.search,
+                permitted=self.permission,
+                cost=self._cost,
+                min_probability_valid=self.least,
+            )
+        else:
+            estimates = given.of_list(
+                listed, min_probability_valid=self.least, cost=self._cost(listed)
+            )
+        cost = None if self.price is None else self.price(estimates.action)
+        return choose(
+            replace(estimates, notes=(*estimates.notes, *notes)),
+            actions,
+            cost=cost,
+            exponent=self.exponent,
+            estimator=type(estimator).__name__,
+            bound="none",  # the model may have seen the rows
+            num_simulations=0,
+            num_missing=0,
+            seed=self.seed,
+        )
+
+    def _evaluate(
+        self, evaluator: GainEvaluator, action: Tensor, num_samples: int
+    ) -> Evaluations:
+        """Estimate the utility at parameters that are the same from call to call."""
+        evaluator.sampler.rewind()
+        drawn = evaluator.draw(num_samples, evaluator.add(action))
+        gain, cost = evaluator(drawn), self._cost(action)
+        valid, counted = drawn.num_valid()
+        error = torch.stack([standard_error(row) for row in gain])
+        return Evaluations(
+            action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
+        )
+
+    def _cost(self, action: Tensor) -> Tensor:
+        if self.price is None:
+            return torch.ones(len(action)).double()
+        return self.price(action)
+
+
+def _by_model(model: Any, simulations: Simulations) -> InformationGainEstimator:
+    """Return the estimator by what the model can say."""
+    if model is None:
+        raise ValueError(
+            "expected a model with simulations=; got None; do pass the trained model, "
+            "or leave out simulations="
+        )
+    some = CandidateSimulations(
+        simulations.theta[:FEW], simulations.action[:1], simulations.x[None, :FEW]
+    )
+    return choose_estimator(model, some)[0]

@@ -1,0 +1,167 @@
+"""What a design is to tell about, and what it takes to estimate that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.information_gain import (
+    InformationGainEstimator,
+    ModelIndexGain,
+    ParameterGain,
+    RivalPredictive,
+    RivalSampler,
+)
+from sbi_active.information_gain.candidates import CandidateSampler
+from sbi_active.information_gain.estimators.automatic import find_estimator
+
+__all__ = ["Target"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the information is about.
+
+    Attributes:
+        name: "theta", names of parameters, or "model".
+        estimator: As the designer was given it.
+        model: What the estimator needs.
+        simulator: ``simulator(theta, action)``.
+        belief: Distribution of the parameters; None for the target "model".
+    """
+
+    name: str | Sequence[str]
+    estimator: str | InformationGainEstimator
+    model: Any
+    simulator: Callable[..., Any] | None
+    belief: Distribution | None
+
+    @staticmethod
+    def of(
+        name: str | Sequence[str],
+        estimator: str | InformationGainEstimator,
+        model: Any,
+        simulator: Callable[..., Any] | None,
+        belief: Distribution | None,
+        *,
+        simulates: bool,
+    ) -> Target:
+        """Return the target, its belief that of the model where none is given.
+
+        Args:
+            name: As the attribute, with the next four.
+            estimator: Of the information.
+            model: For it.
+            simulator: Of outcomes.
+            belief: Of the parameters.
+            simulates: Whether outcomes are to be simulated.
+
+        Raises:
+            ValueError: If what the target needs is lacking.
+        """
+        if name != "theta" and estimator != "auto":
+            raise ValueError(
+                f"expected estimator='auto' for target={name!r}, whose estimator is "
+                f"its own; got {estimator!r}; do leave out estimator="
+            )
+        if name == "model":
+            if not isinstance(model, Sequence) or not simulates:
+                got = type(model).__name__ if simulates else "given simulations"
+                raise ValueError(
+                    "expected a sequence of rivals for target='model'; got "
+                    f"{got}; do pass objects with probability and "
+                    "predict(action, num_samples, seed)"
+                )
+            return Target(name, estimator, model, simulator, None)
+        if simulator is None and simulates:
+            raise ValueError(
+                "expected a simulator; got None; do pass the one that the belief's "
+                "parameters belong to"
+            )
+        belief = getattr(model, "belief", None) if belief is None else belief
+        if belief is None:
+            raise ValueError(
+                "expected belief=, the distribution of the parameters; got none, and "
+                "the model has none; do pass the belief of this round"
+            )
+        return Target(name, estimator, model, simulator, belief)
+
+    def gain(self) -> InformationGainEstimator | None:
+        """Return the estimator; None where the simulations are to decide.
+
+        Raises:
+            ValueError: If it needs a model and there is none, or a name is unknown.
+        """
+        if self.name == "model":
+            return None
+        if self.name != "theta":
+            return ParameterGain(_parameters(self.name, self.simulator))
+        estimator = find_estimator(self.estimator)
+        if estimator is not None and estimator.needs_model and self.model is None:
+            raise ValueError(
+                f"expected a model for {type(estimator).__name__}; got None; do pass "
+                "the trained posterior, or estimator='auto'"
+            )
+        return estimator
+
+    def sampler(
+        self, action: Tensor, others: Tensor, seed: int, engine: Mapping[str, Any]
+    ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None]:
+        """Return what draws outcomes of candidates, and the estimator.
+
+        Args:
+            action: Candidates, shape (a, action_dim).
+            others: Whose outcomes will be known as well, shape (p, action_dim).
+            seed: Of everything drawn.
+            engine: Options of simulations.
+
+        Raises:
+            ValueError: If other outcomes have no place in the target or the estimator.
+        """
+        if self.name == "model":
+            if len(others):
+                raise ValueError(
+                    "expected one action at a time and none pending for "
+                    f"target='model'; got {len(others)} others; do ask for them in turn"
+                )
+            rivals: Sequence[RivalPredictive] = self.model
+            sampler = RivalSampler(rivals, action, seed)
+            return sampler, ModelIndexGain(sampler.probability)
+        assert self.belief is not None
+        assert self.simulator is not None
+        estimator = self.gain()
+        single = not hasattr(self.model, "log_likelihood")
+        if len(others) and estimator is not None and estimator.needs_model and single:
+            raise ValueError(
+                "expected an estimator of the joint information of several actions, "
+                "by the noise or by a model with log_likelihood; got "
+                f"{type(estimator).__name__} on {type(self.model).__name__}, which "
+                "knows single outcomes; do use estimator='auto', or one action at a "
+                "time without pending ones"
+            )
+        return (
+            CandidateSampler(self.simulator, self.belief, action, seed, engine, others),
+            estimator,
+        )
+
+
+def _parameters(target: str | Sequence[str], simulator: Any) -> list[int]:
+    """Return the places of parameters by name."""
+    names = getattr(simulator, "parameter_names", None)
+    if not names:
+        raise ValueError(
+            f"expected a simulator with parameter_names for target={target!r}; got "
+            "none; do build SimulatorModel(fn, parameter_names=[...])"
+        )
+    wanted = [target] if isinstance(target, str) else list(target)
+    unknown = [name for name in wanted if name not in names]
+    if unknown or not wanted:
+        raise ValueError(
+            f"expected target 'theta', 'model' or names among {list(names)}; got "
+            f"{target!r}; do choose one or more of these"
+        )
+    return [list(names).index(name) for name in wanted]

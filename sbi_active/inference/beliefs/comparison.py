@@ -1,0 +1,91 @@
+"""Beliefs against each other: network and refined, one order of trials and another."""
+
+from __future__ import annotations
+
+from sbi_active.inference.beliefs.belief import Belief, ChainedBelief
+from sbi_active.seeding import forked_generators
+
+__all__ = ["ORDER_TOLERANCE", "TOLERANCE", "compare", "compare_orders"]
+
+#: Nats by which the network may lie beside the refined belief before it is said.
+TOLERANCE = 0.5
+#: Nats between two refinements of the same trials beyond which it is said.
+ORDER_TOLERANCE = 0.2
+#: No density in float32 is further below another than this.
+FLOOR = -60.0
+
+
+def compare(
+    refined: Belief, chained: ChainedBelief, *, num_samples: int = 2_000
+) -> None:
+    r"""Add figures on the network's belief to the refined belief's diagnostics.
+
+    A network can pass a calibration test and be nats blunter than the data allow, since
+    calibration sees no sharpness. Against the refined belief r, with c the chained one:
+
+    .. math::
+        \mathrm{loss} = E_r[\log r(\theta) - \log c(\theta)], \qquad
+        \mathrm{bluntness} = H(c) - H(r).
+
+    A loss with a positive bluntness is under-confidence; a loss without it is
+    overconfidence or a wrong place. The loss is bounded by 60 nats.
+
+    Args:
+        refined: Its ``diagnostics`` gain "refined_log_score", "chained_log_score",
+            "chained_loss", "chained_bluntness" and, beyond half a nat, a warning.
+        chained: The network's value at the same trial.
+        num_samples: Draws of each.
+    """
+    with forked_generators(0, "compare"):
+        draws = refined.sample((num_samples,))
+        chained_draws = chained.sample((num_samples,))
+    refined_score = float(refined.log_prob(draws).double().mean())
+    chained_log_prob = chained.log_prob(draws).double()
+    score = float(chained_log_prob.clamp_min(refined_score + FLOOR).mean())
+    entropy = -float(chained.log_prob(chained_draws).double().mean())
+    loss, bluntness = refined_score - score, entropy + refined_score
+    refined.diagnostics |= {
+        "refined_log_score": refined_score,
+        "chained_log_score": score,
+        "chained_loss": loss,
+        "chained_bluntness": bluntness,
+    }
+    if loss <= TOLERANCE:
+        return
+    kind = (
+        f"under-confident, {bluntness:.1f} nats blunter than the refined belief"
+        if bluntness > 0.5 * loss
+        else f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
+    )
+    refined.diagnostics.setdefault("network_warnings", []).append(
+        f"the amortized network is {kind}"
+    )
+
+
+def compare_orders(belief: Belief, other: Belief, *, num_samples: int = 2_000) -> None:
+    r"""Add the divergence from a second refinement to a belief's diagnostics.
+
+    .. math::
+        \mathrm{KL}(b \,\|\, b') = E_b[\log b(\theta) - \log b'(\theta)],
+
+    with b' from the trials in another order and other simulations. The likelihood is
+    a product over trials, so anything beyond Monte Carlo error is an error.
+
+    Args:
+        belief: Its ``diagnostics`` gain "order_swap_kl" and, beyond .2 nat, a warning.
+        other: Of the same trials.
+        num_samples: Draws.
+    """
+    with forked_generators(0, "orders"):
+        draws = belief.sample((num_samples,))
+    difference = (belief.log_prob(draws) - other.log_prob(draws)).double()
+    divergence = float(difference.clamp_max(-FLOOR).mean())
+    diagnostics = belief.diagnostics
+    diagnostics["order_swap_kl"] = divergence
+    diagnostics["num_simulations"] += other.diagnostics["num_simulations"]
+    if divergence > ORDER_TOLERANCE:
+        diagnostics["trustworthy"] = False
+        diagnostics["warnings"].append(
+            f"a second refinement of the same trials, in reverse order, differs by "
+            f"{divergence:.2g} nats; do raise num_histories"
+        )

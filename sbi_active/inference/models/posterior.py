@@ -1,0 +1,306 @@
+"""The posterior over parameters given an outcome and the action that led to it."""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from copy import deepcopy
+from typing import Any
+
+import torch
+from sbi.inference.posteriors.base_posterior import NeuralPosterior
+from sbi.inference.posteriors.direct_posterior import DirectPosterior
+from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
+from sbi.sbi_types import Shape
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
+
+__all__ = ["ActionPosterior"]
+
+
+class ActionPosterior:
+    r"""Amortized posterior :math:`q(\theta | x, \xi)`.
+
+    It has the methods of sbi's posteriors with ``x=`` and ``action=`` together. What
+    only knows a posterior over x takes :meth:`at`, and one over packed (x, action)
+    takes :meth:`packed`.
+
+    Args:
+        packed: sbi's posterior over packed conditions.
+        x_shape: Shape of one outcome.
+        action_dim: Numbers in an action.
+
+    Attributes:
+        belief: The belief the estimator was trained under.
+    """
+
+    def __init__(
+        self, packed: NeuralPosterior, x_shape: torch.Size, action_dim: int
+    ) -> None:
+        self._packed = packed
+        self.x_shape = torch.Size(x_shape)
+        self.action_dim = action_dim
+        self.belief = packed.prior if isinstance(packed, DirectPosterior) else None
+
+    def __repr__(self) -> str:
+        return (
+            f"ActionPosterior(x {tuple(self.x_shape)}, action ({self.action_dim},), "
+            f"{type(self._packed).__name__})"
+        )
+
+    def sample(
+        self,
+        sample_shape: Shape = (),
+        x: Tensor | None = None,
+        action: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Return draws given one outcome.
+
+        Args:
+            sample_shape: Any shape.
+            x: The outcome, shape x_shape or (1, *x_shape); NaN where there was no
+                measurement.
+            action: The action that led to it, shape (action_dim,) or (1, action_dim).
+            kwargs: Passed to sbi's ``sample``.
+
+        Returns:
+            Shape (*sample_shape, theta_dim).
+
+        Raises:
+            ValueError: If x or action is missing or has another shape.
+        """
+        kwargs.setdefault("show_progress_bars", False)
+        posterior, condition = self._given(x, action)
+        draws = posterior.sample(sample_shape, x=condition, **kwargs)
+        return draws.reshape(*torch.Size(sample_shape), -1)
+
+    def sample_batched(
+        self,
+        sample_shape: Shape,
+        x: Tensor | None = None,
+        action: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Return draws given each of several outcomes.
+
+        Args:
+            sample_shape: Any shape.
+            x: Shape (b, *x_shape).
+            action: Shape (b, action_dim), or (action_dim,) for all.
+            kwargs: Passed to sbi's ``sample_batched``.
+
+        Returns:
+            Shape (*sample_shape, b, theta_dim).
+        """
+        kwargs.setdefault("show_progress_bars", False)
+        posterior, condition = self._given(x, action)
+        return posterior.sample_batched(sample_shape, x=condition, **kwargs)
+
+    def log_prob(
+        self,
+        theta: Tensor,
+        x: Tensor | None = None,
+        action: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Return the log density of parameters given one outcome.
+
+        Args:
+            theta: Shape (n, theta_dim).
+            x: The outcome, shape x_shape or (1, *x_shape).
+            action: The action that led to it.
+            kwargs: Passed to sbi's ``log_prob``.
+
+        Returns:
+            Shape (n,); -inf outside the prior's support.
+        """
+        self._direct()
+        posterior, condition = self._given(x, action)
+        return posterior.log_prob(theta.float(), x=condition, **kwargs)
+
+    def log_prob_batched(
+        self,
+        theta: Tensor,
+        x: Tensor | None = None,
+        action: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Return log densities given each of several outcomes.
+
+        Args:
+            theta: Shape (n, b, theta_dim).
+            x: Shape (b, *x_shape).
+            action: Shape (b, action_dim), or (action_dim,) for all.
+            kwargs: Passed to sbi's ``log_prob_batched``.
+
+        Returns:
+            Shape (n, b).
+        """
+        self._direct()
+        posterior, condition = self._given(x, action)
+        return posterior.log_prob_batched(theta.float(), x=condition, **kwargs)
+
+    def map(
+        self, x: Tensor | None = None, action: Tensor | None = None, **kwargs: Any
+    ) -> Tensor:
+        """Return the parameters of highest density, shape (1, theta_dim).
+
+        Args:
+            x: The outcome, shape x_shape or (1, *x_shape).
+            action: The action that led to it.
+            kwargs: Passed to sbi's ``map``.
+        """
+        posterior, condition = self._given(x, action)
+        if "init_method" not in kwargs:
+            num = kwargs.get("num_init_samples", 1_000)
+            kwargs["init_method"] = self.sample((num,), x=x, action=action)
+        return deepcopy(posterior).set_default_x(condition).map(**kwargs)
+
+    def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        r"""Return :math:`\log q(\theta_i | x_i, \xi_i)` row by row.
+
+        Without leakage correction, which a bound on the information does not need.
+
+        Args:
+            theta: Shape (n, theta_dim).
+            x: Shape (n, *x_shape); NaN where there was no measurement.
+            action: Shape (n, action_dim).
+
+        Returns:
+            Shape (n,).
+        """
+        condition = self._condition(x, action)
+        return self._direct().posterior_estimator.log_prob(
+            theta[None].float(), condition
+        )[0]
+
+    def packed(self) -> NeuralPosterior:
+        """Return sbi's posterior over packed (x, action), x flattened."""
+        return self._packed
+
+    def at(self, action: Tensor) -> DirectPosterior:
+        """Return sbi's own posterior over x at one action, for its diagnostics.
+
+        Args:
+            action: Shape (action_dim,) or (1, action_dim).
+        """
+        direct = self._direct()
+        row = action_rows(action, self.action_dim, num_rows=1)
+        estimator = _AtAction(direct.posterior_estimator, row, self.x_shape)
+        return DirectPosterior(estimator, direct.prior)
+
+    def _direct(self) -> DirectPosterior:
+        if not isinstance(self._packed, DirectPosterior):
+            raise ValueError(
+                "expected a posterior with a density; got one that only samples, "
+                f"{type(self._packed).__name__}; do build_posterior() with "
+                "sample_with='direct'"
+            )
+        return self._packed
+
+    def _given(self, x: Tensor | None, action: Tensor | None) -> tuple[Any, Tensor]:
+        """Return a posterior of sbi's and the condition it takes.
+
+        sbi refuses NaN, which here says that nothing was measured. A network that
+        takes it is then given the number of a row in a table of the conditions.
+        """
+        condition = self._condition(x, action)
+        if bool(condition.isfinite().all()) or not isinstance(
+            self._packed, DirectPosterior
+        ):
+            return self._packed, condition
+        direct = self._packed
+        network = direct.posterior_estimator
+        if not isinstance(network, MixtureDensityNetwork):
+            return direct, condition  # sbi says what is wrong
+        if not network.knows(condition):
+            warnings.warn(
+                "the network has never seen an outcome like this: no simulation it was "
+                "trained on lacks these numbers, so what it says is arbitrary",
+                stacklevel=3,
+            )
+        posterior = DirectPosterior(
+            _AtConditions(network, condition),
+            direct.prior,
+            max_sampling_batch_size=direct.max_sampling_batch_size,
+            device=direct.device,
+            enable_transform=direct.enable_transform,
+        )
+        return posterior, torch.arange(float(len(condition)))[:, None]
+
+    def _condition(self, x: Tensor | None, action: Tensor | None) -> Tensor:
+        if x is None or action is None:
+            given = "x without action" if action is None else "action without x"
+            given = "neither" if x is None and action is None else given
+            raise ValueError(
+                f"expected x= and action= together; got {given}; do pass both, or "
+                "posterior.at(action) to something that only knows x"
+            )
+        rows = outcome_rows(x, self.x_shape)
+        return pack(rows, action_rows(action, self.action_dim, num_rows=len(rows)))
+
+
+class _Rewritten(ConditionalDensityEstimator):
+    """A packed estimator whose condition is made from another one.
+
+    Args:
+        packed: Takes packed (x, action).
+        condition_shape: Of what is given instead.
+    """
+
+    def __init__(
+        self, packed: ConditionalDensityEstimator, condition_shape: torch.Size
+    ) -> None:
+        super().__init__(nn.Identity(), packed.input_shape, condition_shape)
+        self.packed = packed
+
+    @abstractmethod
+    def _rows(self, given: Tensor) -> Tensor:
+        """Return packed rows, (n, *condition_shape) -> (n, packed_dim)."""
+
+    def _pack(self, given: Tensor) -> Tensor:
+        rows = self._rows(given.reshape(-1, *self.condition_shape))
+        leading = given.shape[: given.ndim - len(self.condition_shape)]
+        return rows.reshape(*leading, -1)
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        return self.packed.log_prob(input, self._pack(condition), **kwargs)
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: Any) -> Tensor:
+        return self.packed.loss(input, self._pack(condition), **kwargs)
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: Any
+    ) -> Tensor:
+        return self.packed.sample(sample_shape, self._pack(condition), **kwargs)
+
+
+class _AtAction(_Rewritten):
+    """At one action: the condition is x alone."""
+
+    action: Tensor
+
+    def __init__(
+        self, packed: ConditionalDensityEstimator, action: Tensor, x_shape: torch.Size
+    ) -> None:
+        super().__init__(packed, x_shape)
+        self.register_buffer("action", action)
+
+    def _rows(self, given: Tensor) -> Tensor:
+        return pack(given, self.action.expand(len(given), -1))
+
+
+class _AtConditions(_Rewritten):
+    """At the rows of a table: the condition is a row's number."""
+
+    table: Tensor
+
+    def __init__(self, packed: ConditionalDensityEstimator, table: Tensor) -> None:
+        super().__init__(packed, torch.Size([1]))
+        self.register_buffer("table", table)
+
+    def _rows(self, given: Tensor) -> Tensor:
+        return self.table[given[:, 0].long()]

@@ -1,0 +1,208 @@
+"""A Gaussian posterior by regression of the outcome, the frame a network works in."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
+from sbi_active.inference.networks.response import Response
+
+__all__ = ["Baseline", "Frames"]
+
+BLOCK = 4_096  # rows held in memory at once
+NUM_CENTERS = 32
+NUM_STEPS = 7
+INITIAL_DAMPING = 1e-2
+AT_REST = 1e-3  # nat
+NUM_SCALING_ROWS = 1_500
+
+
+class Frames(NamedTuple):
+    r"""Affine coordinates of each row, :math:`v = U (u - m)`.
+
+    Attributes:
+        mean: m, shape (n, J, d).
+        factor: U, upper triangular, shape (n, J, d, d).
+        misfit: Half the squared residual and prior distance at m, shape (n, J).
+    """
+
+    mean: Tensor
+    factor: Tensor
+    misfit: Tensor
+
+    @property
+    def log_det(self) -> Tensor:
+        r""":math:`\log |\mathrm d v / \mathrm d u|`, shape (n, J)."""
+        return self.factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+class Baseline(Response):
+    r"""Gaussian posterior of whitened parameters u, exact where x is linear in u.
+
+    The regression f of the outcome, with noise of covariance S, is inverted by Bayes'
+    rule for :math:`u \sim \mathcal N(0, I)`:
+
+    .. math::
+        m &= \arg\min_u \tfrac12 |u|^2 + \tfrac12 |x - f(\xi, u)|^2_{S^{-1}}, \qquad
+        U^\top U = I + J^\top S^{-1} J, \quad J = \partial_u f(\xi, m).
+
+    "linear" has :math:`\psi = (1, u)`: one Gauss-Newton step is exact. "curved" takes
+    damped steps from two starts, the better of the training parameters and the one that
+    the first solution explains worst, so that a second mode has a frame of its own.
+    Last, :math:`v = U (u - m)` is standardized given the action, which absorbs misfit.
+
+    Args:
+        u: Whitened parameters, shape (n, d).
+        y: Finite outcomes, of scale one over all actions, shape (n, m).
+        action: Shape (n, action_dim).
+        kind: Whether f is linear in u.
+    """
+
+    centers: Tensor
+
+    def __init__(
+        self,
+        u: Tensor,
+        y: Tensor,
+        action: Tensor,
+        *,
+        kind: Literal["linear", "curved"],
+        log_scale: Tensor | None = None,
+    ) -> None:
+        super().__init__(u, y, action, kind=kind, log_scale=log_scale)
+        test = held_out(len(u))
+        self.register_buffer("centers", u[~test][:NUM_CENTERS].clone())
+
+        self.residual_scaling: ActionScaling | None = None
+        some = slice(NUM_SCALING_ROWS if kind == "curved" else None)
+        frames = self(y[some], action[some])
+        v = nearest(local(u[some], frames), frames)
+        self.residual_scaling = ActionScaling(v, action[some])
+
+    def forward(self, y: Tensor, action: Tensor) -> Frames:
+        """Return the frames of outcomes (n, m) and actions (n, action_dim)."""
+        blocks = zip(y.split(BLOCK), action.split(BLOCK), strict=True)
+        parts = zip(*(self._frames(*block) for block in blocks), strict=True)
+        return Frames(*(torch.cat(part) for part in parts))
+
+    def _frames(self, y: Tensor, action: Tensor) -> Frames:
+        # From here on outcomes are in units of their noise, which is N(0, I).
+        whitener, beta = self.weights(action)
+        y = (whitener @ y[..., None])[..., 0]
+        beta = beta @ whitener.mT
+        if self.kind == "linear":
+            start = torch.zeros_like(self.centers[:1]).expand(len(y), 1, -1)
+            misfit, gradient, precision = self._expand(start, y, beta)
+            mean = start - torch.linalg.solve(precision, gradient)
+            # No clamp to the rows' range here: the linear f holds everywhere.
+            misfit = misfit + 0.5 * (gradient * (mean - start)).sum(-1)
+        else:
+            mean, misfit, precision = self._minimize(y, beta)
+        factor = _cholesky(precision).mT
+        if self.residual_scaling is not None:
+            location, scale = self.residual_scaling.location_and_scale(action)
+            location = location[:, None, :, None]
+            step = torch.linalg.solve_triangular(factor, location, upper=True)
+            mean, factor = mean + step[..., 0], factor / scale[:, None, :, None]
+        return Frames(mean, factor, misfit)
+
+    def _minimize(self, y: Tensor, beta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return solution, misfit and precision of two starts a row."""
+        residual = y[:, None] - self.parameter_basis(self.centers) @ beta
+        misfit = 0.5 * (residual.square().sum(-1) + self.centers.square().sum(-1))
+        first = self._descend(self.centers[misfit.argmin(1)][:, None], y, beta)
+        # Of the quadratic around the first solution, the centers' distances to it.
+        step = self.centers - first[0]
+        quadratic = (step * (step @ first[2][:, 0])).sum(-1) * 0.5 + first[1]
+        second = (misfit.log() - quadratic.clamp_min(1e-12).log()).argmin(1)
+        second = self._descend(self.centers[second][:, None], y, beta)
+        mean, misfit, precision = (
+            torch.cat(pair, 1) for pair in zip(first, second, strict=True)
+        )
+        return mean, misfit, precision
+
+    def _descend(
+        self, u: Tensor, y: Tensor, beta: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Take damped Gauss-Newton steps, each accepted where it improves."""
+        low = self.parameter_basis.center - self.parameter_basis.half_width
+        high = self.parameter_basis.center + self.parameter_basis.half_width
+        damping = torch.full_like(u[..., :1], INITIAL_DAMPING)
+        state = (u, *self._expand(u, y, beta))
+        rows = torch.arange(len(u), device=u.device)  # not yet at rest
+        for _ in range(NUM_STEPS):
+            u, misfit, gradient, precision = (each[rows] for each in state)
+            diagonal = precision.diagonal(dim1=-2, dim2=-1)
+            damped = precision + torch.diag_embed(damping * diagonal)
+            proposed = u - torch.linalg.solve(damped, gradient)
+            proposed = torch.minimum(torch.maximum(proposed, low), high)
+            new = (proposed, *self._expand(proposed, y[rows], beta[rows]))
+            better = new[1] < misfit
+            state = tuple(
+                each.index_put((rows,), torch.where(_like(better, b), b, a))
+                for each, a, b in zip(
+                    state, (u, misfit, gradient, precision), new, strict=True
+                )
+            )
+            restless = ~(better & (misfit - new[1] < AT_REST)).all(1)
+            damping = torch.where(better[..., None], 0.1 * damping, 10.0 * damping)
+            rows, damping = rows[restless], damping[restless]
+            if not len(rows):
+                break
+        return state[0], state[1], state[3]
+
+    def _expand(
+        self, u: Tensor, y: Tensor, beta: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return misfit (n, J), its gradient (n, J, d) and Gauss-Newton Hessian."""
+        psi, slope = self.parameter_basis.with_jacobian(u)
+        residual = y[:, None] - psi @ beta
+        jacobian = slope.mT @ beta[:, None]  # (n, J, d, m)
+        misfit = 0.5 * (residual.square().sum(-1) + u.square().sum(-1))
+        gradient = u - (jacobian @ residual[..., None])[..., 0]
+        eye = torch.eye(u.shape[-1], dtype=u.dtype, device=u.device)
+        return misfit, gradient, eye + jacobian @ jacobian.mT
+
+
+def _cholesky(precision: Tensor) -> Tensor:
+    """Return the lower factor of I + J J^T, which rounding may have made indefinite.
+
+    That happens where noise is extrapolated to nearly nothing; a share of the largest
+    entry, raised until it suffices, then stands for the lost I.
+    """
+    factor, info = torch.linalg.cholesky_ex(precision)
+    share = 1e-14
+    while bool(info.any()):
+        if share > 1.0:  # which suffices for any finite one
+            raise ValueError(
+                "expected a regression of the outcomes with finite weights; got "
+                "infinite or undefined ones; do check the outcomes for numbers beyond "
+                "any use"
+            )
+        largest = precision.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+        lifted = precision + torch.diag_embed(
+            (share * largest).expand_as(factor[..., 0])
+        )
+        lost = (info > 0)[..., None, None]
+        factor, info = torch.linalg.cholesky_ex(torch.where(lost, lifted, precision))
+        share *= 10.0
+    return factor
+
+
+def local(u: Tensor, frames: Frames) -> Tensor:
+    """Return v in every frame, (..., n, d) -> (..., n, J, d)."""
+    step = u[..., None, :] - frames.mean
+    return (frames.factor * step[..., None, :]).sum(-1)
+
+
+def nearest(v: Tensor, frames: Frames) -> Tensor:
+    """Return v in the frame of highest density, (n, J, d) -> (n, d)."""
+    log_density = frames.log_det - 0.5 * v.square().sum(-1)
+    return v[torch.arange(len(v)), log_density.argmax(1)]
+
+
+def _like(mask: Tensor, values: Tensor) -> Tensor:
+    return mask.reshape(*mask.shape, *[1] * (values.ndim - mask.ndim))

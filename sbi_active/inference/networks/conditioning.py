@@ -1,0 +1,223 @@
+"""What a network sees instead of raw parameters and conditions, and the way back."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
+from sbi_active.inference.networks.baseline import Baseline, Frames, local
+from sbi_active.inference.networks.response import STRAIGHT
+
+__all__ = ["BaselineKind", "Conditioning", "covariance_factor", "scale_of"]
+
+BaselineKind = Literal["none", "linear", "curved"]
+
+MAX_OUTCOMES = 32  # numbers in x beyond which no regression on the action is tried
+MIN_ROWS = 40
+LARGEST_MISFIT = 20.0
+KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
+#: Nats by which a baseline must beat the simpler one: its frames and what the network
+#: sees of them are more to overfit.
+MARGIN = {"linear": 0.0, "curved": 0.25}
+
+
+class Conditioning(nn.Module):
+    r"""Standardized outcomes and whitened, locally standardized parameters.
+
+    .. math::
+        \tilde x = \frac{x - \mu(\xi)}{\sigma(\xi)}, \qquad
+        u = W (\theta - \bar\theta), \quad W^\top W = \mathrm{Cov}(\theta)^{-1}, \qquad
+        v_j = U_j(x, \xi)\, (u - m_j(x, \xi)),
+
+    where the frames (m, U) come from a :class:`.Baseline`
+    and a last one is the whitened parameters themselves (m = 0, U = I), so that no row
+    is lost where the baseline errs. All of it is in float64: x may reach 15,000 with
+    noise 1, and theta be known to 1e-4 of its range.
+
+    With a baseline the network sees m(x, action), in which noise is shrunk as Bayes'
+    rule does, and x standardized over all rows; without, :math:`\tilde x`. Both
+    :math:`\tilde x` and m were overfitted: where an action tells little, the first is
+    noise of scale one.
+
+    Args:
+        theta: Shape (n, theta_dim).
+        condition: Packed (x, action), shape (n, x_dim + action_dim); NaN in x where
+            there was no measurement.
+        action_dim: Numbers in an action.
+        scaling: Whether x, without a baseline, is standardized given the action or over
+            all rows.
+        whiten: Whether theta is whitened by its full covariance or only scaled.
+        baseline: Whose frames to use; "best" compares Gaussian log scores on held-out
+            rows.
+
+    Attributes:
+        baseline_kind: The baseline in use.
+        scores: Held-out log score of each candidate, in nats.
+    """
+
+    theta_mean: Tensor
+    theta_factor: Tensor
+    action_mean: Tensor
+    action_scale: Tensor
+    y_mean: Tensor
+    y_scale: Tensor
+
+    def __init__(
+        self,
+        theta: Tensor,
+        condition: Tensor,
+        action_dim: int,
+        *,
+        scaling: Literal["action", "global"],
+        whiten: bool,
+        baseline: Literal["best", "none", "linear", "curved"],
+    ) -> None:
+        super().__init__()
+        self.x_dim = condition.shape[1] - action_dim
+        theta = theta.double()
+        self.register_buffer("theta_mean", theta.mean(0))
+        self.register_buffer("theta_factor", covariance_factor(theta, whiten))
+
+        x, action = condition.double().split([self.x_dim, action_dim], 1)
+        valid = x.isfinite().all(1)
+        few = int(valid.sum()) < MIN_ROWS or self.x_dim > MAX_OUTCOMES
+        self.register_buffer("action_mean", action.mean(0))
+        self.register_buffer("action_scale", scale_of(action))
+        columns = [x[row, j] for j, row in enumerate(x.isfinite().mT)]
+        center = [c.mean() if len(c) else x.new_zeros(()) for c in columns]
+        spread = [scale_of(c) if len(c) else x.new_ones(()) for c in columns]
+        self.register_buffer("y_mean", torch.stack(center))
+        self.register_buffer("y_scale", torch.stack(spread))
+        y = (x[valid] - self.y_mean) / self.y_scale
+
+        self.baseline: Baseline | None = None
+        self.baseline_kind: BaselineKind = "none"
+        self.scores: dict[str, float] = {}
+        if baseline != "none" and not few:
+            u = self.whiten(theta[valid])
+            self._choose(u, y, action[valid], baseline)
+        self.x_scaling: ActionScaling | None = None
+        if scaling == "action" and not few and self.baseline is None:
+            self.x_scaling = ActionScaling(y, action[valid])
+
+    def _choose(
+        self,
+        u: Tensor,
+        y: Tensor,
+        action: Tensor,
+        baseline: Literal["best", "linear", "curved"],
+    ) -> None:
+        test = held_out(len(u))
+        best = -math.inf
+        if baseline == "best":
+            best = self.scores["none"] = float(_log_normal(u[test]).mean())
+        for kind in KINDS if baseline == "best" else (baseline,):
+            bends = self.baseline is None or self.baseline.bend(u, y, action) > STRAIGHT
+            if kind == "curved" and baseline == "best" and not bends:
+                continue
+            candidate = Baseline(u, y, action, kind=kind)
+            frames = _with_global(candidate(y[test], action[test]))
+            score = float(_log_mixture(u[test], frames).mean())
+            self.scores[kind] = score
+            if score > best + (MARGIN[kind] if baseline == "best" else 0.0):
+                best, self.baseline, self.baseline_kind = score, candidate, kind
+
+    @property
+    def num_frames(self) -> int:
+        """Local frames of each row, and the global one."""
+        return {"none": 1, "linear": 2, "curved": 3}[self.baseline_kind]
+
+    def whiten(self, theta: Tensor) -> Tensor:
+        """Return u, (..., d) -> (..., d)."""
+        step = (theta.double() - self.theta_mean)[..., None]
+        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
+            ..., 0
+        ]
+
+    def unwhiten(self, u: Tensor) -> Tensor:
+        """Return theta, the inverse of :meth:`whiten`."""
+        return (self.theta_factor @ u[..., None])[..., 0] + self.theta_mean
+
+    @property
+    def log_det(self) -> Tensor:
+        r""":math:`\log |\mathrm d u / \mathrm d \theta|`."""
+        return -self.theta_factor.diagonal().log().sum()
+
+    def forward(self, condition: Tensor) -> tuple[Tensor, Frames]:
+        """Return what the network sees, (n, x_dim + action_dim + ...), and the frames.
+
+        Numbers of x that are missing are zero; a row with any has trivial frames.
+        """
+        x, action = condition.double().split(
+            [self.x_dim, condition.shape[1] - self.x_dim], 1
+        )
+        missing = ~x.isfinite()
+        # Missing numbers are replaced before any arithmetic, lest gradients be NaN.
+        y = (torch.where(missing, self.y_mean, x) - self.y_mean) / self.y_scale
+        scaled = y if self.x_scaling is None else self.x_scaling(y, action)
+        scaled = torch.where(missing, 0.0, scaled)
+        seen = [scaled, (action - self.action_mean) / self.action_scale]
+        d = len(self.theta_mean)
+        trivial = Frames(
+            y.new_zeros(len(y), 1, d),
+            torch.eye(d, dtype=y.dtype, device=y.device).expand(len(y), 1, d, d),
+            y.new_zeros(len(y), 1),
+        )
+        if self.baseline is None:
+            return torch.cat(seen, 1), trivial
+        frames, lost = self.baseline(y, action), missing.any(1)[:, None]
+        frames = Frames(
+            torch.where(lost[..., None], 0.0, frames.mean),
+            torch.where(lost[..., None, None], trivial.factor, frames.factor),
+            torch.where(lost, 0.0, frames.misfit),
+        )
+        seen.append(frames.mean.flatten(1))
+        if frames.misfit.shape[1] > 1:
+            excess = frames.misfit - frames.misfit.min(1, keepdim=True).values
+            seen.append(torch.tanh(excess / LARGEST_MISFIT))
+        return torch.cat(seen, 1), _with_global(frames)
+
+
+def _with_global(frames: Frames) -> Frames:
+    n, _, d = frames.mean.shape
+    eye = torch.eye(d, dtype=frames.mean.dtype, device=frames.mean.device)
+    return Frames(
+        torch.cat([frames.mean, frames.mean.new_zeros(n, 1, d)], 1),
+        torch.cat([frames.factor, eye.expand(n, 1, d, d)], 1),
+        torch.cat([frames.misfit, frames.misfit.new_zeros(n, 1)], 1),
+    )
+
+
+def _log_normal(u: Tensor) -> Tensor:
+    return -0.5 * u.square().sum(-1) - 0.5 * u.shape[-1] * math.log(2 * math.pi)
+
+
+def _log_mixture(u: Tensor, frames: Frames) -> Tensor:
+    """Log density of the local frames, equally weighted, with 1 % of the global one."""
+    log_density = frames.log_det + _log_normal(local(u, frames))
+    weight = torch.full((log_density.shape[1],), 0.99 / (log_density.shape[1] - 1))
+    weight[-1] = 0.01
+    return (log_density + weight.to(u).log()).logsumexp(-1)
+
+
+def scale_of(rows: Tensor) -> Tensor:
+    """Return the columns' standard deviations, one where a column is constant."""
+    scale, mean = rows.std(0, correction=0), rows.mean(0)
+    return torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
+
+
+def covariance_factor(theta: Tensor, whiten: bool) -> Tensor:
+    """Return the lower factor of the covariance, shape (d, d), or its diagonal's."""
+    scale = scale_of(theta)
+    if not whiten or len(theta) <= theta.shape[1]:
+        return scale.diag()
+    z = (theta - theta.mean(0)) / scale
+    correlation = z.mT @ z / len(z)
+    # A constant parameter keeps the scale one.
+    correlation = correlation + torch.diag((correlation.diagonal() < 0.5).to(z))
+    tiny = 1e-12 * torch.eye(len(scale), dtype=z.dtype)
+    return scale[:, None] * torch.linalg.cholesky(correlation + tiny)

@@ -1,0 +1,224 @@
+"""Surrogate likelihood: a regression of the outcome and a mixture on its residual."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.action_scaling import ActionScaling
+from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
+from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.inference.networks.response import Response, exceeds_chance
+from sbi_active.inference.networks.validity_network import ValidityNetwork
+
+__all__ = ["LikelihoodNetwork"]
+
+MAX_OUTCOMES = 32  # numbers in x beyond which no regression is tried
+MIN_ROWS = 40
+
+
+class LikelihoodNetwork(ConditionalDensityEstimator):
+    r"""Density of the outcome given parameters and action.
+
+    .. math::
+        q(x | \theta, \xi) = P_\text{valid}(\theta, \xi)\, |W(\xi)|\,
+        m\big(W(\xi)\,(x - f(\xi, \theta)) \,\big|\, \theta, \xi\big)
+
+    with f and the noise's whitener W from a
+    :class:`.Response` and m a mixture density network on
+    the residual, or the standard normal density where that predicts held-out rows as
+    well: the network corrects the regression where that pays. An outcome of NaN has the
+    probability :math:`1 - P_\text{valid}`. Without a regression, W and f standardize x
+    given the action, or over all rows.
+
+    Args:
+        settings: Of the mixture; ``baseline`` and ``scaling`` are those of the outcome.
+        x: Training outcomes, shape (n, x_dim); NaN throughout a row where there was no
+            measurement.
+        condition: Packed (theta, action), shape (n, theta_dim + action_dim).
+        action_dim: Numbers in an action.
+
+    Attributes:
+        is_gaussian: Whether the residual's density is the standard normal one.
+    """
+
+    theta_mean: Tensor
+    theta_factor: Tensor
+    y_mean: Tensor
+    y_scale: Tensor
+    is_gaussian: Tensor
+
+    def __init__(
+        self, settings: MixtureDensity, x: Tensor, condition: Tensor, action_dim: int
+    ) -> None:
+        super().__init__(nn.Identity(), x.shape[1:], condition.shape[1:])
+        self._theta_dim = condition.shape[1] - action_dim
+        theta, action = condition.double().split([self._theta_dim, action_dim], 1)
+        valid = _valid(x)
+        self.register_buffer("theta_mean", theta.mean(0))
+        self.register_buffer("theta_factor", covariance_factor(theta, settings.whiten))
+        known = x[valid].double()
+        if len(known) < 2:
+            raise ValueError(
+                f"expected at least two simulations with a measurement; got "
+                f"{len(known)} of {len(x)}; do check the simulator, or the belief"
+            )
+        self.register_buffer("y_mean", known.mean(0))
+        self.register_buffer("y_scale", scale_of(known))
+        y = (known - self.y_mean) / self.y_scale
+        rows = self._whiten(theta[valid]), y, action[valid]
+
+        self.response: Response | None = None
+        self.x_scaling: ActionScaling | None = None
+        few = len(y) < MIN_ROWS or y.shape[1] > MAX_OUTCOMES
+        if settings.baseline != "none" and not few:
+            kind = settings.baseline
+            self.response = (
+                Response.best(*rows) if kind == "best" else Response(*rows, kind=kind)
+            )
+        elif settings.scaling == "action" and not few:
+            self.x_scaling = ActionScaling(y, action[valid])
+        z, _ = self._standardize(known, condition[valid])
+        seen = self._see(condition)
+        # The action's place matters to the scaling above alone.
+        plain = replace(settings, scaling="global", whiten=False, baseline="none")
+        self.mixture = plain(z.float(), seen[valid])
+        self.validity = None if bool(valid.all()) else ValidityNetwork(seen, valid)
+        self._log_unseen = -math.log(len(x) + 2)
+        self.register_buffer("is_gaussian", torch.tensor(False))
+
+    @property
+    def embedding_net(self) -> nn.Module:
+        return nn.Identity()
+
+    def residual_rows(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what the mixture is trained on: residuals and its conditions.
+
+        Args:
+            x: Outcomes, shape (n, x_dim); rows without a measurement are left out.
+            condition: Shape (n, condition_dim).
+        """
+        valid = _valid(x)
+        with torch.no_grad():
+            z, _ = self._standardize(x[valid].double(), condition[valid])
+            return z.float(), self._see(condition[valid])
+
+    def choose(self, residual: Tensor, seen: Tensor) -> None:
+        """Take the standard normal density unless the mixture predicts better.
+
+        Args:
+            residual: Held-out, of :meth:`residual_rows`, shape (n, x_dim).
+            seen: Shape (n, p).
+        """
+        if self.response is None or not len(residual):
+            return
+        with torch.no_grad():
+            gain = -self.mixture.loss(residual, seen) - _log_normal(residual)
+            self.is_gaussian.fill_(not exceeds_chance(gain.double()))
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
+        """Return -log q, shape (n,), for rows (n, x_dim) and (n, condition_dim)."""
+        return -self._log_density(input[None], condition)[0]
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
+        """Return log q(input | condition).
+
+        Args:
+            input: Shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
+            condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
+            kwargs: Not used.
+
+        Returns:
+            Shape (sample_dim, batch_dim), float32.
+        """
+        self._check_condition_shape(condition)
+        self._check_input_shape(input)
+        if input.ndim == 2:
+            input = input[None]
+        if condition.ndim == 3:
+            pairs = input.expand(*condition.shape[:2], -1).reshape(
+                1, -1, input.shape[-1]
+            )
+            return self._log_density(pairs, condition.flatten(0, 1)).reshape(
+                condition.shape[:2]
+            )
+        return self._log_density(input, condition)
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: object
+    ) -> Tensor:
+        """Return draws, shape (*sample_shape, batch_dim, x_dim)."""
+        self._check_condition_shape(condition)
+        shape = torch.Size(sample_shape)
+        seen = self._see(condition)
+        if bool(self.is_gaussian):
+            z = torch.randn(*shape, len(seen), *self.input_shape, device=seen.device)
+        else:
+            z = self.mixture.sample(shape, seen)
+        mean, whitener = self._location_and_whitener(condition)
+        step = torch.linalg.solve_triangular(
+            whitener, z.double()[..., None], upper=False
+        )
+        x = (self.y_mean + self.y_scale * (mean + step[..., 0])).float()
+        if self.validity is not None:
+            probability = self.validity(seen)[0].exp().expand(x.shape[:-1])
+            x[torch.rand(probability.shape) > probability] = torch.nan
+        return x
+
+    def _log_density(self, x: Tensor, condition: Tensor) -> Tensor:
+        """Return log q, (s, n, x_dim) and (n, c) -> (s, n)."""
+        valid = _valid(x)
+        known = torch.where(valid[..., None], x.double(), self.y_mean)
+        z, log_det = self._standardize(known, condition)
+        z, seen = z.to(torch.float32), self._see(condition)
+        if bool(self.is_gaussian):
+            log_density = _log_normal(z)
+        else:
+            log_density = self.mixture.log_prob(z, seen)
+        log_density = log_density + log_det.to(log_density)
+        if self.validity is None:
+            # No row lacked a measurement: that it is rare says nothing of where.
+            return torch.where(valid, log_density, self._log_unseen)
+        log_valid, log_invalid = self.validity(seen)
+        return torch.where(valid, log_valid + log_density, log_invalid)
+
+    def _standardize(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """Return residuals (..., n, x_dim) and log |dz / dx| (n,)."""
+        mean, whitener = self._location_and_whitener(condition)
+        y = (x - self.y_mean) / self.y_scale
+        z = (whitener @ (y - mean)[..., None])[..., 0]
+        log_det = whitener.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return z, log_det - self.y_scale.log().sum()
+
+    def _location_and_whitener(self, condition: Tensor) -> tuple[Tensor, Tensor]:
+        theta, action = condition.double().tensor_split([self._theta_dim], 1)
+        if self.response is not None:
+            return self.response.mean_and_whitener(self._whiten(theta), action)
+        if self.x_scaling is not None:
+            mean, scale = self.x_scaling.location_and_scale(action)
+            return mean, (1 / scale).diag_embed()
+        mean = theta.new_zeros(len(theta), len(self.y_mean))
+        return mean, torch.ones_like(mean).diag_embed()
+
+    def _see(self, condition: Tensor) -> Tensor:
+        """Return whitened parameters and the action, shape (n, c), float32."""
+        theta, action = condition.double().tensor_split([self._theta_dim], 1)
+        return torch.cat([self._whiten(theta), action], 1).float()
+
+    def _whiten(self, theta: Tensor) -> Tensor:
+        step = (theta - self.theta_mean)[..., None]
+        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
+            ..., 0
+        ]
+
+
+def _valid(x: Tensor) -> Tensor:
+    return x.isfinite().all(-1)
+
+
+def _log_normal(z: Tensor) -> Tensor:
+    return -0.5 * z.square().sum(-1) - 0.5 * z.shape[-1] * math.log(2 * math.pi)

@@ -1,0 +1,127 @@
+"""A lean mixture density network, the default estimator where actions are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
+
+__all__ = ["MixtureDensity", "MixtureDensityNetwork"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureDensity:
+    """Settings of the mixture density network.
+
+    It is a builder in sbi's sense (called with the training rows), and also says how
+    long to train: a number of iterations, not a patience. The defaults reach a lower
+    loss than the paper's settings, :meth:`faithful`, in a third of their time.
+
+    Attributes:
+        hidden_features: Width of each hidden layer.
+        num_components: Gaussian components K.
+        num_iterations: Steps of stochastic gradient descent.
+        batch_size: Rows a step.
+        learning_rate: Of Adam.
+        anneal: Whether the learning rate falls to zero along a cosine.
+        scaling: "action" standardizes x given the action, "global" over all rows; with
+            a baseline, that does the former.
+        whiten: Whether theta is whitened by its full covariance, or number by number.
+        baseline: Gaussian posterior that the network corrects: "linear" or "curved" in
+            theta, "none", or "best" of these on held-out rows, see
+            :class:`.Conditioning`.
+        embedding_net: Maps the packed condition (n, x_dim + action_dim) to features,
+            for example an :class:`.ActionEmbedding`. It sees x scaled over
+            all rows, and there is no baseline.
+
+    References:
+        Bishop, *Mixture density networks*, NCRG/94/004, 1994.
+
+    Example:
+        >>> import torch
+        >>> settings = MixtureDensity(hidden_features=(32,), num_iterations=100)
+        >>> settings(torch.randn(100, 2), torch.randn(100, 3)).condition_shape
+        torch.Size([3])
+    """
+
+    hidden_features: tuple[int, ...] = (128, 128)
+    num_components: int = 5
+    num_iterations: int = 400
+    batch_size: int = 100
+    learning_rate: float = 5e-3
+    anneal: bool = True
+    scaling: Literal["action", "global"] = "action"
+    whiten: bool = True
+    baseline: Literal["best", "none", "linear", "curved"] = "best"
+    embedding_net: nn.Module | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        counts = {
+            "num_components": self.num_components,
+            "num_iterations": self.num_iterations,
+            "batch_size": self.batch_size,
+            "hidden_features": min(self.hidden_features, default=1),
+        }
+        for name, value in counts.items():
+            if value < 1:
+                raise ValueError(f"expected {name} >= 1; got {value}; do raise it")
+        if not self.learning_rate > 0:
+            raise ValueError(
+                f"expected learning_rate > 0; got {self.learning_rate}; do use 1e-3"
+            )
+        choices = {
+            "scaling": ("action", "global"),
+            "baseline": ("best", "none", "linear", "curved"),
+        }
+        for name, valid in choices.items():
+            if getattr(self, name) not in valid:
+                raise ValueError(
+                    f"expected {name} among {', '.join(map(repr, valid))}; got "
+                    f"{getattr(self, name)!r}; do choose one of these"
+                )
+
+    @classmethod
+    def faithful(cls) -> MixtureDensity:
+        """Return the settings of Kim & Matsubara (2025), section 5.2.
+
+        128 x 128 hidden units, 5 components, 2000 iterations of batch 50; the learning
+        rate, which the paper does not give, is Adam's usual 1e-3, held constant. Each
+        number of the condition and of theta is standardized over all rows.
+        """
+        return cls(
+            num_iterations=2_000,
+            batch_size=50,
+            learning_rate=1e-3,
+            anneal=False,
+            scaling="global",
+            whiten=False,
+            baseline="none",
+        )
+
+    def __call__(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:
+        """Build the network, its scales taken from the rows.
+
+        Args:
+            theta: Shape (n, theta_dim).
+            x: Packed conditions, shape (n, condition_dim); NaN where a simulation gave
+                no measurement.
+
+        Returns:
+            A network on rows standardized number by number, as in sbi.
+        """
+        return MixtureDensityNetwork(self, theta, x)
+
+    def build(
+        self, theta: Tensor, condition: Tensor, action_dim: int
+    ) -> MixtureDensityNetwork:
+        """Build the network, knowing which numbers of the condition are the action.
+
+        Args:
+            theta: Shape (n, theta_dim).
+            condition: Packed (x, action), shape (n, x_dim + action_dim).
+            action_dim: Numbers in an action.
+        """
+        return MixtureDensityNetwork(self, theta, condition, action_dim)

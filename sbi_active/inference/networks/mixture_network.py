@@ -1,0 +1,331 @@
+"""Gaussian mixture whose parameters a network makes of the condition."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.baseline import Frames, local
+from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
+
+if TYPE_CHECKING:
+    from sbi_active.inference.networks.mixture_density import MixtureDensity
+
+__all__ = ["MixtureDensityNetwork", "PreparedLoss"]
+
+#: Bounds of the log-precision of a component in units of the standardized parameter:
+#: wide enough for seven decimal digits, where float32 ends.
+LOG_PRECISION_RANGE = (-10.0, 16.0)
+#: Where components of local frames are, one of the global frame starts with a twentieth
+#: of the weight of each.
+GLOBAL_LOGIT = -3.0
+
+
+class MixtureDensityNetwork(ConditionalDensityEstimator):
+    r"""Gaussian mixture whose parameters are functions of the condition.
+
+    .. math::
+        q(\theta | c) = \sum_k \pi_k(c)\, \mathcal{N}(u; \mu_k(c), (R_k^\top R_k)^{-1})
+        \, |\mathrm{d}u / \mathrm{d}\theta|, \qquad u = (\theta - m) / s,
+
+    with R_k upper triangular, its diagonal the exponential of an output. The condition
+    is standardized column by column. Where training rows hold NaN (outcomes without a
+    measurement), those numbers are set to zero and a 0/1 mask is appended, so that
+    "there was no measurement" is itself something to condition on.
+
+    Where the action's place in the condition is known, a
+    :class:`.Conditioning` takes the place of both
+    standardizations, as the settings say. Component k then lives in the coordinates
+    :math:`v = U_j(c)\,(u - m_j(c))` of one of its frames,
+
+    .. math::
+        q(\theta | c) = \Big|\frac{\mathrm{d}u}{\mathrm{d}\theta}\Big| \sum_k \pi_k(c)\,
+        |U_{j(k)}(c)|\, \mathcal{N}(v_{j(k)}; \mu_k(c), (R_k^\top R_k)^{-1}).
+
+    Args:
+        settings: Layers and components.
+        theta: Training parameters, shape (n, theta_dim).
+        condition: Training conditions, shape (n, condition_dim).
+        action_dim: Numbers of the action at the end of a condition; None leaves them
+            unknown.
+    """
+
+    condition_mean: Tensor
+    condition_scale: Tensor
+    theta_mean: Tensor
+    theta_scale: Tensor
+    strict_upper: Tensor
+
+    def __init__(
+        self,
+        settings: MixtureDensity,
+        theta: Tensor,
+        condition: Tensor,
+        action_dim: int | None = None,
+    ) -> None:
+        dim, num = theta.shape[1], settings.num_components
+        missing = ~condition.isfinite()
+        # Columns that go missing together need one mask between them.
+        masks, columns = missing.unique(dim=1, return_inverse=True)
+        masked = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
+        masked = [column for column in masked if bool(missing[:, column].any())]
+        ever_missing, largest_gap = missing.any(0), int(missing.sum(1).max())
+
+        conditioning = _conditioning(settings, theta, condition, action_dim)
+        embedding = settings.embedding_net or nn.Identity()
+        with torch.no_grad():
+            if conditioning is None:
+                seen = torch.zeros(2, condition.shape[1])
+            else:
+                seen = conditioning(condition[:2])[0].float()
+            width = embedding(seen).shape[1] + len(masked)
+        layers: list[nn.Module] = []
+        for hidden in settings.hidden_features:
+            layers += [nn.Linear(width, hidden), nn.ReLU()]
+            width = hidden
+        last = nn.Linear(width, num * (1 + 2 * dim + dim * dim))
+        super().__init__(
+            nn.Sequential(*layers, last), theta.shape[1:], condition.shape[1:]
+        )
+        self._embedding: nn.Module = embedding
+        self._num_components, self._dim = num, dim
+        self._masked_columns = masked
+        self._ever_missing, self._largest_gap = ever_missing.cpu(), largest_gap
+        self._sections = [num, num * dim, num * dim, num * dim * dim]
+        with torch.no_grad():  # start near a broad mixture that ignores the condition
+            last.weight.mul_(0.1)
+            last.bias.zero_()
+            last.bias[num : num + num * dim].normal_(0.0, 0.5)
+
+        self.conditioning = conditioning
+        self._frame_of = _frame_of_components(num, self.num_frames)
+        if self.num_frames > 1 and num > 1:
+            with torch.no_grad():
+                last.bias[num - 1] = GLOBAL_LOGIT
+        mean, scale = _location_and_scale(condition, ~missing)
+        self.register_buffer("condition_mean", mean)
+        self.register_buffer("condition_scale", scale)
+        mean, scale = _location_and_scale(theta, torch.ones_like(theta).bool())
+        self.register_buffer("theta_mean", mean)
+        self.register_buffer("theta_scale", scale)
+        self.register_buffer("strict_upper", torch.ones(dim, dim).triu(1))
+
+    @property
+    def embedding_net(self) -> nn.Module:
+        return self._embedding
+
+    def knows(self, condition: Tensor) -> bool:
+        """Return whether training rows lacked what conditions lack.
+
+        Each number that is missing must have been so in some row, and as many as are
+        missing must have been so at once.
+
+        Args:
+            condition: Shape (n, condition_dim).
+        """
+        missing = ~condition.isfinite().cpu()
+        unheard = missing & ~self._ever_missing
+        gap = int(missing.sum(1).max())
+        return not bool(unheard.any()) and gap <= self._largest_gap
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of a row that components live in."""
+        return 1 if self.conditioning is None else self.conditioning.num_frames
+
+    @property
+    def can_prepare(self) -> bool:
+        """Whether rows can go through the conditioning once, before training."""
+        return self.conditioning is not None and isinstance(
+            self._embedding, nn.Identity
+        )
+
+    @property
+    def baseline_kind(self) -> BaselineKind:
+        """The Gaussian posterior that the network corrects."""
+        return "none" if self.conditioning is None else self.conditioning.baseline_kind
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
+        """Return -log q, shape (n,), for rows (n, theta_dim) and (n, condition_dim)."""
+        return -self._log_density(input, condition)
+
+    def log_prob(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
+        """Return log q(input | condition).
+
+        Args:
+            input: Shape (sample_dim, batch_dim, theta_dim) or (batch_dim, theta_dim).
+            condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
+            kwargs: Not used.
+
+        Returns:
+            Shape (sample_dim, batch_dim).
+        """
+        self._check_condition_shape(condition)
+        self._check_input_shape(input)
+        if input.ndim == 2:
+            input = input[None]
+        if condition.ndim == 3:
+            pairs = (input.expand(*condition.shape[:2], -1).flatten(0, 1), condition)
+            flat = self._log_density(pairs[0], condition.flatten(0, 1))
+            return flat.reshape(condition.shape[:2])
+        return self._log_density(input, condition)
+
+    def sample(
+        self, sample_shape: torch.Size, condition: Tensor, **kwargs: object
+    ) -> Tensor:
+        """Return draws, shape (*sample_shape, batch_dim, theta_dim)."""
+        self._check_condition_shape(condition)
+        shape = torch.Size(sample_shape)
+        seen, frames = self._see(condition)
+        logits, mean, log_diagonal, upper = self._mixture(seen)
+        batch = len(condition)
+        component = torch.distributions.Categorical(logits=logits).sample(shape)
+        row = torch.arange(batch, device=logits.device).expand(component.shape)
+        factor = upper + torch.diag_embed(log_diagonal.exp())
+        noise = torch.randn(*component.shape, self._dim, 1, device=logits.device)
+        step = torch.linalg.solve_triangular(
+            factor[row, component], noise.to(logits.dtype), upper=True
+        ).squeeze(-1)
+        v = mean[row, component] + step
+        if self.conditioning is None or frames is None:
+            return v * self.theta_scale + self.theta_mean
+        frame = torch.tensor(self._frame_of, device=logits.device)[component]
+        factor = frames.factor[row, frame]
+        step = torch.linalg.solve_triangular(factor, v.double()[..., None], upper=True)
+        u = frames.mean[row, frame] + step.squeeze(-1)
+        return self.conditioning.unwhiten(u).to(logits.dtype)
+
+    def prepare(self, theta: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """Return rows for :class:`PreparedLoss`: all that no weight changes."""
+        with torch.no_grad():
+            seen, frames = self._see(condition)
+            assert frames is not None
+            v, log_det = self._local(theta, frames)
+        return torch.cat([v.flatten(1), log_det], 1), seen
+
+    def _log_density(self, theta: Tensor, condition: Tensor) -> Tensor:
+        seen, frames = self._see(condition)
+        if frames is not None:
+            v, log_det = self._local(theta, frames)
+            return self._log_local_density(v, log_det, seen)
+        u = ((theta - self.theta_mean) / self.theta_scale)[..., None, :]
+        constant = self._log_normal_constant + self.theta_scale.log().sum()
+        return self._log_mixture(u, seen, 0.0) - constant
+
+    def _local(self, theta: Tensor, frames: Frames) -> tuple[Tensor, Tensor]:
+        """Return v (..., n, J, d) and log |dv / dtheta| (n, J)."""
+        assert self.conditioning is not None
+        v = local(self.conditioning.whiten(theta), frames)
+        log_det = frames.log_det + self.conditioning.log_det
+        dtype = self.strict_upper.dtype
+        return v.to(dtype), log_det.to(dtype)
+
+    def _log_local_density(self, v: Tensor, log_det: Tensor, seen: Tensor) -> Tensor:
+        v, log_det = v[..., self._frame_of, :], log_det[:, self._frame_of]
+        return self._log_mixture(v, seen, log_det) - self._log_normal_constant
+
+    @property
+    def _log_normal_constant(self) -> float:
+        return 0.5 * self._dim * math.log(2 * math.pi)
+
+    def _log_mixture(self, v: Tensor, seen: Tensor, log_det: Tensor | float) -> Tensor:
+        """Return the log density of v, shape (..., n, K or 1, d), up to a constant."""
+        logits, mean, log_diagonal, upper = self._mixture(seen)
+        error = v - mean
+        # For few dimensions a product and a sum are faster than batched matrices.
+        z = log_diagonal.exp() * error + (upper * error[..., None, :]).sum(-1)
+        component = log_diagonal.sum(-1) - 0.5 * z.square().sum(-1)
+        return (logits + component + log_det).logsumexp(-1) - logits.logsumexp(-1)
+
+    def _see(self, condition: Tensor) -> tuple[Tensor, Frames | None]:
+        """Return what the layers see of a condition, and the frames of its row."""
+        if self.conditioning is None:
+            z, frames = (condition - self.condition_mean) / self.condition_scale, None
+        else:
+            z, frames = self.conditioning(condition)
+            z = z.to(self.strict_upper.dtype)
+        if not self._masked_columns:
+            return self._embedding(z), frames
+        mask = (~condition[:, self._masked_columns].isfinite()).to(z.dtype)
+        z = self._embedding(z.nan_to_num(0.0, 0.0, 0.0))
+        return torch.cat([z, mask], -1), frames
+
+    def _mixture(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the mixture's parameters.
+
+        Logits (n, K), means and log-diagonals (n, K, d), and the factors above their
+        diagonals (n, K, d, d).
+        """
+        logits, mean, log_diagonal, upper = self.net(seen).split(self._sections, -1)
+        shape = (len(seen), self._num_components, self._dim)
+        return (
+            logits,
+            mean.reshape(shape),
+            log_diagonal.reshape(shape).clamp(*LOG_PRECISION_RANGE),
+            upper.reshape(*shape, self._dim) * self.strict_upper,
+        )
+
+
+class PreparedLoss(nn.Module):
+    """The loss of a network on rows that went through its conditioning once.
+
+    Training visits a row several times, and only the layers change between visits.
+
+    Args:
+        network: With a conditioning and without an embedding net.
+    """
+
+    def __init__(self, network: MixtureDensityNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
+        """Return -log q, shape (n,), for rows of ``network.prepare``."""
+        frames = self.network.num_frames
+        v, log_det = input[:, :-frames], input[:, -frames:]
+        v = v.reshape(len(v), frames, -1)
+        return -self.network._log_local_density(v, log_det, condition)
+
+
+def _conditioning(
+    settings: MixtureDensity, theta: Tensor, condition: Tensor, action_dim: int | None
+) -> Conditioning | None:
+    embeds = settings.embedding_net is not None
+    scaling = "global" if embeds else settings.scaling
+    baseline = "none" if embeds else settings.baseline
+    plain = (scaling, settings.whiten, baseline) == ("global", False, "none")
+    if action_dim is None or plain:
+        return None
+    return Conditioning(
+        theta,
+        condition,
+        action_dim,
+        scaling=scaling,
+        whiten=settings.whiten,
+        baseline=baseline,
+    )
+
+
+def _frame_of_components(num_components: int, num_frames: int) -> list[int]:
+    """The local frames take turns; the last component has the global frame."""
+    num_local = max(num_frames - 1, 1)
+    frames = [k % num_local for k in range(num_components)]
+    if num_components > 1:
+        frames[-1] = num_frames - 1
+    return frames
+
+
+def _location_and_scale(rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of the valid numbers of each column."""
+    count = valid.sum(0).clamp_min(1)
+    values = torch.where(valid, rows, 0.0).double()
+    mean = values.sum(0) / count
+    variance = (torch.where(valid, values - mean, 0.0) ** 2).sum(0) / count
+    scale = variance.sqrt()
+    # A constant column carries nothing: dividing by one keeps it at zero.
+    scale = torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
+    return mean.float(), scale.float()

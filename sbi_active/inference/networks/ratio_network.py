@@ -1,0 +1,166 @@
+"""Log ratio of likelihood to marginal: a regression's, corrected by a network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from sbi.neural_nets.ratio_estimators import RatioEstimator
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.action_scaling import ActionScaling
+from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
+from sbi_active.inference.networks.response import Response
+
+__all__ = ["RatioClassifier", "RatioNetwork"]
+
+MAX_OUTCOMES = 32  # numbers in x beyond which no regression is tried
+MIN_ROWS = 40
+FAR = 4.0  # noise deviations, beyond which a residual is squashed
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatioClassifier:
+    """Settings of the classifier that gives the log ratio, and of its training.
+
+    Attributes:
+        hidden_features: Width of each hidden layer.
+        baseline: Whether the classifier corrects the ratio of a regression of x on
+            parameters and action, or starts from nothing.
+        batch_size: Rows a step.
+        learning_rate: Of Adam.
+        num_iterations: Steps of stochastic gradient descent, at most.
+        stop_after_epochs: Without improvement on held-out rows.
+    """
+
+    hidden_features: tuple[int, ...] = (64, 64)
+    baseline: bool = True
+    batch_size: int = 200
+    learning_rate: float = 2e-3
+    num_iterations: int = 400
+    stop_after_epochs: int = 20
+
+    def __post_init__(self) -> None:
+        values = {"hidden_features": min(self.hidden_features, default=1)}
+        for name in ("batch_size", "num_iterations", "stop_after_epochs"):
+            values[name] = getattr(self, name)
+        for name, value in values.items():
+            if value < 1:
+                raise ValueError(f"expected {name} >= 1; got {value}; do raise it")
+        if not self.learning_rate > 0:
+            raise ValueError(
+                f"expected learning_rate > 0; got {self.learning_rate}; do use 1e-3"
+            )
+
+
+class RatioNetwork(RatioEstimator):
+    r"""Log ratio of a Gaussian regression, and what a network adds to it.
+
+    .. math::
+        \log r(\theta; x, \xi) = \log \mathcal N(x; f(\xi, \theta), S(\xi))
+        - \log \mathcal N(x; \mu(\xi), \sigma^2(\xi)) + g(\theta, x, \xi),
+
+    with f and S of a :class:`.Response`, and the second
+    density the outcome standardized given the action. A classifier alone learns ratios
+    of a few nats; here it starts where the regression is. An outcome without a
+    measurement has the ratio g.
+
+    Args:
+        settings: Layers of g.
+        theta: Training parameters, shape (n, theta_dim).
+        condition: Packed (x, action), shape (n, x_dim + action_dim); NaN throughout x
+            where there was no measurement.
+        action_dim: Numbers in an action.
+    """
+
+    theta_mean: Tensor
+    theta_factor: Tensor
+    y_mean: Tensor
+    y_scale: Tensor
+    action_mean: Tensor
+    action_scale: Tensor
+
+    def __init__(
+        self,
+        settings: RatioClassifier,
+        theta: Tensor,
+        condition: Tensor,
+        action_dim: int,
+    ) -> None:
+        x_dim, dim = condition.shape[1] - action_dim, theta.shape[1]
+        x, action = condition.double().split([x_dim, action_dim], 1)
+        valid = x.isfinite().all(1)
+        with_baseline = (
+            settings.baseline and int(valid.sum()) >= MIN_ROWS and x_dim <= MAX_OUTCOMES
+        )
+        width = dim + action_dim + x_dim * (2 if with_baseline else 1) + 1
+        layers: list[nn.Module] = []
+        for hidden in settings.hidden_features:
+            layers += [nn.Linear(width, hidden), nn.ReLU()]
+            width = hidden
+        last = nn.Linear(width, 1)
+        super().__init__(
+            nn.Sequential(*layers, last), theta.shape[1:], condition.shape[1:]
+        )
+        with torch.no_grad():  # start at the regression's ratio
+            last.weight.mul_(0.1)
+            last.bias.zero_()
+        self._x_dim = x_dim
+        theta = theta.double()
+        self.register_buffer("theta_mean", theta.mean(0))
+        self.register_buffer("theta_factor", covariance_factor(theta, True))
+        self.register_buffer("action_mean", action.mean(0))
+        self.register_buffer("action_scale", scale_of(action))
+        known = x[valid]
+        enough = len(known) > 1
+        self.register_buffer("y_mean", known.mean(0) if enough else torch.zeros(x_dim))
+        self.register_buffer(
+            "y_scale", scale_of(known) if enough else torch.ones(x_dim)
+        )
+        self.response: Response | None = None
+        self.x_scaling: ActionScaling | None = None
+        if with_baseline:
+            y = (known - self.y_mean) / self.y_scale
+            self.response = Response.best(self._whiten(theta[valid]), y, action[valid])
+            self.x_scaling = ActionScaling(y, action[valid])
+
+    def unnormalized_log_ratio(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return log ratios.
+
+        Args:
+            theta: Shape (..., theta_dim).
+            x: Packed (x, action), shape (..., x_dim + action_dim).
+
+        Returns:
+            Shape (...), float32.
+        """
+        shape = self._get_shape_prefix(theta, x)
+        rows = theta.reshape(-1, theta.shape[-1]), x.reshape(-1, x.shape[-1])
+        return self._log_ratio(*rows).reshape(shape)
+
+    def _log_ratio(self, theta: Tensor, condition: Tensor) -> Tensor:
+        x, action = condition.double().tensor_split([self._x_dim], 1)
+        valid = x.isfinite().all(1)
+        y = (torch.where(valid[:, None], x, self.y_mean) - self.y_mean) / self.y_scale
+        u = self._whiten(theta.double())
+        seen = [u, (action - self.action_mean) / self.action_scale]
+        base = torch.zeros(len(theta), dtype=torch.float64)
+        if self.response is None or self.x_scaling is None:
+            seen.append(y)
+        else:
+            location, scale = self.x_scaling.location_and_scale(action)
+            wide = (y - location) / scale
+            sharp, log_det = self.response.standardize(u, y, action)
+            base = log_det + scale.log().sum(1)
+            base = base + 0.5 * (wide.square().sum(1) - sharp.square().sum(1))
+            seen += [wide, FAR * torch.tanh(sharp / FAR)]
+        inside = torch.cat(seen[2:], 1) * valid[:, None]
+        parts = torch.cat([*seen[:2], inside, valid[:, None].double()], 1)
+        correction = self.net(parts.float())[:, 0]
+        return torch.where(valid, base, 0.0).float() + correction
+
+    def _whiten(self, theta: Tensor) -> Tensor:
+        step = (theta - self.theta_mean)[..., None]
+        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
+            ..., 0
+        ]

@@ -1,0 +1,227 @@
+"""Regression of the outcome on action and parameters, with a noise of the action's."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from sbi_active.inference.networks.action_scaling import (
+    SMALLEST_SCALE,
+    Polynomials,
+    best_prefix,
+    exponents_of,
+    fit_location_and_scale,
+    held_out,
+)
+
+__all__ = ["STRAIGHT", "Response", "exceeds_chance"]
+
+MAX_FEATURES = 260  # of (action, parameters)
+MAX_ACTION_DEGREE = 14
+MAX_DEGREE = 9  # of the parameters
+MAX_NOISE_DEGREE = 8
+JOINT_COST = 1.5  # degrees that a product of two parameters counts more
+STRAIGHT = 0.01  # fraction of the residual below which f is taken to be linear
+
+
+class Response(nn.Module):
+    r"""Polynomial regression of the outcome on the action and whitened parameters u.
+
+    .. math::
+        x = f(\xi, u) + e, \qquad f = \sum_{kj} \beta_{kj}\, \phi_k(\xi)\, \psi_j(u),
+        \qquad e \sim \mathcal N(0, S(\xi)), \quad S = \Sigma R\, \Sigma,
+
+    with :math:`\Sigma(\xi)` diagonal, its logarithm a polynomial, and correlations R.
+    "linear" has :math:`\psi = (1, u)`, "curved" powers up to the ninth.
+
+    Args:
+        u: Whitened parameters, shape (n, d).
+        y: Finite outcomes, of scale one over all actions, shape (n, m).
+        action: Shape (n, action_dim).
+        kind: Whether f is linear in u.
+        log_scale: First guess of the logarithm of the noise's scale, shape (n, m); None
+            regresses it.
+    """
+
+    beta: Tensor
+    gamma: Tensor
+    whitener: Tensor
+    log_low: Tensor
+    log_high: Tensor
+
+    def __init__(
+        self,
+        u: Tensor,
+        y: Tensor,
+        action: Tensor,
+        *,
+        kind: Literal["linear", "curved"],
+        log_scale: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.kind = kind
+        test = held_out(len(u))
+        num_train, dim = int((~test).sum()), u.shape[1]
+        most = min(MAX_FEATURES, num_train // 8)
+        exponents, sizes = exponents_of(
+            action, max_degree=MAX_ACTION_DEGREE, max_terms=max(1, most // (1 + dim))
+        )
+        degree = MAX_DEGREE if kind == "curved" else 1
+        # A degree more than there is data for costs nothing: terms are cut off below.
+        inner, _ = exponents_of(u, max_degree=degree, max_terms=max(1 + dim, most))
+        self.action_basis = Polynomials(action, exponents)
+        self.parameter_basis = Polynomials(u, inner)
+        phi, psi = self.action_basis(action), self.parameter_basis(u)
+        degrees = min(len(sizes), MAX_NOISE_DEGREE + 1)
+        noise = phi[:, : sizes[degrees - 1]]
+
+        k, j, prefixes = _joint_terms(exponents, inner, most)
+        beta, gamma = fit_location_and_scale(
+            phi[:, k] * psi[:, j],
+            prefixes,
+            noise,
+            sizes[:degrees],
+            y,
+            test,
+            log_scale=log_scale,
+            num_iterations=3,
+        )
+        # Between rows that lie apart a polynomial may dive to any depth.
+        floor = SMALLEST_SCALE * y.std(0, correction=0).clamp_min(SMALLEST_SCALE)
+        log_sigma = torch.maximum(noise @ gamma, floor.log())
+        z = (y - (phi[:, k] * psi[:, j]) @ beta) / log_sigma.exp()
+        z = z.clamp(-5.0, 5.0)  # few wild rows must not set the correlations
+        correlation = torch.corrcoef(z.T).reshape(y.shape[1], -1).nan_to_num(0.0)
+        correlation.fill_diagonal_(1.0)
+        eye = torch.eye(y.shape[1], dtype=y.dtype)
+        root = torch.linalg.cholesky(0.999 * correlation + 0.001 * eye)
+        dense = y.new_zeros(len(exponents), len(inner), y.shape[1])
+        dense[k, j] = beta
+        used = dense.ne(0).any(-1).any(0)
+        used[: 1 + dim] = True
+        self.parameter_basis = Polynomials(u, inner[used])
+        self.register_buffer("beta", dense[:, used])
+        self.register_buffer("gamma", gamma)
+        self.register_buffer("log_low", log_sigma.min(0).values)
+        self.register_buffer("log_high", log_sigma.max(0).values)
+        self.register_buffer(
+            "whitener", torch.linalg.solve_triangular(root, eye, upper=False)
+        )
+
+    @staticmethod
+    def best(u: Tensor, y: Tensor, action: Tensor) -> Response:
+        """Return the linear or the curved regression, by held-out log score.
+
+        The curved one has many more coefficients to be wrong about, so what it gains
+        must be beyond chance.
+
+        Args:
+            u: As in the class.
+            y: As in the class.
+            action: As in the class.
+        """
+        linear = Response(u, y, action, kind="linear")
+        if linear.bend(u, y, action) <= STRAIGHT:
+            return linear
+        curved = Response(u, y, action, kind="curved")
+        test = held_out(len(u))
+        rows = u[test], y[test], action[test]
+        gain = curved.log_prob(*rows) - linear.log_prob(*rows)
+        return curved if exceeds_chance(gain) else linear
+
+    def weights(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Return what makes the noise of an action standard normal, and f's weights.
+
+        Args:
+            action: Shape (n, action_dim).
+
+        Returns:
+            A root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
+            :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).
+        """
+        phi = self.action_basis(action)
+        log_sigma = phi[:, : len(self.gamma)] @ self.gamma
+        log_sigma = torch.minimum(torch.maximum(log_sigma, self.log_low), self.log_high)
+        whitener = self.whitener / log_sigma.exp()[:, None, :]
+        return whitener, (phi @ self.beta.flatten(1)).unflatten(1, self.beta.shape[1:])
+
+    def mean_and_whitener(self, u: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return f, shape (n, m), and the noise's whitener, shape (n, m, m)."""
+        whitener, beta = self.weights(action)
+        return (self.parameter_basis(u)[:, None] @ beta)[:, 0], whitener
+
+    def standardize(
+        self, u: Tensor, y: Tensor, action: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return residuals in units of the noise and :math:`\log |dz / dy|`.
+
+        Args:
+            u: Shape (n, d).
+            y: Shape (n, m).
+            action: Shape (n, action_dim).
+
+        Returns:
+            Shapes (n, m) and (n,).
+        """
+        mean, whitener = self.mean_and_whitener(u, action)
+        z = (whitener @ (y - mean)[..., None])[..., 0]
+        return z, whitener.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+    def log_prob(self, u: Tensor, y: Tensor, action: Tensor) -> Tensor:
+        """Return the Gaussian log density of outcomes, shape (n,)."""
+        z, log_det = self.standardize(u, y, action)
+        constant = 0.5 * z.shape[1] * math.log(2 * math.pi)
+        return log_det - 0.5 * z.square().sum(1) - constant
+
+    def bend(self, u: Tensor, y: Tensor, action: Tensor) -> float:
+        """Return the fraction of the held-out residual that u's powers explain.
+
+        Args:
+            u: Shape (n, d), as in the fit.
+            y: Shape (n, m), as in the fit.
+            action: Shape (n, action_dim), as in the fit.
+        """
+        test = held_out(len(u))
+        phi = self.action_basis(action)
+        predicted = torch.einsum(
+            "nk,kjm,nj->nm", phi, self.beta, self.parameter_basis(u)
+        )
+        z = (y - predicted) / (phi[:, : len(self.gamma)] @ self.gamma).exp()
+        z = z.clamp(-5.0, 5.0)
+        few = phi[:, : max(4, 1 + action.shape[1])]
+        most = int((~test).sum()) // (10 * few.shape[1])
+        exponents, sizes = exponents_of(
+            u, max_degree=3, max_terms=max(1, min(40, most))
+        )
+        design = Polynomials(u, exponents)(u)[..., None] * few[:, None]
+        design = design.flatten(1)
+        sizes = [size * few.shape[1] for size in sizes]
+        left = z[test] - design[test] @ best_prefix(design, sizes, z, test)
+        return float((1 - left.square().mean(0) / z[test].square().mean(0)).max())
+
+
+def exceeds_chance(gain: Tensor) -> bool:
+    """Return whether a mean is above three of its standard errors, (n,) -> bool."""
+    return bool(gain.mean() > 3 * gain.std() / math.sqrt(len(gain)))
+
+
+def _joint_terms(
+    outer: Tensor, inner: Tensor, most: int
+) -> tuple[Tensor, Tensor, list[int]]:
+    """Return pairs of exponents from coarse to fine, and numbers to choose from.
+
+    Terms linear in u come with every polynomial of the action; for others, degrees of
+    action and parameters add up against one bound.
+    """
+    outer_degree, inner_degree = outer.sum(1), inner.sum(1)
+    ratio = MAX_DEGREE / max(int(outer_degree.max()), 1)
+    joint = (inner.ne(0).sum(1) - 1).clamp_min(0) * JOINT_COST
+    cost = outer_degree[:, None] * ratio + (inner_degree + joint)[None]
+    order = cost.flatten().argsort(stable=True)[:most]
+    costs = cost.flatten()[order]
+    levels = torch.linspace(1.0, float(costs[-1]), 9).tolist()
+    prefixes = sorted({int((costs <= level).sum()) for level in levels})
+    return order // len(inner), order % len(inner), prefixes

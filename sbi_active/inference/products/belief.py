@@ -1,0 +1,80 @@
+"""The belief under a learned likelihood: the prior times a product over trials."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.products.product import NUM_COMPONENTS, Product
+from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.regression.regions import PriorProposal
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.population import (
+    GaussianMixture,
+    Proposal,
+    StudentProposal,
+    population_monte_carlo,
+)
+
+__all__ = ["ProductBelief", "sample_product"]
+
+
+class ProductBelief(RefinedBelief):
+    r"""The posterior of all trials under a learned likelihood or ratio.
+
+    .. math::
+        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k q(x_k | \theta, \xi_k)
+        + \epsilon\, p(\theta)
+    """
+
+    label = "product over trials"
+
+
+def sample_product(
+    prior: Distribution,
+    product: Product,
+    hint: Tensor | None,
+    rng: np.random.Generator,
+    *,
+    num_particles: int,
+    defensive: float,
+) -> ProductBelief:
+    """Return the belief of a product, by annealed importance sampling.
+
+    Args:
+        prior: The original prior.
+        product: The learned likelihood of all trials.
+        hint: Draws around the posterior, shape (n, theta_dim), such as those of the
+            belief before; None begins at the prior.
+        rng: Source of randomness.
+        num_particles: Of the importance sample.
+        defensive: Share of the prior in the belief.
+    """
+    coordinates: PriorCoordinates = product.coordinates
+    base: Proposal = PriorProposal(coordinates)
+    if hint is not None:
+        mixture = GaussianMixture.fit(coordinates.to_z(hint), NUM_COMPONENTS, rng)
+        base = StudentProposal(mixture, base)
+    particles, num_steps = population_monte_carlo(
+        product.log_joint, base, rng, num_particles=num_particles
+    )
+    belief = ProductBelief(prior, product, particles, defensive=defensive)
+    effective = particles.effective_sample_size
+    belief.diagnostics = {
+        "likelihood": "learned",
+        "effective_sample_size": effective,
+        "log_normalizer": particles.log_normalizer,
+        "num_steps": num_steps,
+        "warnings": [],
+    }
+    if effective < ENOUGH:
+        belief.diagnostics["warnings"].append(
+            f"the belief rests on {effective:.0f} effective draws; do raise "
+            "num_particles"
+        )
+    return belief
+
+
+#: Effective draws below which the normalizer is off by more than a tenth of a nat.
+ENOUGH = 100.0

@@ -1,0 +1,158 @@
+"""Prior times a product over trials of something learned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.rounds.rows import Observation
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.population import GaussianMixture
+from sbi_active.threads import single_thread
+
+__all__ = ["Product", "TrainedRegion", "TrialModel", "widened"]
+
+Array = NDArray[Any]
+
+NUM_COMPONENTS = 6
+NUM_FITTED = 2_000  # rows that a region is fitted to
+LOST = 2e-3  # share of the rows that may lie outside
+MARGIN = 3.0  # nats below the density of the last row inside
+SPREAD = 2.0  # deviations of rows to learn from, in those of a component
+BATCH_SIZE = 20_000
+
+
+class TrialModel(Protocol):
+    """What is learned of one trial's likelihood."""
+
+    def log_factor(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        """Return log p(x_i | theta_i, action_i), (n,), but for a term without theta."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainedRegion:
+    """Where a network was trained: what it says elsewhere is made up.
+
+    Attributes:
+        mixture: Fitted to the rows.
+        floor: Log density of the mixture at the edge.
+    """
+
+    mixture: GaussianMixture
+    floor: float
+
+    @staticmethod
+    def of(z: Array, rng: np.random.Generator) -> TrainedRegion:
+        """Return the region of rows, coordinates of shape (n, d)."""
+        some = rng.permutation(z)[:NUM_FITTED]
+        mixture = GaussianMixture.fit(some, NUM_COMPONENTS, rng)
+        floor = np.quantile(mixture.log_prob(z), LOST) - MARGIN
+        return TrainedRegion(mixture, float(floor))
+
+    def contains(self, z: Array) -> NDArray[np.bool_]:
+        """Return whether coordinates lie inside, (n, d) -> (n,)."""
+        return self.mixture.log_prob(z) >= self.floor
+
+
+def widened(
+    z: Array, num_samples: int, coordinates: PriorCoordinates, rng: np.random.Generator
+) -> Array:
+    """Return draws spread up to twice as wide as a belief, within the support.
+
+    A belief may be off by as much as it is wide; a likelihood can be learned from
+    parameters of any distribution. Each component of a Gaussian mixture is doubled, so
+    that modes stay apart.
+
+    Args:
+        z: Draws of the belief, coordinates of shape (n, d).
+        num_samples: How many to return.
+        coordinates: Of the prior.
+        rng: Source of randomness.
+    """
+    mixture = GaussianMixture.fit(z[:NUM_FITTED], NUM_COMPONENTS, rng)
+    factor = mixture.factor[mixture.assign(z)]
+    kept, missing = [], num_samples
+    while missing > 0:
+        i = rng.integers(len(z), size=2 * num_samples)
+        normal = rng.standard_normal((len(i), z.shape[1]))
+        step = np.sqrt(SPREAD**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
+        drawn = z[i] + step
+        kept.append(drawn[coordinates.inside(drawn)][:missing])
+        missing -= len(kept[-1])
+    return np.concatenate(kept)
+
+
+class Product:
+    r"""The learned likelihood of all trials, where it was learned.
+
+    .. math::
+        \hat L(\theta) = 1[\theta \in R] \prod_k q(x_k | \theta, \xi_k)
+
+    with R the region of the training rows, which were drawn from a belief that holds
+    the posterior. The factors are exact products; only q is learned.
+
+    Args:
+        coordinates: Of the prior.
+        model: q, up to factors without theta.
+        trials: The history.
+        region: R; None is the whole support.
+        previous: Takes the prior's place, where beliefs are chained.
+    """
+
+    def __init__(
+        self,
+        coordinates: PriorCoordinates,
+        model: TrialModel,
+        trials: Sequence[Observation],
+        region: TrainedRegion | None = None,
+        previous: Distribution | None = None,
+    ) -> None:
+        self.coordinates, self.model, self.region = coordinates, model, region
+        self._previous = previous
+        self.trials = [*trials]
+
+    def log_factors(self, theta: Tensor) -> Tensor:
+        r"""Return :math:`\sum_k \log q(x_k | \theta, \xi_k)`, (n, d) -> (n,), float64.
+
+        Gradients flow to theta.
+        """
+        total = torch.zeros(len(theta), dtype=torch.float64)
+        for trial in self.trials:
+            rows = trial.x.expand(len(theta), *trial.x.shape)
+            action = trial.action.expand(len(theta), -1)
+            total = total + self.model.log_factor(theta, rows, action).double()
+        return total
+
+    def log_likelihood(self, z: Array) -> Array:
+        """Return the log likelihood, (n, d) -> (n,)."""
+        total = np.full(len(z), -np.inf)
+        inside = np.ones(len(z), dtype=bool)
+        if self.region is not None:
+            inside = self.region.contains(z)
+        theta = self.coordinates.to_theta(z[inside])
+        with torch.no_grad(), single_thread():
+            parts = [self._evaluate(part) for part in theta.split(BATCH_SIZE)]
+        total[inside] = torch.cat(parts).numpy()
+        return total
+
+    def _evaluate(self, theta: Tensor) -> Tensor:
+        total = self.log_factors(theta)
+        if self._previous is not None:
+            ratio = self._previous.log_prob(theta)
+            total = total + (ratio - self.coordinates.prior.log_prob(theta)).double()
+        return total
+
+    def log_joint(self, z: Array) -> Array:
+        """Return the log of prior times likelihood, -inf outside the support."""
+        joint = self.coordinates.log_prior(z)
+        inside = np.isfinite(joint)
+        joint[inside] += self.log_likelihood(z[inside])
+        return joint

@@ -1,0 +1,370 @@
+"""Simulated histories: every executed action at each of many parameter sets."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.inference.regression.outcomes import outcomes_of
+from sbi_active.inference.regression.regions import Region
+from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation.model import require_noise
+from sbi_active.simulation.outcomes import (
+    MissingRowsWarning,
+    Outcome,
+    SimulationError,
+)
+from sbi_active.simulation.workers.engine import simulate
+
+__all__ = ["Histories", "HistoryRecord"]
+
+Array = NDArray[Any]
+
+MIN_PAIRS = 20  # replicates a noise estimate rests on
+LOST = np.inf  # marks the rows of a history that a fault hit
+MAX_ATTEMPTS = 16  # more at a measurement
+ENOUGH = 0.5  # share of complete histories that needs no more attempts
+NUM_PROBES = 50  # rows to see whether another attempt is of use
+WORTHWHILE = 0.05  # share of attempts that must be
+
+
+@dataclass(frozen=True)
+class HistoryRecord:
+    """Simulated histories to go on from when a further trial is known.
+
+    Attributes:
+        action: The executed actions, shape (t, action_dim).
+        theta: Parameters, shape (n, d), float32.
+        x: Outcomes, shape (n, t, q); NaN where there was no measurement.
+        present: Which of them were there at the first attempt, shape (n, t, q).
+        again: Outcomes of a second simulation, NaN where there was none, (n, t, q).
+        present_again: Which of those were there at the first attempt, (n, t, q).
+        has_again: Which rows were simulated twice, shape (n,).
+        is_overview: Which rows were drawn from the whole prior, shape (n,).
+    """
+
+    action: Tensor
+    theta: Tensor
+    x: Array
+    present: NDArray[np.bool_]
+    again: Array
+    present_again: NDArray[np.bool_]
+    has_again: NDArray[np.bool_]
+    is_overview: NDArray[np.bool_]
+
+    def precedes(self, action: Tensor) -> bool:
+        """Whether these are the first trials of ``action``, shape (t', action_dim)."""
+        return torch.equal(self.action, action[: len(self.action)])
+
+
+class Histories:
+    """A growing pool of histories, some of them simulated twice.
+
+    Args:
+        simulator: ``simulator(theta, action)``.
+        action: Executed actions, shape (t, action_dim).
+        x: What was observed, shape (t, q); NaN where it was not.
+        coordinates: Of the prior.
+        seed: Of the simulations.
+        past: Histories of the first of these trials; those that are still of use are
+            simulated at the further actions only.
+        engine: Options of :func:`.simulate`, such as its workers.
+
+    Attributes:
+        z: Coordinates of the parameters, shape (n, d).
+        x: Outcomes less the observed ones, or themselves where nothing was observed,
+            shape (n, t * q).
+        present: Which outcomes were there at the first attempt, shape (n, t * q).
+        observed: What was observed, zero where nothing was, shape (t * q,).
+        used: Which numbers were observed, shape (t * q,).
+        num_drawn: Histories simulated here or taken over, those lost to faults of the
+            simulator included.
+        num_missing: Rows lost to faults of the simulator; each loses its history.
+        num_simulations: Rows simulated here.
+    """
+
+    def __init__(
+        self,
+        simulator: Callable[..., Any],
+        action: Tensor,
+        x: Array,
+        coordinates: PriorCoordinates,
+        seed: int,
+        past: HistoryRecord | None = None,
+        engine: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.simulator, self.action = simulator, action
+        self.engine = {} if engine is None else engine
+        self._seen = np.isfinite(x)
+        self.used = self._seen.reshape(-1)
+        self.observed = np.where(self._seen, x, 0.0).reshape(-1)
+        self.coordinates, self.seed = coordinates, seed
+        self.z = np.zeros((0, coordinates.dim))
+        self.x = np.zeros((0, x.size))
+        self.present = np.zeros((0, x.size), dtype=bool)
+        self.first: list[int] = []
+        self.second: list[int] = []
+        self.num_simulations = self.num_drawn = self.num_missing = 0
+        self._theta = torch.zeros(0, coordinates.dim)
+        self._is_overview = np.zeros(0, dtype=bool)
+        usable = past is not None and past.precedes(action)
+        self._past = past if usable else None
+        self._unused = np.ones(0 if past is None else len(past.theta), dtype=bool)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def add(self, z: Array, num_replicates: int, *, is_overview: bool = False) -> None:
+        """Simulate at z, shape (n, d), and again at the first few of them.
+
+        Args:
+            z: Coordinates of the parameters.
+            num_replicates: How many of them to simulate twice.
+            is_overview: Whether z is drawn from the whole prior.
+        """
+        theta = self.coordinates.to_theta(np.concatenate([z, z[:num_replicates]]))
+        x, present = self._simulate(theta, 0)
+        if self.num_drawn == 0:
+            again = torch.from_numpy(x[len(z) :])
+            require_noise(torch.from_numpy(x[:num_replicates]), again)
+        twice = np.arange(num_replicates)
+        self._append(theta, x, present, twice, is_overview=is_overview)
+
+    def reuse(self, region: Region, count: int, *, is_overview: bool = False) -> int:
+        """Take past histories in a region, simulated at the further actions only.
+
+        Args:
+            region: Where they must lie.
+            count: How many parameter sets at most.
+            is_overview: Take those drawn from the whole prior instead, so that a first
+                stage keeps its distribution.
+
+        Returns:
+            How many rows were added, replicates included.
+        """
+        past = self._past
+        if past is None or count <= 0:
+            return 0
+        if is_overview:
+            eligible = past.is_overview
+        else:
+            eligible = region.distance(self.coordinates.to_z(past.theta)) <= 1
+        rows = np.flatnonzero(eligible & self._unused)[:count]
+        if len(rows) == 0:
+            return 0
+        self._unused[rows] = False
+        twice = np.flatnonzero(past.has_again[rows])
+        theta = torch.cat([past.theta[rows], past.theta[rows[twice]]])
+        x = np.concatenate([past.x[rows], past.again[rows[twice]]]).reshape(
+            len(theta), -1
+        )
+        present = np.concatenate([past.present[rows], past.present_again[rows[twice]]])
+        present = present.reshape(len(theta), -1)
+        if len(past.action) < len(self.action):
+            further = self._simulate(theta, len(past.action))
+            x = np.concatenate([x, further[0]], 1)
+            present = np.concatenate([present, further[1]], 1)
+        self._append(theta, x, present, twice, is_overview=is_overview)
+        return len(theta)
+
+    def record(self) -> HistoryRecord:
+        """Return the histories for a later call with further trials."""
+        t = len(self.action)
+        x = (self.x + self.observed).reshape(len(self), t, -1)
+        is_second = np.zeros(len(self), dtype=bool)
+        is_second[self.second] = True
+        again, has_again = np.full_like(x, np.nan), np.zeros(len(self), dtype=bool)
+        again[self.first], has_again[self.first] = x[self.second], True
+        present = self.present.reshape(x.shape)
+        present_again = np.zeros_like(present)
+        present_again[self.first] = present[self.second]
+        keep = ~is_second
+        return HistoryRecord(
+            action=self.action,
+            theta=self._theta[torch.from_numpy(keep)],
+            x=x[keep],
+            present=present[keep],
+            again=again[keep],
+            present_again=present_again[keep],
+            has_again=has_again[keep],
+            is_overview=self._is_overview[keep],
+        )
+
+    def _simulate(self, theta: Tensor, first: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Return outcomes at each theta of the trials from ``first`` on.
+
+        Returns:
+            Outcomes, and which of them were there at the first attempt, both of shape
+            (n, t * q).
+        """
+        n, t = len(theta), len(self.action) - first
+        seed = derive_seed(self.seed, "histories", self.num_simulations)
+        trial = torch.arange(first, len(self.action)).repeat(n)
+        x = self._rows(theta.repeat_interleave(t, 0), trial, seed)
+        present = np.isfinite(x)
+        place = torch.arange(n).repeat_interleave(t)
+        for attempt in range(MAX_ATTEMPTS):
+            # Where chance decides who gives a measurement, histories of many trials
+            # would seldom be complete; given one, x has the same law at any attempt.
+            lacks = (self._seen[trial] & np.isnan(x)).any(1)
+            incomplete = np.flatnonzero(lacks)
+            complete = ~lacks.reshape(n, t).any(1)
+            if complete.mean() >= ENOUGH or len(incomplete) == 0:
+                break
+            if attempt == 0:  # a few show whether it is chance at all
+                incomplete = incomplete[:: max(len(incomplete) // NUM_PROBES, 1)]
+            again = self._rows(
+                theta[place[incomplete]], trial[incomplete], derive_seed(seed, attempt)
+            )
+            filled = ~(self._seen[trial[incomplete]] & np.isnan(again)).any(1)
+            filled &= ~np.isinf(again).any(1)  # not lost
+            x[incomplete[filled]] = again[filled]
+            if filled.mean() < WORTHWHILE:
+                break
+        x, present = x.reshape(n, -1), present.reshape(n, -1)
+        x[np.isinf(x).any(1)] = LOST
+        return x, present
+
+    def _rows(self, theta: Tensor, trial: Tensor, seed: int) -> Array:
+        """Return one outcome a row, shape (n, q); NaN for no number, LOST for faults.
+
+        Args:
+            theta: Shape (n, d).
+            trial: Whose action to simulate, shape (n,).
+            seed: Of these rows.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+            try:
+                rows = simulate(
+                    self.simulator, theta, self.action[trial], seed=seed, **self.engine
+                )
+            except SimulationError:  # of a few rows, all may be lost
+                if self.num_simulations == 0:
+                    raise
+                self.num_simulations += len(theta)
+                self.num_missing += len(theta)
+                return np.full((len(theta), self._seen.shape[1]), LOST)
+        self.num_simulations += len(rows)
+        x = rows.x.double().flatten(1).numpy()
+        if x.shape[1] != self._seen.shape[1]:
+            raise ValueError(
+                f"expected simulated x of shape {tuple(rows.x.shape[1:])} a row, as "
+                f"observed; got {self._seen.shape[1]} observed numbers a trial; do "
+                "pass x (t, *x_shape) of the simulator's shape"
+            )
+        x = np.where(np.isfinite(x), x, np.nan)
+        lost = (rows.status == Outcome.MISSING).numpy()
+        self.num_missing += int(lost.sum())
+        x[lost] = LOST
+        return x
+
+    def _append(
+        self,
+        theta: Tensor,
+        x: Array,
+        present: NDArray[np.bool_],
+        twice: NDArray[np.intp],
+        *,
+        is_overview: bool,
+    ) -> None:
+        """Append rows of which the last are replicates of ``twice``.
+
+        A history that a fault hit is left out, and its replicate with it.
+        """
+        num_places = len(theta) - len(twice)
+        self.num_drawn += len(theta)
+        lost = (x == LOST).any(1)
+        if lost.any():
+            lost[num_places:] |= lost[twice]
+            place = np.cumsum(~lost[:num_places]) - 1
+            twice = place[twice[~lost[num_places:]]]
+            theta = theta[torch.from_numpy(~lost)]
+            x, present = x[~lost], present[~lost]
+            num_places = len(theta) - len(twice)
+        start = len(self)
+        # What was simulated is the float32 parameter.
+        self.z = np.concatenate([self.z, self.coordinates.to_z(theta)])
+        self.x = np.concatenate([self.x, x - self.observed])
+        self.present = np.concatenate([self.present, present])
+        self._theta = torch.cat([self._theta, theta])
+        overview = np.full(len(theta), is_overview)
+        self._is_overview = np.concatenate([self._is_overview, overview])
+        self.first += (start + twice).tolist()
+        self.second += range(start + num_places, start + len(theta))
+
+    @property
+    def agrees(self) -> NDArray[np.bool_]:
+        """Whether each trial's outcome is of the kind observed, shape (n, t).
+
+        That is without a measurement, as observed, or with the numbers observed.
+        """
+        present = self.present.reshape(len(self), *self._seen.shape)
+        without = ~self._seen.any(1)
+        return np.where(without, ~present.any(2), (present | ~self._seen).all(2))
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Histories that have every number observed, shape (n,)."""
+        return np.asarray(np.isfinite(self.x[:, self.used]).all(1))
+
+    @property
+    def share_invalid(self) -> float:
+        """Share of outcomes without a measurement."""
+        present = self.present.reshape(len(self), *self._seen.shape)
+        return float((~present.any(2)).mean()) if len(self) else 0.0
+
+    def regress(self, region: Region) -> LocalRegression | None:
+        """Regress the histories in a region, or the nearest where it holds few."""
+        distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
+        needed = 2 * (self.coordinates.dim + 21)
+        rows = _nearest(np.where(valid, distance, np.inf), needed)
+        first, second = np.array(self.first, int), np.array(self.second, int)
+        both = valid[first] & valid[second]
+        if len(rows) < needed // 2 or both.sum() < 5:
+            return None
+        pairs = _nearest(np.where(both, distance[first], np.inf), MIN_PAIRS)
+        scale = np.abs(self.x[rows] + self.observed).max(0)[self.used]
+        noise = estimate_noise(
+            self.x[first[pairs]][:, self.used],
+            self.x[second[pairs]][:, self.used],
+            scale,
+        )
+        # Where all trials agree everywhere, or nowhere, there is nothing to compare.
+        mixed = np.flatnonzero(agrees.any(0) & ~agrees.all(0))
+        near = _nearest(distance, needed)
+        repeated = _nearest(distance[first], MIN_PAIRS)
+        return LocalRegression.fit(
+            region,
+            self.z[rows],
+            self.x[rows],
+            noise=noise,
+            num_trials=len(self.action),
+            outcomes=outcomes_of(
+                region,
+                self.z[near],
+                agrees[near],
+                agrees[first[repeated]],
+                agrees[second[repeated]],
+                mixed.tolist(),
+            ),
+            used=self.used,
+        )
+
+
+def _nearest(distance: Array, at_least: int) -> NDArray[np.intp]:
+    """Return the rows within a distance of 1, or the nearest few beyond."""
+    inside = np.flatnonzero(distance <= 1)
+    if len(inside) >= at_least:
+        return inside
+    order = np.argsort(distance, kind="stable")[:at_least]
+    return order[np.isfinite(distance[order])]

@@ -1,0 +1,197 @@
+r"""What a trial's outcome tells by being a measurement, or none.
+
+A trial that fell off the table has no number to regress, yet where in parameter space
+trials fall off is information. The likelihood of a trial is that of what happened,
+
+.. math::
+    p(x_k | \theta) = \begin{cases}
+    P(\text{invalid} | \theta) & \text{without a measurement}, \\
+    P(F_k | \theta)\, p(x_{F_k} | \theta, F_k) & \text{with the numbers } F_k,
+    \end{cases}
+
+where :math:`F_k` stands for "these numbers, and perhaps others, are present". What the
+absence of others tells beyond that is left out: the posterior is of a part of the
+data, so it can be wider than it could be but is not biased.
+
+The probabilities are logistic regressions in a region's coordinates,
+
+.. math::
+    P(y = 1 | u) = \epsilon + (1 - 2 \epsilon)\, \sigma(\beta^\top f(u)), \qquad
+    \beta \sim \mathcal N(0, \tau^2 I),
+
+whose degree and :math:`\tau` have the largest evidence: a chance that varies smoothly
+gets a small :math:`\tau`, and a hard edge, :math:`y = 1\{g(u) > 0\}`, as steep a slope
+as the simulations on its two sides allow.
+
+References:
+    MacKay, Neural Computation 1992 (evidence of a classifier, by Laplace's method).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, log_expit
+
+from sbi_active.inference.regression.basis import Basis
+from sbi_active.inference.regression.regions import Region
+
+__all__ = ["TrialOutcome", "outcomes_of"]
+
+Array = NDArray[Any]
+
+DEVIATIONS = (1.0, 4.0, 16.0, 64.0)  # of coefficients a priori
+INTERCEPT_DEVIATION = 8.0  # at least: an event may be rare all over a region
+DEGREES = (0, 1, 2, 3)
+ROWS_A_FEATURE = 6  # at least
+NUM_STEPS = 40  # of Newton's method
+SURPRISE = 0.01  # probability below which an outcome is a slip
+
+
+@dataclass(frozen=True)
+class TrialOutcome:
+    r"""Probability in one region that a trial's outcome is what it was.
+
+    Attributes:
+        region: Where it holds.
+        trial: Index of the trial.
+        basis: f.
+        coefficient: Shape (p,).
+        slip: :math:`\epsilon`, which no regression falls below.
+        blur: Share of pairs at the same parameters that the regression expects to
+            differ, less the share that does and less chance: above zero it misses an
+            edge.
+    """
+
+    region: Region
+    trial: int
+    basis: Basis
+    coefficient: Array
+    slip: float
+    blur: float = 0.0
+
+    @staticmethod
+    def fit(
+        region: Region,
+        trial: int,
+        z: Array,
+        agrees: NDArray[np.bool_],
+        pairs: NDArray[np.bool_],
+    ) -> TrialOutcome:
+        """Fit the regression with the largest evidence.
+
+        Args:
+            region: Gives the coordinates.
+            trial: Index of the trial.
+            z: Of simulations, shape (n, d).
+            agrees: Whether their outcome is what was observed, shape (n,).
+            pairs: Of simulations at the same parameters, shape (r, 2).
+        """
+        u, n = region.scaled(z), len(z)
+        degrees = DEGREES if 0 < agrees.sum() < n else (0,)
+        best, evidence = (Basis.polynomial(0, u.shape[1]), np.zeros(1)), -np.inf
+        for degree in degrees:
+            basis = Basis.polynomial(degree, u.shape[1])
+            features = basis(u)
+            if degree > 1 and n < ROWS_A_FEATURE * features.shape[1]:
+                break
+            coefficient = np.zeros(features.shape[1])
+            for deviation in DEVIATIONS if degree > 0 else (INTERCEPT_DEVIATION,):
+                coefficient, value = _laplace(features, agrees, deviation, coefficient)
+                if value > evidence:
+                    best, evidence = (basis, coefficient), value
+        basis, coefficient = best
+        probability = expit(basis(u) @ coefficient)
+        actual = np.where(agrees, probability, 1 - probability)
+        if degrees == (0,):  # one kind only: the rule of succession
+            slip = 1 / (n + 2)
+            coefficient = np.full(1, 60.0 if agrees.all() else -60.0)
+        else:
+            slip = (1 + (actual < SURPRISE).sum()) / (n + 2)
+        expected = float((2 * probability * (1 - probability)).mean())
+        num = len(pairs) + 1.0
+        differ = ((pairs[:, 0] != pairs[:, 1]).sum() + 0.5) / num
+        chance = 3 * np.sqrt(differ * (1 - differ) / num)
+        blur = max(expected - float(differ) - float(chance), 0.0)
+        return TrialOutcome(region, trial, basis, coefficient, float(slip), blur)
+
+    def log_prob(self, z: Array) -> Array:
+        """Return the log probability, (n, d) -> (n,)."""
+        logit = self.basis(self.region.scaled(z)) @ self.coefficient
+        return np.logaddexp(
+            np.log(self.slip), np.log1p(-2 * self.slip) + log_expit(logit)
+        )
+
+
+def outcomes_of(
+    region: Region,
+    z: Array,
+    agrees: NDArray[np.bool_],
+    first: NDArray[np.bool_],
+    second: NDArray[np.bool_],
+    trials: Sequence[int],
+) -> tuple[TrialOutcome, ...]:
+    """Return the regressions of trials in a region.
+
+    Args:
+        region: Gives the coordinates.
+        z: Of simulations, shape (n, d).
+        agrees: Whether their outcomes are what was observed, shape (n, t).
+        first: The same of simulations that were repeated, shape (r, t).
+        second: Of their repetitions, shape (r, t).
+        trials: The trials to regress.
+    """
+    known: dict[bytes, TrialOutcome] = {}  # with hard edges, many trials agree
+    outcomes = []
+    for k in trials:
+        pairs = np.stack([first[:, k], second[:, k]], 1)
+        key = agrees[:, k].tobytes() + pairs.tobytes()
+        if key not in known:
+            known[key] = TrialOutcome.fit(region, k, z, agrees[:, k], pairs)
+        same = known[key]
+        outcomes.append(
+            TrialOutcome(region, k, same.basis, same.coefficient, same.slip, same.blur)
+        )
+    return tuple(outcomes)
+
+
+def _laplace(
+    features: Array, agrees: NDArray[np.bool_], deviation: float, start: Array
+) -> tuple[Array, float]:
+    r"""Return the most probable coefficients and the log evidence.
+
+    .. math::
+        \log E = \log p(y | \hat\beta) - \frac{|\hat\beta|^2}{2 \tau^2}
+        - p \log \tau - \tfrac12 \log |H|.
+    """
+    sign = np.where(agrees, 1.0, -1.0)
+    scale = np.full(features.shape[1], deviation)
+    scale[0] = max(deviation, INTERCEPT_DEVIATION)
+    prior = 1 / scale**2
+
+    def objective(beta: Array) -> float:
+        fit = log_expit(sign * (features @ beta)).sum()
+        return float(fit - 0.5 * (prior * beta**2).sum())
+
+    beta, value = start, objective(start)
+    for _ in range(NUM_STEPS):
+        probability = expit(features @ beta)
+        gradient = features.T @ (agrees - probability) - prior * beta
+        weight = probability * (1 - probability)
+        hessian = (features.T * weight) @ features + np.diag(prior)
+        step = np.linalg.solve(hessian, gradient)
+        gain, length = float(gradient @ step), 1.0
+        if gain < 1e-6:
+            break
+        while length > 1e-4:
+            new = objective(beta + length * step)
+            if new > value + 0.1 * length * gain:
+                break
+            length *= 0.5
+        beta, value = beta + length * step, new
+    log_det = np.linalg.slogdet(hessian)[1]
+    return beta, value - float(np.log(scale).sum()) - 0.5 * float(log_det)

@@ -1,0 +1,221 @@
+"""Regions of parameter space in which a simulator is simple enough to regress."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+from scipy.stats import chi, chi2
+
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.population import GaussianMixture, Particles
+
+__all__ = [
+    "PriorProposal",
+    "Region",
+    "RegionsProposal",
+    "cover",
+    "nearest_region",
+    "whole_space",
+]
+
+Array = NDArray[Any]
+
+#: Mass of a Gaussian posterior that its ellipsoid covers.
+COVERED = 0.9997
+#: Simulations spread wider than the posterior: its ellipsoid ends at 4 posterior
+#: deviations (in two dimensions) and at 2.2 deviations of the simulations.
+SPREAD = 2.2
+#: Nats a dimension that more clusters must save.
+WORTH = 0.1
+
+
+@dataclass(frozen=True)
+class Region:
+    r"""The ellipsoid :math:`\| L^{-1} (z - c) \| \le R`, or all of the space.
+
+    Attributes:
+        center: c, shape (d,).
+        factor: L, lower triangular, shape (d, d).
+        radius: R.
+        whole: Whether the region has no edge; c, L and R then only give a scale.
+    """
+
+    center: Array
+    factor: Array
+    radius: float
+    whole: bool = False
+
+    def scaled(self, z: Array) -> Array:
+        """Return coordinates of which the region is the unit ball, shape (n, d)."""
+        return np.linalg.solve(self.factor, (z - self.center).T).T / self.radius
+
+    def distance(self, z: Array) -> Array:
+        """Return 1 on the edge and less inside, shape (n,).
+
+        The whole space is within 1 of everything, so that any ellipsoid is nearer.
+        """
+        if self.whole:
+            return np.ones(len(z))
+        return np.sqrt((self.scaled(z) ** 2).sum(1))
+
+    @property
+    def log_volume(self) -> float:
+        """Log of the ellipsoid's volume."""
+        d = len(self.center)
+        unit_ball = 0.5 * d * np.log(np.pi) - gammaln(0.5 * d + 1)
+        scale = np.log(np.abs(np.diag(self.factor))).sum()
+        return float(unit_ball + d * np.log(self.radius) + scale)
+
+    def sample_uniform(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return uniform draws from the ellipsoid, shape (n, d)."""
+        d = len(self.center)
+        normal = rng.standard_normal((num_samples, d))
+        direction = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        length = self.radius * rng.random((num_samples, 1)) ** (1 / d)
+        return self.center + (length * direction) @ self.factor.T
+
+    def sample_inside(
+        self, num_samples: int, coordinates: PriorCoordinates, rng: np.random.Generator
+    ) -> Array:
+        """Return at most n places to simulate, in the region and the support.
+
+        They are dense in the middle, where the posterior is; uniform draws would lie
+        in the shell.
+        """
+        if self.whole:
+            return coordinates.sample_prior(num_samples, rng)
+        kept: list[Array] = []
+        missing = num_samples
+        for _ in range(20):  # a region may touch the support in a sliver only
+            z = self._rays(2 * missing + 20, rng)
+            kept.append(z[coordinates.inside(z)][:missing])
+            missing -= len(kept[-1])
+            if missing == 0:
+                break
+        if missing > 0:  # as where a box of many sides cuts each ray
+            z = coordinates.pulled_inside(self.center, self._rays(missing, rng), rng)
+            kept.append(z[coordinates.inside(z)])
+        return np.concatenate(kept)
+
+    def _rays(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return normal draws cut at the edge, shape (n, d): a direction and a length.
+
+        The length's distribution is inverted, since of twenty normal numbers hardly
+        any fall within the edge.
+        """
+        d = len(self.center)
+        normal = rng.standard_normal((num_samples, d))
+        direction = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        level = rng.random((num_samples, 1)) * chi.cdf(SPREAD, d)
+        length = self.radius / SPREAD * chi.ppf(level, d)
+        return self.center + (length * direction) @ self.factor.T
+
+
+def whole_space(dim: int) -> Region:
+    """Return the region without an edge."""
+    return Region(np.zeros(dim), np.eye(dim), 1.0, whole=True)
+
+
+def nearest_region(regions: list[Region], z: Array) -> NDArray[np.intp]:
+    """Return the region of each place, shape (n,); -1 where none contains it."""
+    distance = np.stack([region.distance(z) for region in regions])
+    nearest = distance.argmin(0)
+    return np.where(distance.min(0) <= 1, nearest, -1)
+
+
+@dataclass(frozen=True)
+class PriorProposal:
+    """The prior as a proposal."""
+
+    coordinates: PriorCoordinates
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        return self.coordinates.sample_prior(num_samples, rng)
+
+    def log_prob(self, z: Array) -> Array:
+        return self.coordinates.log_prior(z)
+
+
+@dataclass(frozen=True)
+class RegionsProposal:
+    """Equal shares of uniform densities over ellipsoids."""
+
+    regions: list[Region]
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        share = np.full(len(self.regions), 1 / len(self.regions))
+        count = rng.multinomial(num_samples, share)
+        pairs = zip(self.regions, count, strict=True)
+        return np.concatenate([r.sample_uniform(n, rng) for r, n in pairs])
+
+    def log_prob(self, z: Array) -> Array:
+        density = np.stack(
+            [
+                np.where(region.distance(z) <= 1, -region.log_volume, -np.inf)
+                for region in self.regions
+            ]
+        )
+        return logsumexp(density, axis=0) - np.log(len(self.regions))
+
+
+def cover(
+    particles: Particles,
+    rng: np.random.Generator,
+    *,
+    min_regions: int,
+    max_regions: int,
+    generous: bool,
+    num_points: int = 1_000,
+) -> list[Region]:
+    """Return ellipsoids around the clusters of a sample.
+
+    More clusters are taken only where that makes the sample denser by a factor, since
+    each needs simulations of its own.
+
+    Args:
+        particles: The sample.
+        rng: Source of randomness.
+        min_regions: At least this many clusters, where the sample allows.
+        max_regions: At most this many.
+        generous: Whether to reach four deviations of each cluster; else the ellipsoid
+            just holds its particles, which a surrogate with misfit has spread already.
+        num_points: Particles to cluster.
+    """
+    points = particles.resample(num_points, rng)
+    d = points.shape[1]
+    counts = sorted(
+        {min(max(k, min_regions), max_regions) for k in (1, 2, 3, 4, 6, 8, min_regions)}
+    )
+    best = GaussianMixture.fit(points, counts[0], rng)
+    for count in counts[1:]:
+        other = GaussianMixture.fit(points, count, rng)
+        if other.log_likelihood > best.log_likelihood + WORTH * d:
+            best = other
+    label = best.assign(points)
+    full = chi2.ppf(COVERED, d) ** 0.5
+    regions = []
+    for k in range(len(best.log_weight)):
+        members = points[label == k]
+        if len(np.unique(members, axis=0)) < d + 3:
+            continue
+        center, spread = members.mean(0), members.std(0)
+        covariance = np.atleast_2d(np.cov((members / spread).T))
+        root = np.linalg.cholesky(covariance + 1e-12 * np.eye(d))
+        shape = Region(center, spread[:, None] * root, 1.0)
+        farthest = shape.distance(members).max()
+        radius = max(full, 1.1 * farthest) if generous else 1.2 * farthest
+        regions.append(Region(center, shape.factor, float(radius)))
+    return regions or [around(points)]  # a sample of a few points has no clusters
+
+
+def around(draws: Array) -> Region:
+    """Return the ellipsoid that covers draws, shape (n, d), as of a Gaussian."""
+    d = draws.shape[1]
+    spread = draws.std(0) + 1e-12
+    covariance = np.atleast_2d(np.cov((draws / spread).T)) + 1e-9 * np.eye(d)
+    factor = spread[:, None] * np.linalg.cholesky(covariance)
+    return Region(draws.mean(0), factor, float(chi2.ppf(COVERED, d) ** 0.5))

@@ -1,0 +1,338 @@
+r"""A likelihood learned by regression of outcomes on parameters, region by region.
+
+In a region the stacked outcomes of all trials are modeled as
+
+.. math::
+    x \mid \theta \sim \mathcal N\big(B^\top f(u),\; (1 + h(u))\, S\big), \qquad
+    h(u) = f(u)^\top (F^\top F)^{-1} f(u),
+
+with f a basis in the region's own coordinates u, S the covariance of the residuals,
+which holds the noise and what the basis misses, and h the leverage, by which the
+likelihood widens where simulations are few. Regressing x on theta asks nothing of
+where the simulations lie, so there is no proposal to correct for. Numbers that were
+not observed have no part in it, and the probability of what each trial's outcome was,
+a measurement or none, is a further factor
+(:mod:`.outcomes`).
+
+References:
+    Wood, Nature 2010 (synthetic likelihood).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, f
+
+from sbi_active.inference.regression.basis import Basis
+from sbi_active.inference.regression.outcomes import TrialOutcome
+from sbi_active.inference.regression.regions import Region, nearest_region
+from sbi_active.inference.regression.residual_covariance import (
+    ResidualCovariance,
+    alike,
+)
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+
+__all__ = ["LocalRegression", "NoiseEstimate", "Surrogate", "estimate_noise"]
+
+Array = NDArray[Any]
+
+CAUTION = 2.0  # at least, under misfit
+MISFIT = 1.12  # residual over noise variance above which the basis misses something
+MANY = 6  # parameters beyond which bases without products are tried too
+CHANCE = 0.03  # that the largest ratio is taken for misfit where there is none
+GAIN = 0.005  # nats an outcome that a larger basis must save
+MAX_WAVES = 120  # random Fourier features
+WAVE_LENGTHS = (1.0, 0.5, 0.25)  # in half-widths of the region
+FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """Noise from pairs of outcomes at the same parameters.
+
+    Attributes:
+        variance: Of each outcome, shape (q,).
+        num_pairs: How many pairs it rests on.
+    """
+
+    variance: Array
+    num_pairs: int
+
+
+def estimate_noise(first: Array, second: Array, scale: Array) -> NoiseEstimate:
+    """Return the noise of pairs of outcomes, each of shape (r, q).
+
+    Args:
+        first: Outcomes.
+        second: Outcomes at the same parameters.
+        scale: Largest size of each outcome, shape (q,), whose rounding is a floor.
+    """
+    variance = 0.5 * ((first - second) ** 2).mean(0)
+    return NoiseEstimate(variance + (FLOAT32 * scale) ** 2 + 1e-300, len(first))
+
+
+@dataclass(frozen=True)
+class LocalRegression:
+    r"""Regression of the outcomes, less the observed ones, in one region.
+
+    Attributes:
+        region: Where it holds.
+        basis: f.
+        coefficient: :math:`B L^{-\top}`, outcomes whitened by S = L L^T, shape (p, q).
+        root: :math:`R^{-1}` of F = Q R, so that h = |f R^{-1}|^2, shape (p, p).
+        outcomes: Probability of a measurement, or of none, of each trial in which
+            simulations do not all agree.
+        used: Which outcomes were observed, shape (q,); all others have no coefficient
+            and no residual.
+        roughness: Share of the variance of some outcome that a cubic misses.
+        ratio: Residual over noise variance, mean over outcomes.
+        excess: The same with chance removed: above 1 means misfit.
+        residual: Whitened residuals, shape (n, q).
+        standardized: Residuals over their deviations, not rotated, shape (n, q).
+        covariance: S, of the outcomes in use.
+        leverage: h of the simulations, as part of the fit, shape (n,).
+    """
+
+    region: Region
+    basis: Basis
+    coefficient: Array
+    root: Array
+    outcomes: tuple[TrialOutcome, ...]
+    used: NDArray[np.bool_]
+    roughness: float
+    ratio: float
+    excess: float
+    residual: Array
+    standardized: Array
+    covariance: ResidualCovariance
+    leverage: Array
+
+    @property
+    def has_misfit(self) -> bool:
+        """Whether the residuals are larger than the noise."""
+        return self.excess > MISFIT
+
+    @staticmethod
+    def fit(
+        region: Region,
+        z: Array,
+        x: Array,
+        *,
+        noise: NoiseEstimate,
+        num_trials: int,
+        outcomes: tuple[TrialOutcome, ...] = (),
+        used: NDArray[np.bool_] | None = None,
+    ) -> LocalRegression | None:
+        """Fit the basis with the smallest generalized cross-validation score.
+
+        Args:
+            region: Where the simulations lie.
+            z: Their coordinates, shape (n, d).
+            x: Their outcomes less the observed ones, shape (n, q).
+            noise: Noise in the region, of the outcomes in use.
+            num_trials: Trials stacked in q.
+            outcomes: Whether trials gave a measurement.
+            used: Outcomes that were observed, shape (q,); None is all.
+
+        Returns:
+            The regression; None where simulations are too few.
+        """
+        used = np.ones(x.shape[1], dtype=bool) if used is None else used
+        trial = np.repeat(np.arange(num_trials), x.shape[1] // num_trials)[used]
+        x = x[:, used]
+        n, q = x.shape
+        u = region.scaled(z)
+        scale = np.sqrt(noise.variance)
+        best: tuple[float, Basis, Array, Array, Array] | None = None
+        roughness = 0.0
+        for basis in _candidates(u.shape[1], n):
+            is_wave = basis.phase.size > 0
+            if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
+                break  # a cubic will do, or another stage makes it do
+            p = basis.num_features
+            if n < p + max(20, p // 2):
+                continue
+            features = basis(u)
+            ridge = np.diag(np.full(p, 1e-4 if is_wave else 1e-9))
+            orthogonal, triangular = np.linalg.qr(np.concatenate([features, ridge]))
+            root = np.linalg.inv(triangular)
+            coefficient = root @ (orthogonal[:n].T @ x)
+            residual = x - features @ coefficient
+            variance = ((residual / scale) ** 2).sum(0) / (n - p) + 1e-12
+            score = np.log(variance).sum() + q * np.log(n / (n - p))
+            if not is_wave and q > 0:
+                missed = (residual**2).sum(0) / (n - p) - noise.variance
+                roughness = float((missed / x.var(0).clip(noise.variance)).max())
+            if best is None or score < best[0] - GAIN * q:
+                best = (score, basis, root, residual, coefficient)
+        if best is None:
+            return None
+        _, basis, root, residual, coefficient = best
+        freedom = n - len(root)
+        ratio = (residual**2).sum(0) / freedom / noise.variance
+        deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise.variance)
+        standardized = residual / deviation
+        excess = _excess(ratio, alike(standardized, freedom), freedom, noise.num_pairs)
+        covariance = ResidualCovariance.of(
+            standardized, deviation, freedom, trial, independent=excess <= MISFIT
+        )
+        return LocalRegression(
+            region=region,
+            basis=basis,
+            coefficient=_spread(covariance.whiten(coefficient), used),
+            root=root,
+            outcomes=outcomes,
+            used=used,
+            roughness=roughness,
+            ratio=float(ratio.mean()) if q > 0 else 1.0,
+            excess=excess,
+            residual=_spread(covariance.whiten(residual), used),
+            standardized=_spread(standardized, used),
+            covariance=covariance,
+            leverage=((basis(u) @ root) ** 2).sum(1),
+        )
+
+    def whitened(self, z: Array) -> tuple[Array, Array]:
+        """Return the whitened prediction less the observation, and 1 + h.
+
+        Args:
+            z: Shape (n, d).
+
+        Returns:
+            Shapes (n, q) and (n,).
+        """
+        features = self.basis(self.region.scaled(z))
+        leverage = ((features @ self.root) ** 2).sum(1)
+        return features @ self.coefficient, 1 + leverage
+
+    @cached_property
+    def compact(self) -> Array:
+        """Fewest numbers whose squares add up to those of the outcomes, (p, min(p, q)).
+
+        An orthogonal map of the whitened outcomes, many of which are linear in others
+        where there are more outcomes than features.
+        """
+        p, q = self.coefficient.shape
+        return self.coefficient if q <= p else np.linalg.qr(self.coefficient.T)[1].T
+
+    @property
+    def caution(self) -> float:
+        """Factor of the variance that keeps what the misfit would wrongly exclude.
+
+        Misfit is no noise: it is the same at each visit, and where the posterior lies
+        it may be as large as anywhere in the region. So the largest residual shall
+        count as an ordinary one.
+        """
+        if not self.has_misfit:
+            return 1.0
+        n = len(self.residual)
+        square = (self.residual**2).sum(1) * n / (n - len(self.root))
+        return float(max(CAUTION, square.max() / chi2.ppf(0.9, self.used.sum())))
+
+    def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
+        """Return the log likelihood of the observation, shape (n,).
+
+        Args:
+            z: Shape (n, d).
+            caution: Factor of the variance.
+        """
+        features = self.basis(self.region.scaled(z))
+        widening = 1 + ((features @ self.root) ** 2).sum(1)
+        q = int(self.used.sum())
+        square = ((features @ self.compact) ** 2).sum(1)
+        square = square * self.covariance.precision / (widening * caution)
+        log_volume = self.covariance.log_volume + 0.5 * q * np.log(
+            2 * np.pi * widening * caution
+        )
+        log_likelihood = -0.5 * square - log_volume
+        for outcome in self.outcomes:
+            log_likelihood = log_likelihood + outcome.log_prob(z)
+        return log_likelihood
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """Prior times learned likelihood of all trials, each place in its nearest region.
+
+    Attributes:
+        coordinates: Of the prior.
+        regressions: One a region.
+        is_cautious: Whether regions with misfit are taken with their caution, to find
+            where to simulate next and not what to believe.
+    """
+
+    coordinates: PriorCoordinates
+    regressions: list[LocalRegression]
+    is_cautious: bool = False
+
+    def log_likelihood(self, z: Array) -> Array:
+        """Return the log likelihood, shape (n,); -inf outside all regions."""
+        label = self.assign(z)
+        log_likelihood = np.full(len(z), -np.inf)
+        for k, regression in enumerate(self.regressions):
+            rows = np.flatnonzero(label == k)
+            if len(rows):
+                caution = regression.caution if self.is_cautious else 1.0
+                log_likelihood[rows] = regression.log_likelihood(z[rows], caution)
+        return log_likelihood
+
+    def log_joint(self, z: Array) -> Array:
+        """Return log prior plus log likelihood in the coordinates z, shape (n,)."""
+        log_joint = self.coordinates.log_prior(z)
+        rows = np.flatnonzero(np.isfinite(log_joint))
+        log_joint[rows] += self.log_likelihood(z[rows])
+        return log_joint
+
+    def assign(self, z: Array) -> NDArray[np.intp]:
+        """Return the region of each place, shape (n,); -1 where there is none."""
+        return nearest_region([r.region for r in self.regressions], z)
+
+
+def _candidates(dim: int, num_rows: int) -> list[Basis]:
+    polynomials = [Basis.polynomial(degree, dim) for degree in (1, 2, 3)]
+    if dim > MANY:  # products of two parameters each would need too many rows
+        powers = [Basis.polynomial(d, dim, is_additive=True) for d in (2, 3)]
+        polynomials = [polynomials[0], *powers, *polynomials[1:]]
+    num_waves = min(MAX_WAVES, num_rows // 4)
+    return polynomials + [Basis.waves(s, dim, num_waves) for s in WAVE_LENGTHS]
+
+
+def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
+    variance = (residual**2).sum(0) / (len(residual) - len(root))
+    return float((variance / noise.variance).max(initial=0.0))
+
+
+def _excess(ratio: Array, num_alike: float, freedom: int, num_pairs: int) -> float:
+    """Return the misfit, residual over noise variance, with chance removed.
+
+    The mean over outcomes is sharp where all are missed a little, the maximum where
+    one is missed; each less what chance alone reaches: ratios are F distributed and
+    correlate as the squares of the residuals' correlations.
+
+    Args:
+        ratio: Of the outcomes, shape (q,).
+        num_alike: Outcomes that vary as one, by their correlations.
+        freedom: Rows less coefficients.
+        num_pairs: That the noise is known from.
+    """
+    q = len(ratio)
+    if q == 0:
+        return 0.0
+    deviation = np.sqrt(2 / freedom + 2 / max(num_pairs, 1))
+    mean = ratio.mean() - 3 * deviation * np.sqrt(num_alike / q)
+    largest = ratio.max() / f.isf(CHANCE / q, freedom, max(num_pairs, 1))
+    return float(max(mean, largest))
+
+
+def _spread(columns: Array, used: NDArray[np.bool_]) -> Array:
+    """Return columns (n, used) at their places among all, (n, q), zero elsewhere."""
+    if used.all():
+        return columns
+    full = np.zeros((len(columns), len(used)))
+    full[:, used] = columns
+    return full

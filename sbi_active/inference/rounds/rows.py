@@ -1,0 +1,146 @@
+"""What goes into a round with actions: checked rows, and the trials that ended it."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from sbi.utils import RestrictedPrior
+from sbi.utils.sbiutils import within_support
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.beliefs.belief import parameter_dim
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+
+__all__ = [
+    "Observation",
+    "RoundRows",
+    "UnexplainedOutcomeError",
+    "check_proposal",
+    "require_whole",
+    "round_rows",
+]
+
+
+class UnexplainedOutcomeError(ValueError):
+    """A trial gave a measurement where simulations give none."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A real trial: the executed action, shape (action_dim,), and x, shape x_shape."""
+
+    action: Tensor
+    x: Tensor
+
+
+@dataclass(frozen=True)
+class RoundRows:
+    """Simulations of a round, one a row, in float32."""
+
+    theta: Tensor
+    x: Tensor
+    action: Tensor
+
+
+def round_rows(
+    theta: Tensor,
+    x: Tensor,
+    action: Tensor,
+    *,
+    prior: Distribution,
+    x_shape: torch.Size | None,
+    action_dim: int | None,
+    exclude_invalid: bool,
+    may_be_invalid: bool = False,
+) -> RoundRows:
+    """Return the rows of a round, or say what is wrong with them.
+
+    Args:
+        theta: Shape (n, theta_dim), within the prior's support.
+        x: Shape (n, *x_shape), or (n,) where x is one number.
+        action: Shape (n, action_dim), or (action_dim,) for all rows.
+        prior: Gives theta_dim and the support.
+        x_shape: Shape of earlier outcomes; None takes that of these.
+        action_dim: Of earlier actions; None takes that of these.
+        exclude_invalid: Drop rows in which a number is missing.
+        may_be_invalid: Whether it is plausible that no row has a measurement, as under
+            a belief from trials that had none.
+
+    Raises:
+        ValueError: If shapes do not fit, theta leaves the support, or no row is valid.
+    """
+    theta = torch.as_tensor(theta, dtype=torch.float32).clone()
+    x = torch.as_tensor(x)
+    x = x[:, None] if x.ndim == 1 else x
+    dim = parameter_dim(prior)
+    if theta.ndim != 2 or theta.shape[1] != dim or len(x) != len(theta):
+        raise ValueError(
+            f"expected theta (n, {dim}) and x (n, ...) with as many rows; got "
+            f"{tuple(theta.shape)} and {tuple(x.shape)}; do give one row a simulation"
+        )
+    outside = ~within_support(prior, theta)
+    if bool(outside.any()):
+        row = int(outside.nonzero()[0])
+        raise ValueError(
+            f"expected theta within the prior's support; got {int(outside.sum())} of "
+            f"{len(theta)} rows outside, the first {theta[row].tolist()} in row {row}; "
+            "do sample theta from the belief"
+        )
+    x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape)
+    action = action_rows(action, action_dim, num_rows=len(theta))
+    rows = RoundRows(theta, x, action)
+    present = x.flatten(1).isfinite()
+    invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
+    if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
+        raise UnexplainedOutcomeError(
+            f"expected at least one simulation with a measurement; got {len(x)} of "
+            f"{len(x)} invalid (NaN or inf); do check the simulator at theta = "
+            f"{theta[0].tolist()}, action = {action[0].tolist()}"
+        )
+    if not (exclude_invalid and bool(invalid.any())):
+        return rows
+    warnings.warn(
+        f"dropping {int(invalid.sum())} of {len(x)} simulations without a measurement: "
+        "information gain is then biased towards actions that fail. The default "
+        "MixtureDensity network keeps them.",
+        stacklevel=4,
+    )
+    return RoundRows(theta[~invalid], x[~invalid], action[~invalid])
+
+
+def require_whole(x: Tensor) -> None:
+    """Raise where some numbers of an outcome are missing and others are not.
+
+    Args:
+        x: Shape (n, *x_shape).
+
+    Raises:
+        ValueError: If there is such an outcome.
+    """
+    present = torch.as_tensor(x).reshape(len(x), -1).isfinite()
+    partly = present.any(1) & ~present.all(1)
+    if bool(partly.any()):
+        row = int(partly.nonzero()[0])
+        raise ValueError(
+            "expected outcomes that are measured or NaN throughout, since a likelihood "
+            f"of some of the numbers is not learned; got {int(partly.sum())} of "
+            f"{len(x)} measured in part, the first in row {row}; do leave out the "
+            "numbers that go missing, or use ASBI"
+        )
+
+
+def check_proposal(proposal: Any, belief: Distribution | None) -> None:
+    """Raise unless theta is drawn from the belief or a truncation of it."""
+    truncated = isinstance(proposal, RestrictedPrior) and proposal._prior is belief
+    if proposal is None or proposal is belief or truncated:
+        return
+    raise ValueError(
+        "expected proposal to be the belief or sbi's RestrictedPrior of it, since a "
+        "round with actions is trained by plain maximum likelihood and any other "
+        f"proposal would take the belief's place; got {type(proposal).__name__}; do "
+        "pass belief= the distribution theta was drawn from"
+    )

@@ -1,0 +1,390 @@
+"""Weighted samples of a cheap density: annealed population Monte Carlo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+from sbi_active.inference.sampling.unbounding import Unbounding
+
+__all__ = [
+    "GaussianMixture",
+    "Particles",
+    "Proposal",
+    "StudentProposal",
+    "normalized",
+    "population_monte_carlo",
+]
+
+Array = NDArray[Any]
+
+FREEDOM = 5.0  # of the Student components: tails above any Gaussian's
+INFLATION = 1.4  # of their covariance
+SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
+SHARE_OF_STEP = 0.2  # particles that stay effective in a step
+MAX_COMPONENTS = 12
+NUM_FITTED = 800  # particles a mixture is fitted to, at least
+FITTED = 8  # of them for each number in a covariance
+
+
+def normalized(log_weight: Array) -> Array:
+    """Return weights that sum to one, shape (n,), whatever their size.
+
+    Args:
+        log_weight: Shape (n,). Beyond 1e16 a sum of several is lost in the rounding of
+            its logarithm; where none is finite, all count the same.
+    """
+    if not np.isfinite(log_weight).any():
+        return np.full(len(log_weight), 1 / len(log_weight))
+    weight = np.exp(log_weight - np.asarray(logsumexp(log_weight)))
+    total = weight.sum()
+    return weight if abs(total - 1) < 1e-9 else weight / total
+
+
+class Proposal(Protocol):
+    """A density that can be sampled."""
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
+        ...
+
+    def log_prob(self, z: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Particles:
+    r"""Draws :math:`z_i` from a proposal and their weights.
+
+    Attributes:
+        z: Shape (n, d).
+        log_weight: Log of target over proposal, shape (n,).
+        proposal: Where they were drawn.
+    """
+
+    z: Array
+    log_weight: Array
+    proposal: Proposal
+
+    @property
+    def weight(self) -> Array:
+        """Normalized weights, shape (n,)."""
+        return normalized(self.log_weight)
+
+    @property
+    def log_normalizer(self) -> float:
+        r""":math:`\log \frac1n \sum_i w_i`."""
+        return float(logsumexp(self.log_weight) - np.log(len(self.log_weight)))
+
+    @property
+    def effective_sample_size(self) -> float:
+        r""":math:`(\sum w_i)^2 / \sum w_i^2`."""
+        return _effective_sample_size(self.log_weight)
+
+    def resample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return equally weighted particles, shape (n, d), by systematic resampling."""
+        return self.z[_systematic(self.weight, num_samples, rng)]
+
+
+@dataclass(frozen=True)
+class GaussianMixture:
+    """Gaussian mixture with full covariances.
+
+    Attributes:
+        log_weight: Shape (k,).
+        mean: Shape (k, d).
+        factor: Lower Cholesky factors, shape (k, d, d).
+        log_likelihood: Of the points it was fitted to, a point.
+    """
+
+    log_weight: Array
+    mean: Array
+    factor: Array
+    log_likelihood: float
+
+    @staticmethod
+    def fit(
+        points: Array,
+        num_components: int,
+        rng: np.random.Generator,
+        *,
+        num_iterations: int = 25,
+    ) -> GaussianMixture:
+        """Fit by expectation-maximization from seeds spread over the points.
+
+        Args:
+            points: Shape (n, d); repeated points count as often as they occur.
+            num_components: At most this many; fewer where points are few.
+            rng: Source of the starting points.
+            num_iterations: At most this many.
+        """
+        center = points.mean(0)
+        # A relative floor: a cluster may be 1e-5 of the cloud wide, or one point.
+        spread = points.std(0) + 1e-12 * (np.abs(center) + 1.0)
+        covariance = np.cov(((points - center) / spread).T, bias=True)
+        root = np.linalg.cholesky(
+            np.atleast_2d(covariance) + 1e-12 * np.eye(len(spread))
+        )
+        whitening = spread[:, None] * root
+        z = np.linalg.solve(whitening, (points - center).T).T
+        n, d = z.shape
+        k = max(1, min(num_components, n // max(2 * d + 2, _num_moments(d))))
+        share = _spread_responsibility(z, k, rng)
+        previous = -np.inf
+        for _ in range(num_iterations if k > 1 else 1):
+            count = share.sum(0) + 1e-12
+            mean = (share.T @ z) / count[:, None]
+            second = (share.T[:, None] * z.T) @ z
+            covariance = (
+                second / count[:, None, None] - mean[:, :, None] * mean[:, None]
+            )
+            floor = 1e-9 + 1e-6 * (count < d + 1)[:, None, None]
+            factor = np.linalg.cholesky(_positive(covariance) + floor * np.eye(d))
+            log_weight = np.log(count / count.sum())
+            joint = log_weight + _gaussian_log_prob(z, mean, factor)
+            total = np.asarray(logsumexp(joint, axis=1))
+            share = np.exp(joint - total[:, None])
+            if total.mean() - previous < 1e-3:
+                break
+            previous = total.mean()
+        log_volume = np.log(np.diag(whitening)).sum()
+        return GaussianMixture(
+            log_weight,
+            mean @ whitening.T + center,
+            whitening @ factor,
+            float(total.mean() - log_volume),
+        )
+
+    def log_prob(self, points: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        joint = self.log_weight + _gaussian_log_prob(points, self.mean, self.factor)
+        return np.asarray(logsumexp(joint, axis=1))
+
+    def assign(self, points: Array) -> NDArray[np.intp]:
+        """Return the likeliest component of each point, shape (n,)."""
+        joint = self.log_weight + _gaussian_log_prob(points, self.mean, self.factor)
+        return joint.argmax(1)
+
+
+class StudentProposal:
+    """Student mixture over fitted Gaussian components, with a share of a base.
+
+    Args:
+        mixture: The components.
+        base: The defensive proposal.
+        unbounding: Where the components were fitted; None is in z itself.
+    """
+
+    def __init__(
+        self,
+        mixture: GaussianMixture,
+        base: Proposal,
+        unbounding: Unbounding | None = None,
+    ) -> None:
+        self.base, self._unbounding = base, unbounding
+        k = len(mixture.log_weight)
+        self._weight = 0.8 * np.exp(mixture.log_weight) + 0.2 / k
+        self._mean = mixture.mean
+        self._factor = INFLATION**0.5 * mixture.factor
+
+    @staticmethod
+    def fit(
+        points: Array,
+        num_components: int,
+        base: Proposal,
+        rng: np.random.Generator,
+        unbounding: Unbounding | None = None,
+    ) -> StudentProposal:
+        """Fit components to points, shape (n, d)."""
+        places = points if unbounding is None else unbounding.to_line(points)
+        mixture = GaussianMixture.fit(places, num_components, rng)
+        return StudentProposal(mixture, base, unbounding)
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        d = self._mean.shape[1]
+        num_base = rng.binomial(num_samples, SHARE_OF_BASE)
+        count = rng.multinomial(num_samples - num_base, self._weight)
+        scale = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (num_samples - num_base, 1)))
+        normal = scale * rng.standard_normal((num_samples - num_base, d))
+        pieces = [
+            mean + part @ factor.T
+            for mean, factor, part in zip(
+                self._mean,
+                self._factor,
+                np.split(normal, np.cumsum(count)[:-1]),
+                strict=True,
+            )
+        ]
+        drawn = np.concatenate(pieces)
+        if self._unbounding is not None:
+            drawn = self._unbounding.from_line(drawn)
+        return np.concatenate([drawn, self.base.sample(num_base, rng)])
+
+    def log_prob(self, z: Array) -> Array:
+        d = z.shape[1]
+        y = z if self._unbounding is None else self._unbounding.to_line(z)
+        constant = (
+            gammaln(0.5 * (FREEDOM + d))
+            - gammaln(0.5 * FREEDOM)
+            - 0.5 * d * np.log(np.pi * FREEDOM)
+        )
+        square, log_volume = _mahalanobis(y, self._mean, self._factor)
+        student = constant - log_volume
+        student = student - 0.5 * (FREEDOM + d) * np.log1p(square / FREEDOM)
+        student = logsumexp(student + np.log(self._weight), axis=1)
+        if self._unbounding is not None:
+            student = student + self._unbounding.log_slope(y)
+        return np.logaddexp(
+            np.log1p(-SHARE_OF_BASE) + student,
+            np.log(SHARE_OF_BASE) + self.base.log_prob(z),
+        )
+
+
+def population_monte_carlo(
+    log_density: Callable[[Array], Array],
+    base: Proposal,
+    rng: np.random.Generator,
+    *,
+    num_particles: int,
+    first: Proposal | None = None,
+    num_components: int = 6,
+    max_iterations: int = 40,
+    unbounding: Unbounding | None = None,
+) -> tuple[Particles, int]:
+    r"""Sample a density by importance sampling from mixtures fitted to it.
+
+    The target is reached from the base along
+
+    .. math::
+        \pi_\beta(z) \propto g_0(z)^{1 - \beta}\, \pi(z)^\beta,
+
+    each step as long as a fifth of the particles stays effective, so that a peak
+    :math:`10^{-8}` of the base's volume is found in some ten steps.
+
+    Args:
+        log_density: Log of the unnormalized :math:`\pi`, (n, d) -> (n,); -inf allowed.
+        base: :math:`g_0`, which should cover the target.
+        rng: Source of randomness.
+        num_particles: At the last steps; half as many on the way.
+        first: A guess at the target to begin with; None begins at the base.
+        num_components: Of the fitted mixtures.
+        max_iterations: Steps at most.
+        unbounding: Where mixtures are fitted; None is in z itself.
+
+    Returns:
+        The particles of the last step and the number of steps.
+
+    References:
+        Cappe et al., J. Comp. Graph. Stat. 2004; Neal, Stat. Comput. 2001.
+    """
+    beta, at_target, share = 0.0, 0, SHARE_OF_STEP
+    proposal = base if first is None else first
+    best: Particles | None = None
+    for step in range(max_iterations):
+        num = num_particles if beta == 1 or step == 0 else num_particles // 2
+        z = proposal.sample(num, rng)
+        log_q = proposal.log_prob(z)
+        log_target = log_density(z)
+        particles = Particles(z, log_target - log_q, proposal)
+        ess = particles.effective_sample_size / num
+        if beta == 1:
+            at_target += 1
+            if best is None or ess * num > best.effective_sample_size:
+                best = particles
+            if ess > 0.4 or (at_target >= 3 and ess > 0.2) or at_target >= 6:
+                break
+        log_base = log_q if proposal is base else base.log_prob(z)
+        reached = beta
+        beta = _next_beta(log_base, log_target, log_q, beta, share)
+        if 0 < beta < 1 and beta < 1.1 * reached:
+            # More peaks than components: fit more of them, and take a coarser step.
+            num_components = min(num_components + 2, MAX_COMPONENTS)
+            share = max(0.7 * share, 0.02)
+        tempered = _tempered(log_base, log_target, log_q, beta)
+        weight = normalized(tempered)
+        num_fitted = max(NUM_FITTED, FITTED * _num_moments(z.shape[1]))
+        points = z[_systematic(weight, num_fitted, rng)]
+        proposal = StudentProposal.fit(points, num_components, base, rng, unbounding)
+    return (particles if best is None else best), step + 1
+
+
+def _num_moments(dim: int) -> int:
+    """Return the numbers in a mean and a covariance."""
+    return dim * (dim + 3) // 2
+
+
+def _tempered(log_base: Array, log_target: Array, log_q: Array, beta: float) -> Array:
+    with np.errstate(invalid="ignore"):
+        tempered = (1 - beta) * log_base + beta * log_target - log_q
+    return np.where(np.isfinite(log_target) & np.isfinite(tempered), tempered, -np.inf)
+
+
+def _next_beta(
+    log_base: Array, log_target: Array, log_q: Array, beta: float, share: float
+) -> float:
+    """Return the largest step that leaves a share of the particles effective."""
+
+    def suffices(candidate: float) -> bool:
+        log_weight = _tempered(log_base, log_target, log_q, candidate)
+        return _effective_sample_size(log_weight) > share * len(log_weight)
+
+    if suffices(1.0):
+        return 1.0
+    low, high = beta, 1.0
+    for _ in range(25):
+        # By powers of ten first: the first step may be of the order of 1e-8.
+        middle = 0.5 * (low + high) if low > 0 else 0.1 * high
+        low, high = (middle, high) if suffices(middle) else (low, middle)
+    return max(low, beta + 1e-10)
+
+
+def _effective_sample_size(log_weight: Array) -> float:
+    top = log_weight.max()
+    if not np.isfinite(top):
+        return 0.0
+    weight = np.exp(log_weight - top)
+    return float(weight.sum() ** 2 / (weight**2).sum())
+
+
+def _systematic(weight: Array, num: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    place = (np.arange(num) + rng.random()) / num
+    return np.minimum(np.searchsorted(np.cumsum(weight), place), len(weight) - 1)
+
+
+def _spread_responsibility(z: Array, k: int, rng: np.random.Generator) -> Array:
+    """Return each point's nearest seed, the seeds far apart, shape (n, k)."""
+    seeds = z[[rng.integers(len(z))]]
+    square = ((z - seeds) ** 2).sum(1)
+    for _ in range(k - 1):
+        total = square.sum()
+        pick = rng.choice(len(z), p=square / total) if total > 0 else 0
+        seeds = np.concatenate([seeds, z[[pick]]])
+        square = np.minimum(square, ((z - z[pick]) ** 2).sum(1))
+    distance = ((z[:, None] - seeds) ** 2).sum(-1)
+    return np.eye(k)[distance.argmin(1)]
+
+
+def _positive(covariance: Array) -> Array:
+    """Return the nearest positive semi-definite matrices; rounding leaves -1e-16."""
+    value, vector = np.linalg.eigh(covariance)
+    return (vector * np.maximum(value, 0.0)[:, None]) @ np.swapaxes(vector, -1, -2)
+
+
+def _mahalanobis(z: Array, mean: Array, factor: Array) -> tuple[Array, Array]:
+    """Return squared distances, shape (n, k), and log volumes, shape (k,)."""
+    inverse = np.linalg.inv(factor)
+    square = np.stack(
+        [(((z - m) @ i.T) ** 2).sum(1) for m, i in zip(mean, inverse, strict=True)], 1
+    )
+    return square, np.log(np.abs(np.diagonal(factor, axis1=1, axis2=2))).sum(1)
+
+
+def _gaussian_log_prob(z: Array, mean: Array, factor: Array) -> Array:
+    square, log_volume = _mahalanobis(z, mean, factor)
+    return -0.5 * (square + z.shape[1] * np.log(2 * np.pi)) - log_volume

@@ -1,0 +1,346 @@
+"""Updates of a belief by a learned likelihood or ratio of each trial."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import Self
+
+from sbi_active.inference.beliefs.belief import Belief, require_support
+from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
+from sbi_active.inference.models.action_factor import ActionFactor
+from sbi_active.inference.products.belief import sample_product
+from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, ChainBelief
+from sbi_active.inference.products.product import (
+    Product,
+    TrainedRegion,
+    widened,
+)
+from sbi_active.inference.refinement.stages import Refinement
+from sbi_active.inference.rounds.rows import Observation, require_whole
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.trainers.action_rounds import ActionRounds
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import MissingRowsWarning, simulate
+
+__all__ = ["SAMPLERS", "ProductRounds"]
+
+SAMPLERS = ("importance", "kde", *MARKOV_CHAINS)
+#: Shares of the budget by stage, by what they begin at: this round's network, the
+#: belief before, or the prior.
+STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
+NUM_KERNELS = 2_000
+NUM_HINTS = 1_000
+NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
+
+
+class ProductRounds(ActionRounds):
+    r"""Rounds of a method that learns a factor of each trial's likelihood.
+
+    The belief is the original prior times the product over the history, in which every
+    trial counts by what the latest network says of it, within the region of its
+    training rows:
+
+    .. math::
+        b_r(\theta) \propto p(\theta)\, 1[\theta \in R_r]
+        \prod_{k \le r} q_r(x_k | \theta, \xi_k).
+
+    Args:
+        posterior: How the belief is sampled: "importance", annealed importance
+            sampling; one of sbi's Markov chains, for example "slice_np_vectorized" or
+            "nuts_pyro"; or "kde", the paper's: draws of the belief before times the
+            last trial's factor, as a kernel density estimate.
+        bandwidth: Of "kde", see :class:`.KernelBelief`.
+        kwargs: Of sbi's trainer.
+
+    References:
+        Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
+        for where theta was drawn); Deistler, Goncalves & Macke, NeurIPS 2022 (keeping
+        to where a network was trained).
+    """
+
+    # Of the trainer that this is mixed into.
+    append_simulations: Callable[..., Any]
+    train: Callable[..., Any]
+    _neural_net: Any
+    #: What its network is, set by each method.
+    _factor: type[ActionFactor]
+
+    def __init__(
+        self,
+        *,
+        posterior: str = "importance",
+        bandwidth: Bandwidth = "scott",
+        **kwargs: Any,
+    ) -> None:
+        if posterior not in SAMPLERS:
+            raise ValueError(
+                f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
+                f"{posterior!r}; do choose one of these"
+            )
+        super().__init__(**kwargs)
+        self._sampler = posterior
+        self._bandwidth: Bandwidth = bandwidth
+
+    def _append_round(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        action: Tensor,
+        belief: Distribution | None,
+        exclude_invalid_x: bool | None,
+        data_device: str | None,
+        proposal: Any = None,
+    ) -> Self:
+        if self._keeps_invalid and not exclude_invalid_x:
+            require_whole(x)
+        return super()._append_round(
+            theta, x, action, belief, exclude_invalid_x, data_device, proposal
+        )
+
+    def _learned(self, estimator: Any = None) -> ActionFactor:
+        """Return what was learned; None is this round's, apart from later training."""
+        if estimator is None:
+            self._require_trained()
+            estimator = deepcopy(self._neural_net)
+        assert self._outcome_shape is not None
+        assert self._action_dim is not None
+        return self._factor(
+            estimator, self._round_belief, self._outcome_shape, self._action_dim
+        )
+
+    def update(
+        self,
+        x_o: Tensor,
+        *,
+        action: Tensor,
+        simulator: Callable[..., Any] | None = None,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the belief after a real trial, and make it the current one.
+
+        Without a simulator it is the product over the history under this round's
+        network. With one, further parameters are drawn around that, more widely, and
+        simulated at the executed actions alone, and a network trained on those rows
+        gives the product again. Without a network of this round that begins at the
+        belief before, and takes two stages or, from the prior, four.
+
+        Args:
+            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN throughout
+                where there was no measurement.
+            action: The executed action, shape (action_dim,) or (1, action_dim).
+            simulator: ``simulator(theta, action)`` to refine with.
+            refinement: Its ``num_histories`` parameters are simulated at every executed
+                action; None is ``Refinement()``.
+            seed: Of everything random here; None draws one from torch's global
+                generator.
+
+        Returns:
+            The belief.
+
+        Raises:
+            RuntimeError: If there is neither a simulator nor a network of this round.
+            ValueError: If shapes do not fit.
+        """
+        trial = self._observation(x_o, action)
+        require_whole(trial.x[None])
+        settings = Refinement() if refinement is None else refinement
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        trials = [*self.trials, trial]
+        if simulator is None:
+            self._require_belief_network()
+        belief: Belief | None = None
+        if self._trained_round is not None:
+            belief = self._product(trials, settings, seed)
+        if simulator is not None:
+            with self._aside():
+                belief = self._refined(trials, simulator, belief, settings, seed)
+        assert belief is not None
+        self.trials.append(trial)
+        self._belief, self._trained_round = belief, None
+        return belief
+
+    def update_all(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any],
+        *,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the belief of these trials alone, computed from scratch.
+
+        Args:
+            trials: They replace the history.
+            simulator: As in :meth:`update`.
+            refinement: As in :meth:`update`; the budget is shared by four stages.
+            seed: As in :meth:`update`.
+        """
+        settings = Refinement() if refinement is None else refinement
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        with self._aside():
+            self._belief = None
+            belief = self._refined([*trials], simulator, None, settings, seed)
+        self.trials = [*trials]
+        self._belief, self._trained_round = belief, None
+        return belief
+
+    @contextmanager
+    def _aside(self) -> Iterator[None]:
+        """Leave rounds and belief as they were, whatever was appended meanwhile."""
+        names = ("_belief", "_round_belief", "_trained_round", "_neural_net")
+        before = {name: getattr(self, name) for name in names}
+        num = len(self._data_round_index)
+        try:
+            yield
+        finally:
+            vars(self).update(before)
+            for rows in (
+                self._theta_roundwise,
+                self._x_roundwise,
+                self._prior_masks,
+                self._data_round_index,
+            ):
+                del rows[num:]
+
+    def _refined(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any],
+        start: Belief | None,
+        settings: Refinement,
+        seed: int,
+    ) -> Belief:
+        """Simulate the executed actions where the belief is, and learn that."""
+        prior = require_support(self._prior)
+        belief: Distribution | None = self.belief if start is None else start
+        begin = "network" if start is not None else "belief"
+        action = torch.stack([t.action for t in trials])
+        num_simulations = num_missing = 0
+        for stage, share in enumerate(STAGES["prior" if belief is prior else begin]):
+            assert belief is not None
+            num = int(share * settings.num_histories)
+            own = derive_seed(seed, "stage", stage)
+            theta = self._places(belief, num, own)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+                rows = simulate(
+                    simulator,
+                    theta.repeat_interleave(len(trials), 0),
+                    action.repeat(num, 1),
+                    seed=derive_seed(own, "x"),
+                    num_workers=settings.num_workers,
+                    time_limit=settings.time_limit,
+                    num_retries=settings.num_retries,
+                )
+            num_simulations += len(rows)
+            num_missing += rows.counts["missing"]
+            known = rows.without_missing()
+            self.append_simulations(
+                known.theta, known.x, action=known.action, belief=belief
+            )
+            with forked_generators(own, "train"):
+                self.train()
+            belief = self._product(trials, settings, derive_seed(own, "product"))
+        assert isinstance(belief, Belief)
+        belief.diagnostics |= {
+            "num_simulations": num_simulations,
+            "num_missing": num_missing,
+        }
+        return belief
+
+    def _places(self, belief: Distribution, num: int, seed: int) -> Tensor:
+        """Return where to simulate, around a belief, shape (num, theta_dim)."""
+        prior = require_support(self._prior)
+        with forked_generators(seed, "theta"):
+            theta = belief.sample(torch.Size([num]))
+        if belief is prior:
+            return theta
+        rng = np.random.default_rng(derive_seed(seed, "wider"))
+        coordinates = PriorCoordinates(prior, rng)
+        z = widened(coordinates.to_z(theta), num, coordinates, rng)
+        return coordinates.to_theta(z)
+
+    def _product(
+        self, trials: Sequence[Observation], settings: Refinement, seed: int
+    ) -> Belief:
+        """Return the belief under this round's network."""
+        prior, previous = require_support(self._prior), self._round_belief
+        assert previous is not None
+        rng = np.random.default_rng(derive_seed(seed, "product"))
+        coordinates = PriorCoordinates(prior, rng)
+        region, hint = None, None
+        if previous is not prior:
+            rows = self._round_parameters()
+            region = TrainedRegion.of(coordinates.to_z(rows), rng)
+            hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
+        chained = self._sampler == "kde"
+        learned = self._learned()
+        counted = [
+            t
+            for t in (trials[-1:] if chained else trials)
+            if _says_something(learned, t, prior)
+        ]
+        product = Product(
+            coordinates,
+            learned,
+            counted,
+            region,
+            previous if chained and previous is not prior else None,
+        )
+        belief = sample_product(
+            prior,
+            product,
+            hint,
+            rng,
+            num_particles=settings.num_particles,
+            defensive=settings.defensive,
+        )
+        sampled: Belief = belief
+        if chained:
+            with forked_generators(seed, "kernels"):
+                draws = belief.sample(torch.Size([NUM_KERNELS]))
+            sampled = KernelBelief(prior, draws, bandwidth=self._bandwidth)
+        elif self._sampler in MARKOV_CHAINS:
+            sampled = ChainBelief(belief, product, self._sampler)
+        num_lost = len(trials[-1:] if chained else trials) - len(counted)
+        if num_lost:
+            sampled.diagnostics["trustworthy"] = False
+            sampled.diagnostics.setdefault("warnings", []).append(
+                f"{num_lost} trials are left out, at which the network's density is "
+                "finite nowhere: a measurement is wrong, or the simulator lacks much"
+            )
+        return sampled
+
+    def _round_parameters(self) -> Tensor:
+        """Return the parameters of this round's rows, shape (n, theta_dim)."""
+        current = max(self._data_round_index)
+        rows = [
+            theta
+            for theta, index in zip(
+                self._theta_roundwise, self._data_round_index, strict=True
+            )
+            if index == current
+        ]
+        prior = require_support(self._prior)
+        return torch.cat(rows)[:, : prior.event_shape[-1]].cpu()
+
+
+def _says_something(
+    learned: ActionFactor, trial: Observation, prior: Distribution
+) -> bool:
+    """Return whether a factor is finite anywhere: float32 has no squares of 1e20."""
+    with forked_generators(0), torch.no_grad():
+        theta = prior.sample(torch.Size([NUM_PROBES])).float()
+        rows = trial.x.expand(NUM_PROBES, *trial.x.shape)
+        action = trial.action.expand(NUM_PROBES, -1)
+        return bool(learned.log_factor(theta, rows, action).isfinite().any())

@@ -1,0 +1,362 @@
+"""Sequential Bayesian experimental design by ratio estimation at single parameters."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from sbi.sbi_types import Tracker
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import Self
+
+from sbi_active.inference.beliefs.belief import Belief, require_support
+from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
+from sbi_active.inference.models.lfire import LFIRE
+from sbi_active.inference.models.lfire_model import LFIREModel, fit_log_ratios
+from sbi_active.inference.refinement.stages import Refinement
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+from sbi_active.inference.rounds.rows import (
+    Observation,
+    RoundRows,
+    require_whole,
+    round_rows,
+)
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import MissingRowsWarning, simulate
+from sbi_active.threads import single_thread
+
+__all__ = ["SeqBED"]
+
+
+class SeqBED:
+    r"""Sequential Bayesian experimental design for implicit models.
+
+    A belief is a set of particles. For each of them and each candidate action, LFIRE
+    separates outcomes at the particle from outcomes of all; the mean log ratio is the
+    utility of the action, and the ratio at the real outcome weighs the particle:
+
+    .. math::
+        U(\xi) = E\!\left[\log r(x, \theta | \xi)\right], \qquad
+        w_i \propto r(x_o, \theta_i | \xi^*), \qquad
+        r = \frac{p(x | \theta, \xi)}{p(x | \xi)}.
+
+    Particles of a round are drawn from the belief, Gaussian kernels around the weighted
+    particles of the last one, where the original redraws them once the effective sample
+    size falls below half: one informative trial leaves far less. What distinguishes
+    the method is its cost: every particle needs simulations of its own.
+    :class:`.SeqBED_C` shares them.
+
+    Args:
+        prior: The prior over parameters, with a support.
+        settings: Of the logistic regressions; None is ``LFIRE()``.
+        num_particles: In a round; None makes as many as each has simulations.
+        bandwidth: Of the kernels, see :class:`.KernelBelief`.
+        tracker: Not used: no network is trained.
+        show_progress_bars: Not used.
+
+    References:
+        Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021, arXiv:2003.09379.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> _ = torch.manual_seed(0)
+        >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
+        >>> inference = SeqBED(prior)
+        >>> theta, action = inference.arrange(prior.sample((400,)), torch.ones(400, 1))
+        >>> x = theta + 0.3 * torch.randn_like(theta)
+        >>> _ = inference.append_simulations(theta, x, action=action).train()
+        >>> belief = inference.update(torch.tensor([0.5]), action=torch.ones(1))
+        >>> bool((belief.mean - 0.5).abs() < 0.25)
+        True
+    """
+
+    def __init__(
+        self,
+        prior: Distribution,
+        settings: LFIRE | None = None,
+        *,
+        num_particles: int | None = None,
+        bandwidth: Bandwidth = "scott",
+        tracker: Tracker | None = None,
+        show_progress_bars: bool = False,
+    ) -> None:
+        self._prior = require_support(prior)
+        self._settings = LFIRE() if settings is None else settings
+        if num_particles is not None and num_particles < 2:
+            raise ValueError(
+                f"expected num_particles >= 2; got {num_particles}; do use about 50"
+            )
+        self._num_particles = num_particles
+        self._bandwidth: Bandwidth = bandwidth
+        self._belief: Distribution | None = None
+        self._round_belief: Distribution | None = None
+        self._rows: list[RoundRows] = []
+        self._model: LFIREModel | None = None
+        self._x_shape: torch.Size | None = None
+        self._action_dim: int | None = None
+        self.trials: list[Observation] = []
+
+    @property
+    def belief(self) -> Distribution:
+        """The current belief over parameters; the prior before any trial."""
+        return self._prior if self._belief is None else self._belief
+
+    def arrange(self, theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return every action with every particle, several times each.
+
+        Args:
+            theta: Draws from the belief, shape (n, theta_dim); the first are particles.
+            action: Draws from the action space, shape (n, action_dim); the different
+                ones among them are the candidates.
+
+        Returns:
+            At most n rows of parameters and of actions.
+
+        Raises:
+            ValueError: If n is too small.
+        """
+        candidates = action.unique(dim=0)
+        share = len(theta) // len(candidates)
+        num = self._num_particles or math.isqrt(share)
+        repeats = share // max(num, 1)
+        if repeats < 2 * self._settings.num_folds:
+            raise ValueError(
+                f"expected at least {2 * self._settings.num_folds} simulations of each "
+                f"particle at each action; got {repeats}, of {len(theta)} in all at "
+                f"{len(candidates)} different actions and {num} particles; do allow "
+                "more simulations, or fewer actions"
+            )
+        particles = theta[:num]
+        return (
+            particles.repeat_interleave(repeats, 0).repeat(len(candidates), 1),
+            candidates.repeat_interleave(num * repeats, 0),
+        )
+
+    def append_simulations(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        *,
+        action: Tensor | None = None,
+        belief: Distribution | None = None,
+    ) -> Self:
+        """Store simulations of this round, see :meth:`arrange`.
+
+        Args:
+            theta: Particles, each of them several times, shape (n, theta_dim).
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
+            action: Shape (n, action_dim).
+            belief: The distribution of the particles; None is the current belief.
+
+        Raises:
+            ValueError: If there are no actions, or shapes do not fit.
+        """
+        if action is None:
+            raise ValueError(
+                "expected action=, since ratios belong to an action; got none; do pass "
+                "the action of each row"
+            )
+        belief = self.belief if belief is None else belief
+        require_whole(x)
+        rows = round_rows(
+            theta,
+            x,
+            action,
+            prior=self._prior,
+            x_shape=self._x_shape,
+            action_dim=self._action_dim,
+            exclude_invalid=False,
+            may_be_invalid=bool(self.trials),
+        )
+        self._x_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
+        if belief is not self._round_belief:
+            self._round_belief, self._rows = belief, []
+        self._rows.append(rows)
+        self._belief, self._model = belief, None
+        return self
+
+    def train(self, *, seed: int | None = None) -> LFIREModel:
+        """Fit the log ratio of every particle at every action.
+
+        Args:
+            seed: Of the cross-validation's folds and the choice of marginal rows; None
+                draws one from torch's global generator.
+
+        Raises:
+            RuntimeError: If there are no simulations.
+            ValueError: If a particle has too few.
+        """
+        if not self._rows:
+            raise RuntimeError(
+                "expected simulations of this round; got none; do append_simulations()"
+            )
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        with single_thread():
+            self._model = fit_log_ratios(self._settings, self._rows, seed)
+        return self._model
+
+    def build_posterior(self) -> LFIREModel:
+        """Return the log ratios of this round's particles."""
+        if self._model is None:
+            raise RuntimeError(
+                "expected log ratios of this round; got new rows since the last "
+                "train(), or none; do call train() first"
+            )
+        return self._model
+
+    def update(
+        self,
+        x_o: Tensor,
+        *,
+        action: Tensor,
+        simulator: Callable[..., Any] | None = None,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the belief after a real trial, and make it the current one.
+
+        Args:
+            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN throughout
+                where there was no measurement.
+            action: The executed action, shape (action_dim,) or (1, action_dim).
+            simulator: With one, new particles are simulated at the executed action
+                alone, which allows more of them.
+            refinement: Its ``num_histories`` is how many simulations; None is
+                ``Refinement()``.
+            seed: Of the particles; None draws one from torch's global generator.
+
+        Returns:
+            Kernels around the weighted particles; its diagnostics tell their effective
+            number.
+
+        Raises:
+            RuntimeError: If there is neither a simulator nor a model of this round.
+        """
+        trial = self._observation(x_o, action)
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        settings = Refinement() if refinement is None else refinement
+        if simulator is None:
+            belief = self._weighted(self.build_posterior(), trial, {})
+        else:
+            belief = self._simulated(self.belief, trial, simulator, settings, seed)
+        self.trials.append(trial)
+        self._belief, self._model, self._rows = belief, None, []
+        return belief
+
+    def update_all(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any],
+        *,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the belief of these trials alone, computed from scratch.
+
+        Args:
+            trials: They replace the history; one counts after another.
+            simulator: As in :meth:`update`.
+            refinement: As in :meth:`update`, a trial.
+            seed: As in :meth:`update`.
+
+        Raises:
+            ValueError: If there is no trial.
+        """
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        settings = Refinement() if refinement is None else refinement
+        if not trials:
+            raise ValueError("expected at least one trial; got none; do pass some")
+        spent = {"num_simulations": 0, "num_missing": 0}
+        current: Distribution = self._prior
+        for k, trial in enumerate(trials):
+            own = derive_seed(seed, "trial", k)
+            current = self._simulated(current, trial, simulator, settings, own)
+            spent = {name: n + current.diagnostics[name] for name, n in spent.items()}
+        assert isinstance(current, Belief)
+        current.diagnostics |= spent
+        self.trials = [*trials]
+        self._belief, self._model, self._rows = current, None, []
+        return current
+
+    def _simulated(
+        self,
+        belief: Distribution,
+        trial: Observation,
+        simulator: Callable[..., Any],
+        settings: Refinement,
+        seed: int,
+    ) -> Belief:
+        """Weigh new particles of a belief, simulated at the executed action."""
+        n = settings.num_histories
+        with forked_generators(seed, "theta"):
+            drawn = belief.sample(torch.Size([n]))
+        theta, action = self.arrange(drawn, trial.action.expand(n, -1))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+            rows = simulate(
+                simulator,
+                theta,
+                action,
+                seed=derive_seed(seed, "x"),
+                num_workers=settings.num_workers,
+                time_limit=settings.time_limit,
+                num_retries=settings.num_retries,
+            )
+        known = rows.without_missing()
+        with single_thread():
+            model = fit_log_ratios(
+                self._settings,
+                [RoundRows(known.theta, known.x, known.action)],
+                derive_seed(seed, "folds"),
+            )
+        spent = {"num_simulations": len(rows), "num_missing": rows.counts["missing"]}
+        return self._weighted(model, trial, spent)
+
+    def _weighted(
+        self, model: LFIREModel, trial: Observation, spent: dict[str, int]
+    ) -> Belief:
+        particles = model.particles
+        action = model.nearest_action(trial.action)
+        if not torch.equal(action, trial.action):
+            warnings.warn(
+                f"the executed action {trial.action.tolist()} was not simulated; the "
+                f"ratios are those at {action.tolist()}. Pass a simulator to update().",
+                stacklevel=3,
+            )
+        n = len(particles)
+        rows = trial.x.expand(n, *trial.x.shape), action.expand(n, -1)
+        log_ratio = model.log_ratio(particles, *rows)
+        says_nothing = not bool(log_ratio.isfinite().any())
+        if says_nothing:  # beyond 1e19 float32 has no squares
+            log_ratio = torch.zeros_like(log_ratio)
+        weight = log_ratio.nan_to_num(-torch.inf).softmax(0)
+        belief = KernelBelief(self._prior, particles, weight, bandwidth=self._bandwidth)
+        belief.label = "weighted particles"
+        effective = belief.diagnostics["effective_sample_size"]
+        belief.diagnostics |= {"num_particles": n, **spent}
+        if says_nothing:
+            belief.diagnostics["trustworthy"] = False
+            belief.diagnostics["warnings"].append(
+                "the ratios are finite nowhere at the last trial, which is left out: a "
+                "measurement is wrong, or the simulator lacks much"
+            )
+        if effective < 0.1 * n:
+            belief.diagnostics["warnings"].append(
+                f"{effective:.1f} of {n} particles are effective: the belief is as "
+                "wide as its kernels"
+            )
+        return belief
+
+    def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
+        x = torch.as_tensor(x_o)
+        shape = self._x_shape
+        if shape is None:
+            shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
+        row = action_rows(action, self._action_dim, num_rows=1)[0]
+        rows = outcome_rows(x, shape)
+        require_whole(rows)
+        return Observation(row, rows[0])

@@ -1,0 +1,208 @@
+"""Noise that is correlated along a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.simulation.noise.base import ScaleNoise, standard_normals
+from sbi_active.simulation.noise.gaussian import LOG_2PI
+from sbi_active.simulation.noise.posterior import (
+    InverseChiSquare,
+    NoisePosterior,
+    log_student_evidence,
+)
+
+__all__ = ["AutocorrelatedNoise", "innovations", "time_stamps"]
+
+
+class AutocorrelatedNoise(ScaleNoise):
+    r"""Gaussian noise whose correlation decays exponentially with the time between.
+
+    The stationary Ornstein-Uhlenbeck process, independent in each channel,
+
+    .. math::
+        \mathrm{cov}(e_s, e_t) = \sigma^2 \exp(-|t - s| / \tau), \qquad
+        e_t | e_s \sim N(\rho e_s, \sigma^2 (1 - \rho^2)), \quad
+        \rho = \exp(-(t - s) / \tau),
+
+    exact at irregular time stamps, and with masked numbers skipped. Time is the first
+    axis of x; where x has more axes, channels are the last.
+
+    Args:
+        sd: Standard deviation :math:`\sigma`, in the units of x; a number, or one a
+            channel.
+        correlation_time: :math:`\tau` in seconds, of all channels. Without time stamps
+            it counts samples.
+        posterior: Over (sd, correlation_time), event shape (p,).
+        measurement_sd: Known standard deviation of the measurement alone, where the
+            rest of an unknown sd is what a simulator gets wrong; None where nothing is
+            known of it.
+
+    Raises:
+        ValueError: If a parameter is negative or not finite.
+
+    References:
+        Uhlenbeck & Ornstein, Physical Review 36 (1930).
+
+    Example:
+        >>> noise = AutocorrelatedNoise(1.0, 4.0)
+        >>> x = noise.sample(torch.zeros(3, 50))
+        >>> noise.log_prob(x, torch.zeros(3, 50)).shape
+        torch.Size([3])
+    """
+
+    def __init__(
+        self,
+        sd: float | Tensor,
+        correlation_time: float | Tensor,
+        *,
+        posterior: Distribution | None = None,
+        measurement_sd: float | None = None,
+    ) -> None:
+        super().__init__(
+            sd, shared={"correlation_time": correlation_time}, posterior=posterior
+        )
+        if measurement_sd is not None and not 0 < measurement_sd < float("inf"):
+            raise ValueError(
+                f"expected measurement_sd > 0; got {measurement_sd}; do give the "
+                "sensor's error in the units of x, or None"
+            )
+        self.measurement_sd = measurement_sd
+
+    def _check(self, parameters: Tensor) -> None:
+        super()._check(parameters)
+        tau = parameters[..., -1]
+        if not bool((tau.isfinite() & (tau >= 0)).all()):
+            raise ValueError(
+                f"expected a correlation time >= 0; got {tau.tolist()}; do give it in "
+                "seconds"
+            )
+
+    def _check_shape(self, shape: torch.Size) -> None:
+        if len(shape) == 2 and self._num_sd > 1:
+            raise ValueError(
+                f"expected outcomes of shape (n, T, {self._num_sd}), time before "
+                f"channels; got {tuple(shape)}; do give one standard deviation where x "
+                "has a time axis only"
+            )
+        super()._check_shape(shape)
+
+    def _draw(
+        self,
+        seeds: Tensor | None,
+        shape: torch.Size,
+        parameters: Tensor,
+        times: Tensor | None,
+    ) -> Tensor:
+        normal = standard_normals(seeds, shape).reshape(len(parameters), shape[1], -1)
+        step = time_stamps(times, shape).diff()
+        ratio = step / parameters[:, -1:]
+        rho, spread = torch.exp(-ratio), (-torch.expm1(-2 * ratio)).sqrt()
+        path = [normal[:, 0]]
+        for t in range(shape[1] - 1):
+            path.append(
+                rho[:, t, None] * path[-1] + spread[:, t, None] * normal[:, t + 1]
+            )
+        noise = torch.stack(path, 1).reshape(shape)
+        return self._spread(parameters[:, :-1], shape) * noise
+
+    def _log_density(
+        self, residual: Tensor, parameters: Tensor, times: Tensor | None
+    ) -> Tensor:
+        tau, sd = parameters[:, -1], parameters[:, :-1]
+        square, log_factor, count = self._summed(residual, tau, times)
+        density = -0.5 * square / sd**2 - count * (sd.log() + 0.5 * LOG_2PI)
+        return (density - 0.5 * log_factor).sum(1)
+
+    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
+        posterior = self.posterior
+        if not isinstance(posterior, NoisePosterior) or not isinstance(
+            posterior.sd, InverseChiSquare
+        ):
+            return super()._marginal(residual, times)
+        assert posterior.shared is not None
+        edges, log_weight = posterior.shared.edges, posterior.shared.log_weight
+        terms = []
+        for cell, weight in enumerate(log_weight.tolist()):
+            tau = (edges[cell] * edges[cell + 1]).sqrt().expand(len(residual))
+            square, log_factor, count = self._summed(residual, tau, times)
+            evidence = log_student_evidence(square, count, posterior.sd, cell=cell)
+            terms.append((evidence - 0.5 * log_factor).sum(1) + weight)
+        return torch.stack(terms).logsumexp(0)
+
+    def _summed(
+        self, residual: Tensor, tau: Tensor, times: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the innovations' sums, each of shape (n, channels)."""
+        square, log_factor = innovations(residual, tau, times)
+        count = (~residual.isnan()).double()
+        square, log_factor, count = (
+            self._by_channel(part.reshape(residual.shape))
+            for part in (square, log_factor, count)
+        )
+        return square, log_factor, count
+
+
+def innovations(
+    residual: Tensor, tau: Tensor, times: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    r"""Whiten residuals, up to the standard deviation, by the Markov chain.
+
+    .. math::
+        u_t = \frac{e_t - \rho e_s}{\sqrt{1 - \rho^2}}, \qquad
+        \log |R| = \sum_t \log(1 - \rho^2),
+
+    with s the last time observed before t, and :math:`u_t = e_t` where there is none.
+
+    Args:
+        residual: Shape (n, T, ...), NaN where not observed.
+        tau: Correlation times, shape (n,).
+        times: Shape (T,) or (n, T); None for 0, 1, 2, ...
+
+    Returns:
+        :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero where not observed, shapes (n,
+        T, rest).
+    """
+    e = residual.flatten(2) if residual.ndim > 2 else residual[..., None]
+    stamp = time_stamps(times, residual.shape).to(e.device)[..., None].expand(e.shape)
+    observed = ~e.isnan()
+    index = torch.arange(e.shape[1], device=e.device)[:, None].expand(e.shape[1:])
+    index = torch.where(observed, index, -1)
+    before = torch.full_like(index[:, :1], -1)
+    before = torch.cat([before, index.cummax(1).values[:, :-1]], 1)
+    source = before.clamp_min(0)
+    first = before < 0
+    step = torch.where(first, torch.inf, stamp - stamp.gather(1, source))
+    ratio = step / tau[:, None, None]
+    rho, variance = torch.exp(-ratio), -torch.expm1(-2 * ratio)
+    past = torch.where(first, 0.0, e.gather(1, source))
+    square = (e - rho * past).square() / variance
+    log_factor = torch.where(observed, variance.log(), 0.0)
+    return torch.where(observed, square, 0.0), log_factor
+
+
+def time_stamps(times: Tensor | None, shape: Sequence[int]) -> Tensor:
+    """Return time stamps of every row of (n, T, ...), shape (n, T), float64.
+
+    Raises:
+        ValueError: If they do not fit x's time axis or do not increase.
+    """
+    n, num = shape[0], shape[1]
+    if times is None:
+        return torch.arange(num, dtype=torch.float64).expand(n, num)
+    times = torch.as_tensor(times, dtype=torch.float64)
+    if times.shape not in ((num,), (n, num)):
+        raise ValueError(
+            f"expected times of shape ({num},) or ({n}, {num}), one a sample of x's "
+            f"first axis; got {tuple(times.shape)}; do give the stamps of x {(*shape,)}"
+        )
+    if not bool((times.diff() > 0).all()):
+        raise ValueError(
+            f"expected times that increase; got {times.tolist()}; do sort x by time "
+            "and drop repeated stamps"
+        )
+    return times.expand(n, num)

@@ -1,0 +1,306 @@
+"""What a noise model is, and what those with a standard deviation share."""
+
+from __future__ import annotations
+
+import copy
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.seeding import forked_generators, row_normals, row_uniforms
+from sbi_active.simulation.noise.posterior import NoisePosterior
+
+__all__ = ["NoiseModel", "ScaleNoise", "observed_terms", "standard_normals"]
+
+NUM_DRAWS = 256  # of a posterior that is not one of this library's own
+
+
+class NoiseModel(ABC):
+    r"""Distribution of an observation around the simulator's noise-free output.
+
+    A number of x that is NaN was not observed and is integrated out exactly; a row
+    without any number has log density 0. Where x has a number and the mean has none,
+    the log density is minus infinity, and observations of a mean that is NaN are NaN.
+
+    Parameters are declared exactly, or have a posterior :math:`p(\eta | D)`. With one,
+    samples and densities are those of the marginal
+
+    .. math::
+        p(x | \mu) = \int p(x | \mu, \eta) \, p(\eta | D) \, d\eta
+
+    of every row by itself: each has a draw of its own. Where several rows share one
+    unknown :math:`\eta`, draw it from ``posterior`` and give it as ``parameters``.
+
+    Attributes:
+        parameter_names: One a parameter.
+        parameters: Their values in natural units, shape (p,), float64.
+        posterior: Over the parameters, event shape (p,); None where they are declared
+            exactly.
+        times: Time stamps of the first axis of x in seconds, shape (T,); None where
+            nobody gave them.
+    """
+
+    parameter_names: tuple[str, ...] = ()
+    parameters: Tensor = torch.empty(0, dtype=torch.float64)
+    posterior: Distribution | None = None
+    times: Tensor | None = None
+
+    def at(self, times: Tensor | None) -> NoiseModel:
+        """Return the same noise at time stamps (T,), in seconds."""
+        noise = copy.copy(self)
+        noise.times = None if times is None else _copied(times)
+        return noise
+
+    @abstractmethod
+    def sample(
+        self,
+        mean: Tensor,
+        seeds: Tensor | None = None,
+        *,
+        times: Tensor | None = None,
+        parameters: Tensor | None = None,
+    ) -> Tensor:
+        """Return observations.
+
+        Args:
+            mean: Noise-free outputs, shape (n, *x_shape).
+            seeds: One a row, shape (n,), and row i depends on ``seeds[i]`` alone; None
+                draws from torch's global generator.
+            times: Of x's first axis in seconds, shape (T,) or one set a row (n, T);
+                None takes those of the model.
+            parameters: Shape (p,), or one set a row (n, p); None takes the model's own,
+                or for each row a draw from the posterior.
+
+        Returns:
+            Shape (n, *x_shape).
+        """
+
+    @abstractmethod
+    def log_prob(
+        self,
+        x: Tensor,
+        mean: Tensor,
+        *,
+        times: Tensor | None = None,
+        parameters: Tensor | None = None,
+    ) -> Tensor:
+        """Return the log density of observations.
+
+        Args:
+            x: Observations, shape (n, *x_shape); NaN where a number was not observed.
+            mean: Noise-free outputs, broadcastable to x.
+            times: As in :meth:`sample`.
+            parameters: As in :meth:`sample`; None with a posterior gives the marginal.
+
+        Returns:
+            Shape (n,), float64, nats.
+        """
+
+
+class ScaleNoise(NoiseModel):
+    r"""Noise with a standard deviation and further parameters common to all channels.
+
+    Checks and shapes stand here; a kind of noise implements ``_draw`` and
+    ``_log_density`` given parameters, and ``_marginal`` where it has a closed form.
+
+    Args:
+        sd: Standard deviation, in the units of x; a number, or one a channel (the last
+            axis of x). Its parameters are named "sd", or "sd_1", "sd_2", ...
+        shared: Further parameters by name, which follow those.
+        posterior: Over the parameters, event shape (p,). One that
+            :func:`.estimate_noise` did not make is represented
+            by 256 fixed draws of equal weight.
+    """
+
+    def __init__(
+        self,
+        sd: float | Tensor,
+        *,
+        shared: Mapping[str, float | Tensor] | None = None,
+        posterior: Distribution | None = None,
+    ) -> None:
+        self.sd = _copied(sd)
+        if self.sd.ndim > 1:
+            raise ValueError(
+                "expected a standard deviation that is a number or one a channel; got "
+                f"shape {tuple(self.sd.shape)}; do give shape () or (channels,)"
+            )
+        self._num_sd = self.sd.numel()
+        shared = {} if shared is None else shared
+        names = [f"sd_{c + 1}" for c in range(self._num_sd)] if self.sd.ndim else ["sd"]
+        self.parameter_names = (*names, *shared)
+        values = [torch.as_tensor(v, dtype=torch.float64) for v in shared.values()]
+        self.parameters = torch.cat(
+            [self.sd.reshape(-1), *(v.reshape(1) for v in values)]
+        )
+        self.posterior = posterior
+        self._table: Tensor | None = None
+        self._check(self.parameters)
+
+    def __repr__(self) -> str:
+        values = self.parameters[self._num_sd :].tolist()
+        names = self.parameter_names[self._num_sd :]
+        parts = {"sd": self.sd.tolist(), **dict(zip(names, values, strict=True))}
+        text = ", ".join(f"{k}={v}" for k, v in parts.items())
+        known = "" if self.posterior is None else ", with a posterior"
+        return f"{type(self).__name__}({text}{known})"
+
+    def sample(
+        self,
+        mean: Tensor,
+        seeds: Tensor | None = None,
+        *,
+        times: Tensor | None = None,
+        parameters: Tensor | None = None,
+    ) -> Tensor:
+        shape = mean.shape
+        self._check_shape(shape)
+        if parameters is None and self.posterior is not None:
+            parameters = self._draw_parameters(seeds, shape)
+        rows = self._rows(parameters, len(mean))
+        noise = self._draw(seeds, shape, rows, self.times if times is None else times)
+        return mean + noise.to(mean)
+
+    def log_prob(
+        self,
+        x: Tensor,
+        mean: Tensor,
+        *,
+        times: Tensor | None = None,
+        parameters: Tensor | None = None,
+    ) -> Tensor:
+        x, mean = _broadcast(x, mean)
+        self._check_shape(x.shape)
+        observed = ~x.isnan()
+        impossible = observed & ~(x.isfinite() & mean.isfinite())
+        residual = torch.where(observed & ~impossible, x - mean, torch.nan)
+        times = self.times if times is None else times
+        if parameters is None and self.posterior is not None:
+            density = self._marginal(residual, times)
+        else:
+            rows = self._rows(parameters, len(x))
+            if not bool((rows[:, : self._num_sd] > 0).all()):
+                raise ValueError(
+                    "expected a standard deviation > 0 for a density; got 0, at which "
+                    "there is none; do give the noise of every channel"
+                )
+            density = self._log_density(residual, rows.to(x.device), times)
+        return density.masked_fill(impossible.flatten(1).any(1), -torch.inf)
+
+    @abstractmethod
+    def _draw(
+        self,
+        seeds: Tensor | None,
+        shape: torch.Size,
+        parameters: Tensor,
+        times: Tensor | None,
+    ) -> Tensor:
+        """Return noise of a shape (n, *x_shape), float64; parameters (n, p)."""
+
+    @abstractmethod
+    def _log_density(
+        self, residual: Tensor, parameters: Tensor, times: Tensor | None
+    ) -> Tensor:
+        """Return log densities (n,) of residuals, NaN where not observed."""
+
+    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
+        """Return log densities (n,) averaged over the posterior's fixed draws."""
+        draws = self._fixed_draws().to(residual.device)
+        terms = [
+            self._log_density(residual, draw.expand(len(residual), -1), times)
+            for draw in draws
+        ]
+        return torch.stack(terms).logsumexp(0) - math.log(len(draws))
+
+    def _check(self, parameters: Tensor) -> None:
+        """Raise where parameters (..., p) are outside their range."""
+        sd = parameters[..., : self._num_sd]
+        if not bool((sd.isfinite() & (sd >= 0)).all()):
+            raise ValueError(
+                f"expected a standard deviation >= 0; got {sd.tolist()}; do give it in "
+                "the units of x"
+            )
+
+    def _check_shape(self, shape: torch.Size) -> None:
+        """Raise where outcomes (n, *x_shape) do not fit the channels."""
+        if len(shape) < 2 or self._num_sd not in (1, shape[-1]):
+            raise ValueError(
+                f"expected outcomes of shape (n, ..., {self._num_sd}), one standard "
+                f"deviation a channel; got {tuple(shape)}; do give one number, or one "
+                "an entry of the last axis"
+            )
+
+    def _rows(self, parameters: Tensor | None, num_rows: int) -> Tensor:
+        """Return checked parameters, shape (n, p)."""
+        num = len(self.parameter_names)
+        if parameters is None:
+            return self.parameters.expand(num_rows, num)
+        parameters = torch.as_tensor(parameters, dtype=torch.float64)
+        if parameters.shape not in ((num,), (num_rows, num)):
+            raise ValueError(
+                f"expected parameters of shape ({num},) or ({num_rows}, {num}), for "
+                f"{', '.join(self.parameter_names)}; got {tuple(parameters.shape)}; do "
+                "give one set, or one a row"
+            )
+        self._check(parameters)
+        return parameters.expand(num_rows, num)
+
+    def _draw_parameters(self, seeds: Tensor | None, shape: torch.Size) -> Tensor:
+        """Return one draw of the posterior a row, shape (n, p)."""
+        num = len(self.parameter_names)
+        if seeds is None:
+            uniform = torch.rand(shape[0], num, dtype=torch.float64)
+        else:  # behind the numbers that the noise itself takes
+            uniform = row_uniforms(seeds, num, first=2 * math.prod(shape[1:]))
+        if isinstance(self.posterior, NoisePosterior):
+            return self.posterior.quantile(uniform)
+        draws = self._fixed_draws()
+        return draws[(uniform[:, 0] * len(draws)).long()]
+
+    def _fixed_draws(self) -> Tensor:
+        if self._table is None:
+            assert self.posterior is not None
+            with forked_generators(0, "noise posterior"):
+                self._table = self.posterior.sample((NUM_DRAWS,)).double()
+        return self._table
+
+    def _spread(self, sd: Tensor, shape: torch.Size) -> Tensor:
+        """Return standard deviations (n, channels) for shape (n, *x_shape)."""
+        return sd.reshape(len(sd), *[1] * (len(shape) - 2), self._num_sd)
+
+    def _by_channel(self, terms: Tensor) -> Tensor:
+        """Return sums over all but the channels, (n, *x_shape) -> (n, num_sd)."""
+        return terms.reshape(len(terms), -1, self._num_sd).sum(1)
+
+
+def _copied(values: Any) -> Tensor:
+    """Return numbers in float64 that their owner cannot change afterwards."""
+    return torch.as_tensor(values, dtype=torch.float64).clone()
+
+
+def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:
+    """Return terms of a sum, zero where the residual was not observed."""
+    return torch.where(residual.isnan(), 0.0, terms)
+
+
+def standard_normals(seeds: Tensor | None, shape: torch.Size) -> Tensor:
+    """Return standard normal numbers of a shape (n, *x_shape), float64."""
+    if seeds is None:
+        return torch.randn(shape, dtype=torch.float64)
+    return row_normals(seeds, math.prod(shape[1:])).reshape(shape)
+
+
+def _broadcast(x: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    try:
+        x, mean = torch.broadcast_tensors(x.double(), mean.double())
+    except RuntimeError as error:
+        raise ValueError(
+            "expected a mean broadcastable to x; got shapes "
+            f"{tuple(mean.shape)} and {tuple(x.shape)}; do give one mean a row"
+        ) from error
+    return x, mean

@@ -1,0 +1,290 @@
+"""The noise of a system from repeated measurements."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.linalg import helmert
+from scipy.special import chdtri
+from torch import Tensor
+
+from sbi_active.simulation.noise.autocorrelated import (
+    AutocorrelatedNoise,
+    innovations,
+    time_stamps,
+)
+from sbi_active.simulation.noise.gaussian import GaussianNoise, NoiseModel
+from sbi_active.simulation.noise.posterior import (
+    Cells,
+    InverseChiSquare,
+    NoisePosterior,
+    SdGrid,
+)
+from sbi_active.simulation.noise.student import StudentTNoise, log_student
+
+__all__ = ["NoiseKind", "estimate_noise"]
+
+NoiseKind = Literal["gaussian", "autocorrelated", "student"]
+
+TAU_CELLS = 96
+TAU_SHORTEST = 0.1  # of the shortest time step: no correlation that could be seen
+TAU_LONGEST = 3.0  # times the time between first and last sample
+DF_EDGES = torch.logspace(math.log10(2.05), 2, 17, dtype=torch.float64)
+SD_CELLS = 48
+TAIL = 1e-4  # of the standard deviation's posterior that the grid may cut off
+MEAN_NODES = 129  # of the quadrature over an unknown mean
+MEAN_MARGIN = 10.0  # of its range beyond the data, in scales
+NEGLIGIBLE = 1e-7  # weight of a cell relative to the largest
+CHUNK = 4_000_000  # numbers at once
+
+Array = Tensor | np.ndarray
+
+
+def estimate_noise(
+    repeats: Array | Sequence[Array],
+    *,
+    kind: NoiseKind = "gaussian",
+    times: Tensor | None = None,
+    pooled: bool = False,
+) -> NoiseModel:
+    r"""Return a noise model with a posterior over its parameters.
+
+    Every group of repeats has a mean of its own, which is integrated out under a flat
+    prior, as is the standard deviation's :math:`p(\sigma) \propto 1 / \sigma`:
+
+    * "gaussian": :math:`\nu s^2 / \sigma^2 \sim \chi^2_\nu`, exactly, with :math:`\nu`
+      the number of measurements less that of means and :math:`\nu s^2` their sum of
+      squares.
+    * "autocorrelated": the same given :math:`\tau`, whose posterior is
+
+      .. math::
+          p(\tau | D) \propto p(\tau) \, |R_\tau|^{-1/2} \prod_c Q_c(\tau)^{-\nu_c / 2}
+
+      on a grid, with R the correlation of the contrasts between repeats and Q their
+      whitened sum of squares. The prior is uniform in :math:`\log \tau` from a tenth of
+      the shortest time step to three times the recording.
+    * "student": a grid over the degrees of freedom, prior Gamma(2, 0.1) within [2.05,
+      100], and the standard deviations; means are integrated by quadrature.
+
+    The point values in ``noise.parameters`` are s and medians.
+
+    Args:
+        repeats: Measurements of one action on one system, shape (k, *x_shape); or a
+            sequence of such groups, of several actions. NaN masks a number, and a
+            repeat of NaN alone is left out.
+        kind: Of the noise.
+        times: Time stamps of the first axis of x in seconds, shape (T,).
+        pooled: One standard deviation for all numbers, not one a channel (an entry of
+            the last axis of x). Autocorrelated noise of x of shape (T,) is always so.
+
+    Returns:
+        The noise model, whose ``posterior`` is over its parameters.
+
+    Raises:
+        ValueError: If there are fewer than two repeats, or all are identical.
+
+    References:
+        Gelman et al., Bayesian Data Analysis, 3rd edition, section 3.2; Juarez & Steel,
+        JBES 28 (2010), for the prior of the degrees of freedom.
+
+    Example:
+        >>> x = torch.tensor([[1.0], [2.0], [4.0]])
+        >>> noise = estimate_noise(x)
+        >>> noise.parameters, noise.posterior.sample((5,)).shape
+        (tensor([1.5275], dtype=torch.float64), torch.Size([5, 1]))
+    """
+    if kind not in ("gaussian", "autocorrelated", "student"):
+        raise ValueError(
+            "expected kind among 'gaussian', 'autocorrelated', 'student'; got "
+            f"{kind!r}; do choose one of these"
+        )
+    groups = _groups(repeats)
+    shape = groups[0].shape[1:]
+    trajectory = kind == "autocorrelated" and len(shape) == 1
+    num_sd = 1 if pooled or trajectory else shape[-1]
+    if kind == "gaussian":
+        noise = _gaussian(groups, num_sd)
+    elif kind == "autocorrelated":
+        noise = _autocorrelated(groups, num_sd, times)
+    else:
+        noise = _student(groups, num_sd)
+    return noise if times is None else noise.at(times)
+
+
+def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
+    """Return groups (k, *x_shape) of at least two repeats with a measurement."""
+    single = isinstance(repeats, Tensor | np.ndarray)
+    groups = [torch.as_tensor(g).double() for g in ([repeats] if single else repeats)]
+    groups = [g[:, None] if g.ndim == 1 else g for g in groups]
+    if not groups or any(
+        g.ndim < 2 or g.shape[1:] != groups[0].shape[1:] for g in groups
+    ):
+        raise ValueError(
+            "expected repeats of shape (k, *x_shape), or groups of such; got "
+            f"{[tuple(g.shape) for g in groups]}; do give a list of tensors of one "
+            "x_shape"
+        )
+    groups = [g[g.flatten(1).isfinite().any(1)] for g in groups]
+    freedom = sum(max(len(g) - 1, 0) for g in groups)
+    if freedom == 0:
+        raise ValueError(
+            f"expected at least 2 repeats of one action; got {len(groups[0])}; do "
+            "repeat a trial: without repeats nothing separates noise from the system"
+        )
+    if freedom == 1:
+        warnings.warn(
+            "expected at least 3 repeats to estimate noise; got 2, from which the "
+            "standard deviation is known to a factor of 30; do repeat the trial again",
+            UserWarning,
+            stacklevel=3,
+        )
+    return [g for g in groups if len(g) > 1]
+
+
+def _gaussian(groups: list[Tensor], num_sd: int) -> GaussianNoise:
+    square, freedom = _sums_of_squares(groups, num_sd)
+    conditional = InverseChiSquare(freedom, (square / freedom)[None])
+    sd = conditional.variance[0].sqrt()
+    posterior = NoisePosterior(conditional)
+    return GaussianNoise(_scalar_if_one(sd), posterior=posterior)
+
+
+def _sums_of_squares(groups: list[Tensor], num_sd: int) -> tuple[Tensor, Tensor]:
+    """Return squares around the means of groups and their degrees of freedom."""
+    square = torch.zeros(num_sd, dtype=torch.float64)
+    freedom = torch.zeros(num_sd, dtype=torch.float64)
+    for group in groups:
+        deviation = (group - group.nanmean(0)).square().nansum(0)
+        count = ((~group.isnan()).sum(0) - 1).clamp_min(0)
+        square += deviation.reshape(-1, num_sd).sum(0)
+        freedom += count.reshape(-1, num_sd).sum(0)
+    _require_scatter(square, freedom)
+    return square, freedom
+
+
+def _require_scatter(square: Tensor, freedom: Tensor) -> None:
+    if bool((freedom == 0).any()):
+        raise ValueError(
+            "expected at least 2 repeats of every channel; got none for channels "
+            f"{torch.nonzero(freedom == 0)[:, 0].tolist()}; do repeat the trial, or "
+            "set pooled=True"
+        )
+    if bool((square <= 0).any()):
+        raise ValueError(
+            "expected repeats that differ; got identical ones in channels "
+            f"{torch.nonzero(square <= 0)[:, 0].tolist()}; do measure with more "
+            "digits, or declare the noise, GaussianNoise(sd)"
+        )
+
+
+def _autocorrelated(
+    groups: list[Tensor], num_sd: int, times: Tensor | None
+) -> AutocorrelatedNoise:
+    # Contrasts are independent, of mean zero, and have the noise's own covariance.
+    # A number missing in one repeat is missing in all contrasts of its group.
+    contrast = torch.cat(
+        [
+            (torch.from_numpy(helmert(len(g))) @ g.flatten(1)).reshape(-1, *g.shape[1:])
+            for g in groups
+        ]
+    )
+    if contrast.shape[1] < 3:
+        raise ValueError(
+            "expected x with a time axis of at least 3 samples; got x of shape "
+            f"{tuple(contrast.shape[1:])}; do estimate kind='gaussian'"
+        )
+    stamps = time_stamps(times, (1, contrast.shape[1]))[0]
+    edges = torch.logspace(
+        math.log10(TAU_SHORTEST * float(stamps.diff().min())),
+        math.log10(TAU_LONGEST * float(stamps[-1] - stamps[0])),
+        TAU_CELLS + 1,
+        dtype=torch.float64,
+    )
+    freedom = (~contrast.isnan()).double().reshape(-1, num_sd).sum(0)
+    squares, log_weight = [], []
+    for tau in (edges[1:] * edges[:-1]).sqrt():
+        square, log_factor = innovations(contrast, tau.expand(len(contrast)), times)
+        square = square.reshape(-1, num_sd).sum(0)
+        _require_scatter(square, freedom)
+        squares.append(square)
+        log_weight.append(
+            -0.5 * log_factor.sum() - 0.5 * (freedom * square.log()).sum()
+        )
+    shared, kept = _heavy(edges, torch.stack(log_weight))
+    conditional = InverseChiSquare(freedom, torch.stack(squares)[kept] / freedom)
+    cell, tau = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
+    return AutocorrelatedNoise(
+        _scalar_if_one(conditional.variance[cell].sqrt()),
+        tau,
+        posterior=NoisePosterior(conditional, shared=shared),
+    )
+
+
+def _heavy(edges: Tensor, log_weight: Tensor) -> tuple[Cells, slice]:
+    """Return the range of cells that carry weight, normalized."""
+    heavy = torch.nonzero(log_weight > log_weight.max() + math.log(NEGLIGIBLE))[:, 0]
+    first, last = int(heavy[0]), int(heavy[-1])
+    kept = slice(first, last + 1)
+    weight = log_weight[kept].log_softmax(0)
+    return Cells(edges[first : last + 2], weight), kept
+
+
+def _student(groups: list[Tensor], num_sd: int) -> StudentTNoise:
+    square, freedom = _sums_of_squares(groups, num_sd)
+    # The Gaussian's range, wider: an outlier or df near 2 moves the posterior.
+    low, high = (
+        (square / torch.from_numpy(chdtri(freedom.numpy(), level))).sqrt()
+        for level in (TAIL, 1 - TAIL)
+    )
+    share = torch.linspace(0, 1, SD_CELLS + 1, dtype=torch.float64)
+    edges = (low[:, None] / 3) * (9 * high / low)[:, None] ** share
+    nodes = (edges[:, 1:] * edges[:, :-1]).sqrt()  # (channels, s)
+    df_nodes = (DF_EDGES[1:] * DF_EDGES[:-1]).sqrt()
+    log_p = torch.zeros(len(df_nodes), num_sd, SD_CELLS, dtype=torch.float64)
+    for group in groups:
+        numbers = group.reshape(len(group), -1, num_sd)
+        for channel in range(num_sd):
+            column = numbers[:, :, channel]
+            column = column[:, (~column.isnan()).sum(0) > 1]
+            for i, df in enumerate(df_nodes):
+                scale = nodes[channel] * ((df - 2) / df).sqrt()
+                log_p[i, channel] += _log_evidence(column, scale, df)
+    # The prior of sd is uniform over cells, each as wide in its logarithm.
+    log_prior = df_nodes.log() - 0.1 * df_nodes + torch.log(DF_EDGES.diff())
+    shared, kept = _heavy(DF_EDGES, log_prior + log_p.logsumexp(2).sum(1))
+    grid = SdGrid(edges, log_p[kept].log_softmax(2))
+    cell, df = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
+    middle = torch.full((1, num_sd), 0.5, dtype=torch.float64)
+    sd = grid.quantile(cell.reshape(1), middle)[0]
+    posterior = NoisePosterior(grid, shared=shared)
+    return StudentTNoise(_scalar_if_one(sd), df, posterior=posterior)
+
+
+def _log_evidence(x: Tensor, scale: Tensor, df: Tensor) -> Tensor:
+    """Return the log evidence of repeats (k, j) with means integrated out, (s,)."""
+    total = torch.zeros(len(scale), dtype=torch.float64)
+    low, high = x.nan_to_num(torch.inf).amin(0), x.nan_to_num(-torch.inf).amax(0)
+    share = torch.linspace(0, 1, MEAN_NODES, dtype=torch.float64)
+    margin = MEAN_MARGIN * scale[:, None]
+    size = max(1, CHUNK // (len(scale) * len(x) * MEAN_NODES))
+    for rows in torch.arange(x.shape[1]).split(size):
+        start = low[rows] - margin  # (s, j)
+        width = high[rows] + margin - start
+        mean = start[..., None] + width[..., None] * share  # (s, j, m)
+        density = torch.zeros_like(mean)
+        for repeat in x[:, rows]:
+            z = (repeat[:, None] - mean) / scale[:, None, None]
+            term = log_student(z, df) - scale.log()[:, None, None]
+            density += torch.where(repeat.isnan()[:, None], 0.0, term)
+        step = (width / (MEAN_NODES - 1)).log()
+        total += (density.logsumexp(-1) + step).sum(1)
+    return total
+
+
+def _scalar_if_one(sd: Tensor) -> Tensor:
+    return sd[0] if len(sd) == 1 else sd

@@ -1,0 +1,269 @@
+"""Run a simulator over rows so that x depends on nothing but its seed."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from typing import Any
+
+import torch
+from joblib import effective_n_jobs
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation.model import takes_seeds
+from sbi_active.simulation.outcomes import (
+    MissingRowsWarning,
+    Outcome,
+    SimulationInterrupted,
+    Simulations,
+)
+from sbi_active.simulation.simulator import require_noise
+from sbi_active.simulation.workers.cluster import configured_pool
+from sbi_active.simulation.workers.pace import pace_of
+from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
+from sbi_active.simulation.workers.schedule import Schedule
+from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
+
+__all__ = ["simulate"]
+
+
+def simulate(
+    simulator: Callable[..., Any],
+    theta: Tensor,
+    action: Tensor,
+    *,
+    seed: int,
+    num_workers: int = 1,
+    batch_size: int | None = None,
+    time_limit: float | None = None,
+    num_retries: int = 0,
+    show_progress: bool = False,
+    store: RowStore | None = None,
+    check_noise: bool = False,
+) -> Simulations:
+    r"""Draw :math:`x_i \sim p(x | \theta_i, \xi_i)`.
+
+    x is a function of the seed, theta and the action, whatever the number of workers
+    and the size of a batch. A simulator that takes ``seeds`` gets one a row. Any other
+    runs in fixed blocks of 256 rows under forked generators of torch and NumPy, which
+    are restored; where such a block fails, its rows run singly, each under generators
+    of its own, so that their x differs from what it would have been, though it is
+    still a function of the seed and the row.
+
+    A row whose call raises, ends its process or exceeds the time limit is missing, with
+    the text of its traceback, and costs no other row. A row of NaN or infinite numbers
+    alone is invalid. A simulator that fails on every row, or returns other rows than it
+    was given, raises: that is no fault of a row.
+
+    More than one worker means processes of this machine, one thread each, which receive
+    the simulator once. They wait a minute for the next call with the same simulator, so
+    that a module of it that is edited meanwhile is not read again. Another executor is
+    one line of joblib's configuration. Dask::
+
+        client = distributed.Client("scheduler:8786")
+        with joblib.parallel_config(backend="dask"):
+            simulate(simulator, theta, action, seed=0, num_workers=64)
+
+    A lost Dask worker loses no rows. Ray is configured likewise, by
+    ``ray.util.joblib.register_ray()`` and ``parallel_config(backend="ray")``, which is
+    not tested. Time limits need the processes of this machine.
+
+    Args:
+        simulator: ``simulator(theta, action)``, see
+            :class:`.Simulator`.
+        theta: Parameters, shape (n, theta_dim).
+        action: Actions, shape (n, action_dim).
+        seed: Seed of the whole set.
+        num_workers: Calls at a time; -1 means one a core. One worker without a time
+            limit is this process.
+        batch_size: Rows a call; None gives workers as many as take a quarter of a
+            second. A simulator in this process is given all at once, or, after its
+            first rows have shown that this would take long, as many as take about a
+            second: an interrupt loses no more. One that takes no seeds is given whole
+            blocks.
+        time_limit: Seconds a row, loading the simulator not counted; a batch may take
+            as much as its rows. None waits for ever.
+        num_retries: How often a missing row is tried again, with the same seed.
+        show_progress: Show a progress bar.
+        store: Keeps finished rows, every half second, and gives those that it has.
+        check_noise: Simulate the first rows under a second seed and raise where
+            nothing differs.
+
+    Returns:
+        The simulations, x in float32.
+
+    Raises:
+        ValueError: If the shapes do not fit, or the simulator is deterministic and
+            ``check_noise`` is set.
+        SimulationError: If no row could be simulated.
+        SimulationInterrupted: On a keyboard interrupt; it carries what is finished.
+
+    Example:
+        >>> rows = simulate(
+        ...     lambda theta, action: theta * action + torch.randn_like(theta),
+        ...     torch.ones(3, 1), torch.ones(3, 1), seed=0,
+        ... )
+        >>> rows.x.shape
+        torch.Size([3, 1])
+    """
+    theta, action = _checked(torch.as_tensor(theta), torch.as_tensor(action))
+    _check_options(num_workers, batch_size, time_limit, num_retries)
+    pool = _pool(simulator, num_workers, time_limit)
+    pace = None
+    if not isinstance(pool, InProcess):
+        theta, action = theta.detach().cpu(), action.detach().cpu()
+    elif batch_size is None and not show_progress and store is None:
+        pace = pace_of(simulator)  # nobody looks on
+    options = {
+        "has_seeds": takes_seeds(simulator),
+        "time_limit": time_limit,
+        "num_retries": num_retries,
+        "batch_size": batch_size,
+        "pace": pace,
+    }
+    schedule = Schedule(theta, action, seed=seed, **options)
+    with closing(pool):
+        _run(schedule, pool, store, show_progress)
+        rows = _simulations(schedule)
+        if check_noise:
+            few = slice(0, 16)
+            again = derive_seed(seed, "again")
+            other = Schedule(theta[few], action[few], seed=again, **options)
+            other.run(pool)
+            if other.x is not None:
+                require_noise(rows.x[few], other.x)
+    _warn(schedule)
+    return rows
+
+
+def _checked(theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
+        raise ValueError(
+            "expected theta (n, theta_dim) and action (n, action_dim) with as many "
+            f"rows; got {tuple(theta.shape)} and {tuple(action.shape)}; do repeat the "
+            "action for each row"
+        )
+    if not len(theta):
+        raise ValueError("expected at least one row; got none; do pass theta of n >= 1")
+    theta, action = _own_rows(theta), _own_rows(action)
+    for name, rows in (("theta", theta), ("action", action)):
+        finite = rows.isfinite().flatten(1).all(-1)
+        if not bool(finite.all()):
+            bad = torch.nonzero(~finite).flatten()
+            raise ValueError(
+                f"expected finite {name}; got NaN or inf in {len(bad)} rows, first "
+                f"{int(bad[0])}: {rows[bad[0]].tolist()}; do remove those rows"
+            )
+    return theta, action
+
+
+def _own_rows(rows: Tensor) -> Tensor:
+    """Return parameters or actions in float32, which no caller changes later."""
+    if rows.is_complex():
+        raise ValueError(
+            f"expected theta and action of real numbers; got {rows.dtype}; pass the "
+            "real and the imaginary part as two columns"
+        )
+    return rows.to(torch.float32, copy=True)
+
+
+def _check_options(
+    num_workers: int,
+    batch_size: int | None,
+    time_limit: float | None,
+    num_retries: int,
+) -> None:
+    if num_workers < 1 and num_workers != -1:
+        raise ValueError(
+            f"expected num_workers >= 1, or -1 for one a core; got {num_workers}; do "
+            "use 1 to simulate in this process"
+        )
+    if batch_size is not None and batch_size < 1:
+        raise ValueError(
+            f"expected batch_size >= 1; got {batch_size}; do use None to have it chosen"
+        )
+    if time_limit is not None and not time_limit > 0:
+        raise ValueError(
+            f"expected time_limit > 0 s a row; got {time_limit}; do use None to wait "
+            "for ever"
+        )
+    if num_retries < 0:
+        raise ValueError(
+            f"expected num_retries >= 0; got {num_retries}; do use 0 to try once"
+        )
+
+
+def _pool(
+    simulator: Callable[..., Any], num_workers: int, time_limit: float | None
+) -> Pool:
+    if num_workers == 1 and time_limit is None:
+        return InProcess(simulator)
+    elsewhere = configured_pool(simulator, num_workers)
+    if elsewhere is None:
+        return WorkerPool(simulator, effective_n_jobs(num_workers))
+    if time_limit is not None:
+        raise ValueError(
+            "expected the processes of this machine for time_limit; got another "
+            "executor from joblib.parallel_config, whose workers cannot be killed from "
+            "here; do simulate outside that block, or limit the time in the simulator"
+        )
+    return elsewhere
+
+
+def _run(
+    schedule: Schedule, pool: Pool, store: RowStore | None, show_progress: bool
+) -> None:
+    theta, action, seed = schedule.theta, schedule.action, schedule.seed
+    recorder = None
+    num_restored = 0
+    if store is not None:
+        run = run_digest(seed, theta, action)
+        recorder = Recorder(store, run, theta, action, seed)
+        stored = store.load(run)
+        if stored is not None:
+            num_restored = schedule.restore(*map(torch.as_tensor, stored))
+    bar = tqdm(
+        total=len(theta), initial=num_restored, unit="row", disable=not show_progress
+    )
+
+    def on_rows(index: Tensor, x: Tensor, status: Tensor) -> None:
+        bar.update(len(index))
+        if recorder is not None:
+            recorder.add(index, x, status)
+
+    schedule.on_rows = on_rows
+    try:
+        schedule.run(pool)
+    except KeyboardInterrupt:
+        if schedule.x is None:
+            raise
+        raise SimulationInterrupted(_simulations(schedule)) from None
+    finally:
+        bar.close()
+        if recorder is not None:
+            recorder.flush()
+
+
+def _simulations(schedule: Schedule) -> Simulations:
+    assert schedule.x is not None
+    status = schedule.status.clone()
+    status[status < 0] = Outcome.MISSING  # interrupted
+    tracebacks = dict(sorted(schedule.tracebacks.items()))
+    return Simulations(schedule.theta, schedule.action, schedule.x, status, tracebacks)
+
+
+def _warn(schedule: Schedule) -> None:
+    if schedule.faults:
+        counts = ", ".join(f"{k} {fault}" for fault, k in schedule.faults.items())
+        row, text = min(schedule.tracebacks.items())
+        last = text.strip().splitlines()[-1]
+        warnings.warn(
+            f"{schedule.faults.total()} of {len(schedule.theta)} rows are missing: "
+            f"{counts}; the first is row {row}: {last}. All tracebacks are in "
+            "Simulations.tracebacks",
+            MissingRowsWarning,
+            stacklevel=3,
+        )

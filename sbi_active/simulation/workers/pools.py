@@ -1,0 +1,198 @@
+"""Where calls of a simulator run: in this process, or in worker processes."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from math import inf
+from multiprocessing.connection import wait
+from typing import Any
+
+import cloudpickle
+
+from sbi_active.simulation.workers.calls import Call, Reply, answer
+from sbi_active.simulation.workers.idle import IDLE
+from sbi_active.simulation.workers.processes import Worker, surroundings
+
+__all__ = ["InProcess", "Pool", "WorkerPool", "pickled"]
+
+
+class Pool(ABC):
+    """Runs calls, some at a time, and hands back what came of them in any order.
+
+    Attributes:
+        num_slots: Calls that it takes at once.
+        knows_guilty: Whether a call whose worker died was the only one there.
+    """
+
+    num_slots: int
+    knows_guilty: bool = True
+
+    @property
+    @abstractmethod
+    def num_free(self) -> int:
+        """Calls that it would take now."""
+
+    @abstractmethod
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        """Take a call.
+
+        Args:
+            call: The rows.
+            time_limit: Seconds after which it is given up; None waits for ever.
+        """
+
+    @abstractmethod
+    def collect(self) -> list[tuple[Call, Reply]]:
+        """Wait until a call has ended, and return those that have."""
+
+    def close(self) -> None:  # noqa: B027  # most have nothing to close
+        """Give up what still runs."""
+
+
+class InProcess(Pool):
+    """Runs each call here, at once."""
+
+    num_slots = 1
+
+    def __init__(self, simulator: Callable[..., Any]) -> None:
+        self._simulator = simulator
+        self._done: list[tuple[Call, Reply]] = []
+
+    @property
+    def num_free(self) -> int:
+        return 1 - len(self._done)
+
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        self._done.append((call, answer(self._simulator, call)))
+
+    def collect(self) -> list[tuple[Call, Reply]]:
+        done, self._done = self._done, []
+        return done
+
+
+class WorkerPool(Pool):
+    """Runs calls in processes of its own, each of which has one call at a time.
+
+    So a worker that dies or is killed at its time limit takes no other call with it,
+    and the guilty call is known. Those that have answered are kept for the next pool
+    of the same simulator, folder, path and environment.
+
+    Args:
+        simulator: Sent once to each worker.
+        num_workers: Number of processes.
+    """
+
+    def __init__(self, simulator: Callable[..., Any], num_workers: int) -> None:
+        self.num_slots = num_workers
+        self._simulator = pickled(simulator)
+        self._surroundings = surroundings()
+        key = pickle.dumps((self._simulator, self._surroundings))
+        self._key = hashlib.sha256(key).hexdigest()
+        self._idle = IDLE.take(self._key)
+        self._busy: dict[Worker, _Running] = {}
+
+    @property
+    def num_free(self) -> int:
+        return self.num_slots - len(self._busy)
+
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        if self._idle:
+            worker = self._idle.pop()
+        else:
+            worker = Worker(self._simulator, self._surroundings)
+        self._busy[worker] = _Running(call, time_limit)
+        with suppress(OSError):  # it has died, as collect() will find
+            worker.send(pickle.dumps(call, protocol=5))
+        if worker.is_ready:
+            self._busy[worker].start()
+
+    def collect(self) -> list[tuple[Call, Reply]]:
+        done: list[tuple[Call, Reply]] = []
+        while self._busy and not done:
+            first = min(r.deadline for r in self._busy.values())
+            timeout = None if first == inf else max(first - time.monotonic(), 0.0)
+            wait([w.connection for w in self._busy], timeout=timeout)
+            for worker, running in list(self._busy.items()):
+                reply = self._look(worker, running)
+                if reply is not None:
+                    del self._busy[worker]
+                    done.append((running.call, reply))
+                    if reply.fault in ("timed out", "worker died", "not loaded"):
+                        continue
+                    self._idle.append(worker)
+        return done
+
+    def close(self) -> None:
+        for worker in self._busy:
+            worker.end()
+        IDLE.give(self._key, self._idle, at_most=self.num_slots)
+        self._idle, self._busy = [], {}
+
+    def _look(self, worker: Worker, running: _Running) -> Reply | None:
+        """Return what came of a call; None while it runs."""
+        try:
+            while worker.connection.poll():
+                reply = pickle.loads(worker.connection.recv_bytes())
+                if isinstance(reply, Reply):
+                    if reply.fault == "not loaded":
+                        worker.end()
+                    return reply
+                worker.is_ready = True
+                running.start()
+        except (EOFError, OSError):
+            code = worker.end()
+            if worker.is_ready:
+                return Reply(
+                    fault="worker died",
+                    traceback=f"worker died: its process {_ending(code)} during the "
+                    "call, without an exception",
+                )
+            return Reply(
+                fault="not loaded",
+                traceback=f"the process {_ending(code)} while it loaded the simulator",
+            )
+        if time.monotonic() < running.deadline:
+            return None
+        worker.end()
+        return Reply(
+            fault="timed out",
+            traceback=f"timed out: no answer within {running.time_limit:g} s",
+        )
+
+
+class _Running:
+    """A call with its deadline, which begins once the simulator has been loaded."""
+
+    def __init__(self, call: Call, time_limit: float | None) -> None:
+        self.call = call
+        self.time_limit = time_limit
+        self.deadline = inf
+
+    def start(self) -> None:
+        if self.time_limit is not None:
+            self.deadline = time.monotonic() + self.time_limit
+
+
+def pickled(simulator: Callable[..., Any]) -> bytes:
+    """Return the simulator as bytes.
+
+    Raises:
+        TypeError: If it cannot be pickled.
+    """
+    try:
+        return cloudpickle.dumps(simulator)
+    except Exception as error:
+        raise TypeError(
+            "expected a simulator that can travel to another process; got "
+            f"{type(error).__name__}: {error}; do open files and engines in the setup "
+            "of a SimulatorModel, or run it here with num_workers=1 and no time_limit"
+        ) from error
+
+
+def _ending(code: int) -> str:
+    return f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"

@@ -1,0 +1,113 @@
+"""What a store of rows offers to the engine, and when rows are handed to it."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+__all__ = ["Recorder", "RowStore", "run_digest"]
+
+
+class RowStore(Protocol):
+    """Keeps simulated rows across interruptions.
+
+    All calls come from the process that simulates. Rows that are missing are not
+    saved, so that a fault is tried again the next time.
+    """
+
+    def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Return what is stored of a set of rows, or None.
+
+        Args:
+            run: Digest of the set, see :func:`run_digest`.
+
+        Returns:
+            Row indices (k,), int64; x (k, *x_shape); status (k,).
+        """
+        ...
+
+    def save(
+        self,
+        run: str,
+        *,
+        index: Tensor,
+        theta: Tensor,
+        action: Tensor,
+        x: Tensor,
+        status: Tensor,
+        seed: int,
+    ) -> None:
+        """Store rows; they are on disk when this returns.
+
+        Args:
+            run: Digest of the set.
+            index: Which of its rows these are, shape (k,), int64.
+            theta: Parameters, shape (k, theta_dim).
+            action: Actions, shape (k, action_dim).
+            x: Outcomes, shape (k, *x_shape), float32.
+            status: An :class:`.Outcome` a row, shape (k,), int8.
+            seed: Of the whole set.
+        """
+        ...
+
+
+def run_digest(seed: int, theta: Tensor, action: Tensor) -> str:
+    """Return the name of a set of rows: SHA-256 of its seed, theta and action.
+
+    Example:
+        >>> theta = torch.zeros(2, 1)
+        >>> run_digest(0, theta, theta)
+        '40e5538b0077201874242ebaea9810a33215466f3dd244238daf0314374e325d'
+    """
+    shapes = tuple(theta.shape), tuple(action.shape)
+    digest = hashlib.sha256(repr((int(seed), *shapes)).encode())
+    for rows in (theta, action):
+        digest.update(rows.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+class Recorder:
+    """Hands finished rows to a store, every half second or 4,096 rows."""
+
+    INTERVAL = 0.5  # s
+    CHUNK = 4096  # rows
+
+    def __init__(
+        self, store: RowStore, run: str, theta: Tensor, action: Tensor, seed: int
+    ) -> None:
+        self._store = store
+        self._run = run
+        self._theta = theta
+        self._action = action
+        self._seed = seed
+        self._waiting: list[tuple[Tensor, Tensor, Tensor]] = []
+        self._num_waiting = 0
+        self._last = time.monotonic()
+
+    def add(self, index: Tensor, x: Tensor, status: Tensor) -> None:
+        """Take finished rows: index (k,), x (k, *x_shape), status (k,)."""
+        self._waiting.append((index, x, status))
+        self._num_waiting += len(index)
+        is_due = time.monotonic() - self._last >= self.INTERVAL
+        if is_due or self._num_waiting >= self.CHUNK:
+            self.flush()
+
+    def flush(self) -> None:
+        """Store the rows that wait."""
+        if self._waiting:
+            index, x, status = map(torch.cat, zip(*self._waiting, strict=True))
+            self._waiting, self._num_waiting = [], 0
+            self._store.save(
+                self._run,
+                index=index,
+                theta=self._theta[index].detach().cpu(),
+                action=self._action[index].detach().cpu(),
+                x=x.detach().cpu(),
+                status=status,
+                seed=self._seed,
+            )
+        self._last = time.monotonic()
