@@ -124,7 +124,7 @@ class Problem:
         normal = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
         return Problem(simulator, normal, action, x, exact)
 
-    def infer(self, seed: int, num_histories: int | None) -> Belief:
+    def infer(self, seed: int, num_histories: int | None = None) -> Belief:
         """Return the belief after the trials, one update each."""
         settings = Refinement()
         if num_histories is not None:
