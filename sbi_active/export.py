@@ -1,8 +1,7 @@
-"""Export to ArviZ. The only module that imports it."""
+"""Export to ArviZ."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,17 +10,14 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arviz_versions import inference_data
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
-
-with warnings.catch_warnings():  # ArviZ 0.23 announces 1.0 at every import
-    warnings.simplefilter("ignore", FutureWarning)
-    import arviz as az
 
 if TYPE_CHECKING:
     from sbi_active.campaign import Campaign
 
-__all__ = ["pareto_smoothed", "to_inference_data"]
+__all__ = ["to_inference_data"]
 
 
 def to_inference_data(
@@ -77,34 +73,7 @@ def to_inference_data(
             groups["prior"] = {"theta": _draws(prior.sample((num_samples,)))}
     if campaign is not None:
         _add_trials(campaign, theta, groups, coords, dims, seed)
-    return _assemble(groups, coords, dims)
-
-
-def pareto_smoothed(
-    log_likelihood: np.ndarray, *, relative_efficiency: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return smoothed log weights of leaving out each trial, and Pareto shapes k.
-
-    Args:
-        log_likelihood: Of each trial given each posterior draw, shape (n, t).
-        relative_efficiency: Effective number of draws over their number.
-
-    Returns:
-        Log weights, which sum to one over the draws, shape (n, t), and k, shape (t,).
-
-    References:
-        Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 25 (2024) 72.
-    """
-    rows = np.ascontiguousarray(log_likelihood.T, dtype=float)
-    if int(az.__version__.split(".")[0]) >= 1:
-        from arviz_stats.base import array_stats  # pyright: ignore
-
-        smoothed, k = array_stats.psislw(rows, r_eff=relative_efficiency)
-    else:
-        smoothed, k = az.psislw(-rows, reff=relative_efficiency)
-    smoothed, k = np.asarray(smoothed), np.asarray(k)
-    smoothed = smoothed - smoothed.max(1, keepdims=True)
-    return (smoothed - np.log(np.exp(smoothed).sum(1, keepdims=True))).T, k
+    return inference_data(groups, coords, dims)
 
 
 def _add_trials(
@@ -156,21 +125,3 @@ def _log_likelihood(
 def _draws(values: Tensor) -> np.ndarray:
     """Return draws as one chain, shape (1, n, ...)."""
     return values.detach().numpy()[None]
-
-
-def _assemble(
-    groups: dict[str, dict[str, np.ndarray]],
-    coords: dict[str, Any],
-    dims: dict[str, list[str]],
-) -> Any:
-    if int(az.__version__.split(".")[0]) >= 1:
-        return az.from_dict(groups, coords=coords, dims=dims)  # type: ignore[arg-type]
-    # ArviZ 0.x takes one log-likelihood value a trial under the name of its variable,
-    # whose other dimensions do not exist there: dimensions are given group by group.
-    data = az.InferenceData()
-    for name, variables in groups.items():
-        own = {key: value for key, value in dims.items() if key in variables}
-        if name == "log_likelihood":
-            own["x"] = ["round"]
-        data.extend(az.from_dict(**{name: variables}, coords=coords, dims=own))  # pyright: ignore
-    return data

@@ -2,94 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
-from torch.distributions import Distribution
 
-from sbi_active.seeding import forked_generators
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.effect import NUM_DRAWS, Effect
 
 __all__ = [
     "require_distinct",
-    "require_finite_draws",
     "require_nested",
-    "require_parts",
-    "sound_null",
 ]
 
-#: Draws of a prior that must be finite, and that lead from the null into its support.
-NUM_DRAWS = 64
 #: Step from the null towards a draw: a null on the edge of a support belongs to it.
 STEP = 1e-6
-
-
-def require_parts(effect: Effect) -> None:
-    """Raise where a part of an effect is of another type than it should be."""
-    texts = {"name": effect.name, "units": effect.units}
-    texts |= {
-        name: value
-        for name in ("family", "describe")
-        if (value := getattr(effect, name)) is not None
-    }
-    for part, value in texts.items():
-        if not isinstance(value, str):
-            raise ValueError(
-                f"expected {part} of an effect as text; got {value!r}; pass a string"
-            )
-    if not effect.name or " + " in effect.name:
-        raise ValueError(
-            f"expected a name without ' + ', which joins names; got {effect.name!r}; "
-            "do choose another"
-        )
-    if not isinstance(effect.prior, Distribution):
-        raise ValueError(
-            f"expected a torch distribution as prior of effect {effect.name!r}; got "
-            f"{effect.prior!r}; pass for example Normal(0.0, 1.0)"
-        )
-    if not callable(effect.apply):
-        raise ValueError(
-            f"expected apply of effect {effect.name!r} as a function of (value, phi, "
-            f"action, context); got {effect.apply!r}; pass one"
-        )
-
-
-def sound_null(effect: Effect) -> Any:
-    """Return the null, a copy where it is an array, or raise where it is none."""
-    try:
-        null = torch.as_tensor(effect.null, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"expected a null of effect {effect.name!r} in numbers; got "
-            f"{effect.null!r}; pass the value of phi at which it vanishes"
-        ) from error
-    if null.numel() not in (1, effect.phi_dim):
-        raise ValueError(
-            f"expected a null of shape ({effect.phi_dim},), the shape of a draw of "
-            f"effect {effect.name!r}; got {tuple(null.shape)}; do give one each"
-        )
-    if bool(null.isnan().any()):
-        raise ValueError(
-            f"expected a null of effect {effect.name!r}; got NaN; pass the value of "
-            "phi at which it vanishes, which may be infinite"
-        )
-    return copy.deepcopy(effect.null)
-
-
-def require_finite_draws(effect: Effect) -> None:
-    """Raise where the prior gives phi that is no number."""
-    lost = ~_draws(effect).isfinite()
-    if bool(lost.any()):
-        raise ValueError(
-            f"expected finite draws from the prior of effect {effect.name!r}; got NaN "
-            f"or inf in {int(lost.any(-1).sum())} of {NUM_DRAWS}; pass a prior whose "
-            "draws are numbers"
-        )
 
 
 def require_nested(effects: Sequence[Effect]) -> None:
@@ -132,17 +57,12 @@ def _require_once(names: Sequence[str], expected: str) -> None:
 
 
 def _reaches_null(effect: Effect) -> bool:
-    draws = _draws(effect)
+    draws = effect.declared_draws()
     null = effect.null_phi(NUM_DRAWS)
     known = null.isfinite()
     near = torch.where(known, null + STEP * (draws - null), draws)
     exact = torch.where(known, null, draws)
     return bool((effect.log_prob(torch.cat([exact, near])) > -torch.inf).any())
-
-
-def _draws(effect: Effect) -> Tensor:
-    with forked_generators(0, "declared"):
-        return effect.sample(NUM_DRAWS)
 
 
 def _in_words(effect: Effect) -> str:

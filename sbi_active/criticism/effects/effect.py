@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -10,11 +11,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.criticism.effects.declarations import (
-    require_finite_draws,
-    require_parts,
-    sound_null,
-)
 from sbi_active.seeding import forked_generators
 
 __all__ = ["Context", "Effect", "Hook"]
@@ -23,6 +19,8 @@ Hook = Literal["action", "parameter", "dynamics", "observation", "noise"]
 
 #: Stands for an infinite null where the formula has no limit in floating point.
 LARGE = 1e9
+#: Draws of a prior that must be finite, and that lead from the null into its support.
+NUM_DRAWS = 64
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class Effect:
     describe: str | None = None
 
     def __post_init__(self) -> None:
-        require_parts(self)
+        _require_parts(self)
         if self.hook not in get_args(Hook):
             raise ValueError(
                 f"expected a hook of {', '.join(get_args(Hook))}; got {self.hook!r}; "
@@ -97,8 +95,8 @@ class Effect:
                 f"expected scope 'campaign' or 'trial'; got {self.scope!r}; do choose "
                 "one"
             )
-        object.__setattr__(self, "null", sound_null(self))
-        require_finite_draws(self)
+        object.__setattr__(self, "null", _sound_null(self))
+        _require_finite_draws(self)
         if self.family is None:
             object.__setattr__(self, "family", self.hook)
 
@@ -152,6 +150,11 @@ class Effect:
         """Return draws of phi by torch's generator, shape (num, phi_dim), float64."""
         return self.prior.sample(torch.Size([num])).double().reshape(num, self.phi_dim)
 
+    def declared_draws(self) -> Tensor:
+        """Return the same few draws of phi each time, shape (64, phi_dim), float64."""
+        with forked_generators(0, "declared"):
+            return self.sample(NUM_DRAWS)
+
     def log_prob(self, phi: Tensor) -> Tensor:
         """Return the log prior density, shape (n,), float64; -inf outside."""
         shape = self.prior.batch_shape + self.prior.event_shape
@@ -182,3 +185,66 @@ class _Keywords:
         self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
     ) -> dict[str, Any]:
         return {**value, **dict(zip(self.names, phi.unbind(-1), strict=True))}
+
+
+def _require_parts(effect: Effect) -> None:
+    """Raise where a part of an effect is of another type than it should be."""
+    texts = {"name": effect.name, "units": effect.units}
+    texts |= {
+        name: value
+        for name in ("family", "describe")
+        if (value := getattr(effect, name)) is not None
+    }
+    for part, value in texts.items():
+        if not isinstance(value, str):
+            raise ValueError(
+                f"expected {part} of an effect as text; got {value!r}; pass a string"
+            )
+    if not effect.name or " + " in effect.name:
+        raise ValueError(
+            f"expected a name without ' + ', which joins names; got {effect.name!r}; "
+            "do choose another"
+        )
+    if not isinstance(effect.prior, Distribution):
+        raise ValueError(
+            f"expected a torch distribution as prior of effect {effect.name!r}; got "
+            f"{effect.prior!r}; pass for example Normal(0.0, 1.0)"
+        )
+    if not callable(effect.apply):
+        raise ValueError(
+            f"expected apply of effect {effect.name!r} as a function of (value, phi, "
+            f"action, context); got {effect.apply!r}; pass one"
+        )
+
+
+def _sound_null(effect: Effect) -> Any:
+    """Return the null, a copy where it is an array, or raise where it is none."""
+    try:
+        null = torch.as_tensor(effect.null, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"expected a null of effect {effect.name!r} in numbers; got "
+            f"{effect.null!r}; pass the value of phi at which it vanishes"
+        ) from error
+    if null.numel() not in (1, effect.phi_dim):
+        raise ValueError(
+            f"expected a null of shape ({effect.phi_dim},), the shape of a draw of "
+            f"effect {effect.name!r}; got {tuple(null.shape)}; do give one each"
+        )
+    if bool(null.isnan().any()):
+        raise ValueError(
+            f"expected a null of effect {effect.name!r}; got NaN; pass the value of "
+            "phi at which it vanishes, which may be infinite"
+        )
+    return copy.deepcopy(effect.null)
+
+
+def _require_finite_draws(effect: Effect) -> None:
+    """Raise where the prior gives phi that is no number."""
+    lost = ~effect.declared_draws().isfinite()
+    if bool(lost.any()):
+        raise ValueError(
+            f"expected finite draws from the prior of effect {effect.name!r}; got NaN "
+            f"or inf in {int(lost.any(-1).sum())} of {NUM_DRAWS}; pass a prior whose "
+            "draws are numbers"
+        )

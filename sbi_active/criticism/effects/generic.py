@@ -14,9 +14,9 @@ from torch.distributions import (
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.rivals.noise_grid import declared_sds
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.noise.base import declared_sds
 
 __all__ = ["generic_effects"]
 

@@ -23,9 +23,9 @@ from torch.distributions import Distribution
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.rivals.noise_grid import declared_sds
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.simulation.noise.base import declared_sds
 
 __all__ = ["MANY", "MOST", "Summarized", "can_summarize", "summarize"]
 

@@ -16,13 +16,12 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.results import OUTLIER
 from sbi_active.criticism.rivals.error_models import (
     LOG_2PI,
     ErrorModel,
@@ -34,10 +33,7 @@ from sbi_active.criticism.rivals.error_models import (
 )
 from sbi_active.criticism.rivals.residual_process import smooth_features
 
-if TYPE_CHECKING:
-    from sbi_active.criticism.evidence.rival_set import RivalSet
-
-__all__ = ["OneOutlier", "gross_errors"]
+__all__ = ["OneOutlier"]
 
 Array = NDArray[Any]
 
@@ -209,25 +205,6 @@ class OneOutlier(ErrorModel):
         log_p = -0.5 * square[:, None] / scales[:, None] ** 2
         log_p = log_p - 0.5 * np.log(total).sum(1) - num * np.log(scales)[:, None]
         return log_p - 0.5 * num * LOG_2PI
-
-
-def gross_errors(rivals: RivalSet) -> dict[float, float]:
-    """Return the probability that each trial is the one, if one has a gross error.
-
-    Args:
-        rivals: The models, whose "outlier" has its evidence.
-
-    Returns:
-        By the trial's index, most probable first.
-    """
-    name = rivals.evidence(error=OUTLIER).name
-    sample, error = rivals.samples[name], rivals.one_outlier()
-    some = sample.weights > 0
-    residual = rivals.rivals[name].residual(sample.u[some], penalized=False)[0]
-    share = sample.weights[some] @ error.responsibility(residual)
-    order = np.argsort(-share, kind="stable")
-    index = rivals.trials.index.numpy()[error.trials]
-    return {float(index[k]): float(share[k]) for k in order}
 
 
 def _smooth(cell: NoiseCell, measurements: Measurements, at: Array) -> _Smooth | None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import number, summary_sentence
 from sbi_active.criticism.report.section import named_entries, setting
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 __all__ = ["conditions", "first_paragraph"]
 
@@ -19,12 +16,12 @@ __all__ = ["conditions", "first_paragraph"]
 MOST_NAMED = 3
 
 
-def first_paragraph(report: Report) -> str:
+def first_paragraph(report: Contents) -> str:
     """Return what was found, and what a verdict that names effects does not know."""
     return " ".join([summary_sentence(report), *conditions(report)])
 
 
-def conditions(report: Report) -> Iterator[str]:
+def conditions(report: Contents) -> Iterator[str]:
     """Yield what a verdict that names effects does not know, a sentence each.
 
     An effect that nobody declared can pass for declared ones, with parameters that are
@@ -43,7 +40,7 @@ def conditions(report: Report) -> Iterator[str]:
         yield f"The verdict would be put to the test most {tests}."
 
 
-def _tests(report: Report) -> Iterator[str]:
+def _tests(report: Contents) -> Iterator[str]:
     """Yield each severe test, with how far a free residual's prediction is there."""
     between = "where its prediction and that of a free residual differ by "
     unit = " of its standard deviations"
@@ -54,7 +51,7 @@ def _tests(report: Report) -> Iterator[str]:
         between, unit = "by ", ""
 
 
-def _moved(report: Report) -> str:
+def _moved(report: Contents) -> str:
     """Return how far the parameters moved from the bare fit, the farthest first."""
     table = report.parameters.dropna(subset=["before", "after"])
     shift = (table["after"] - table["before"]).to_numpy()
@@ -78,7 +75,7 @@ def _times(far: float) -> str:
     return f"{many} of its standard deviations"
 
 
-def _tried(report: Report) -> str:
+def _tried(report: Contents) -> str:
     """Return which actions were executed."""
     action = np.unique(report.residuals.action, axis=0)
     if len(action) == 1:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import added, probability, with_error
 from sbi_active.criticism.report.section import Section, joined
 from sbi_active.criticism.report.suspects import label
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 __all__ = ["effects", "equivalences", "leave_one_out", "residuals"]
 
@@ -20,7 +16,7 @@ SHOWN = 0.01  # probability from which a set of several effects stands in the ta
 SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
 
 
-def effects(report: Report) -> Section:
+def effects(report: Contents) -> Section:
     """Return every model alone, and the sets of effects that have a share."""
     tracing = report.tracing
     any_set = any(" + " in name for name in tracing.probabilities)
@@ -82,7 +78,7 @@ def effects(report: Report) -> Section:
     )
 
 
-def equivalences(report: Report) -> Section:
+def equivalences(report: Contents) -> Section:
     """Return the groups of models that nothing separates, or not these trials."""
     tracing = report.tracing
     items = [
@@ -104,7 +100,7 @@ def equivalences(report: Report) -> Section:
     return Section("Equivalence sets", text=text, items=tuple(items))
 
 
-def residuals(report: Report) -> Section:
+def residuals(report: Contents) -> Section:
     """Return the size of the residuals before and after."""
     before, detection = report.residuals, report.detection
     rows = [("bare model", *_sizes(before.refitted), *_sizes(before.prequential))]
@@ -137,7 +133,7 @@ def residuals(report: Report) -> Section:
     )
 
 
-def leave_one_out(report: Report) -> Section:
+def leave_one_out(report: Contents) -> Section:
     """Return how well each trial is predicted from the others."""
     found = report.leave_one_out
     limit = found[0].largest_k

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 __all__ = [
     "added",
@@ -23,7 +19,7 @@ __all__ = [
 ]
 
 
-def verdict_line(report: Report) -> str:
+def verdict_line(report: Contents) -> str:
     """Return the verdict with what limits it, in one line."""
     tracing, verdict = report.tracing, report.verdict
     p = tracing.probabilities.get(verdict)
@@ -43,7 +39,7 @@ def verdict_line(report: Report) -> str:
     return line
 
 
-def added(report: Report) -> str:
+def added(report: Contents) -> str:
     """Return what was added to the bare model, in words."""
     beside = " + ".join(report.tracing.beside)
     words = {
@@ -55,7 +51,7 @@ def added(report: Report) -> str:
     return words.get(report.verdict, report.verdict)
 
 
-def summary_sentence(report: Report) -> str:
+def summary_sentence(report: Contents) -> str:
     """Return what was found, in a few sentences."""
     detection, trials = report.detection, f"{report.num_trials} trials"
     against = (

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import METRICS
 from sbi_active.criticism.report.headline import added, number, with_error
 from sbi_active.criticism.report.section import Section, joined, setting
@@ -16,9 +15,6 @@ from sbi_active.criticism.results import (
     Evaluation,
     NextAction,
 )
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 __all__ = ["errors", "next_action", "parameters"]
 
@@ -31,7 +27,7 @@ SEVERE = (
 FEW_PAIRS = 8  # scored trials below which the pairs stand in place of an interval
 
 
-def errors(report: Report) -> Section:
+def errors(report: Contents) -> Section:
     """Return the error before and after, on trials that had no part in it."""
     evaluation, title = report.evaluation, "Error before and after"
     if evaluation is None:
@@ -81,7 +77,7 @@ def errors(report: Report) -> Section:
     )
 
 
-def parameters(report: Report) -> Section:
+def parameters(report: Contents) -> Section:
     """Return theta before and after, and phi."""
     units = {e.name: e.units for e in report.tracing.estimates if e.units}
     header = ["parameter", "bare model", f"with {added(report)}"]
@@ -101,7 +97,7 @@ def parameters(report: Report) -> Section:
     return Section("Parameters before and after", header=(*header,), rows=tuple(rows))
 
 
-def next_action(report: Report) -> Section:
+def next_action(report: Contents) -> Section:
     """Return the action that tells most, and what no permitted action tells."""
     chosen, title = report.next_action, "Next action"
     if chosen is None:
@@ -120,7 +116,7 @@ def next_action(report: Report) -> Section:
     return Section(title, tuple(text), items=tuple(_inseparable(report, chosen)))
 
 
-def _nothing_to_tell(report: Report, chosen: NextAction, best: float) -> str:
+def _nothing_to_tell(report: Contents, chosen: NextAction, best: float) -> str:
     """Return why no action is chosen; it is the end only where the bare model holds."""
     found = (
         "no permitted action tells more about which declared model is right than "
@@ -137,7 +133,7 @@ def _nothing_to_tell(report: Report, chosen: NextAction, best: float) -> str:
     return found[0].upper() + found[1:] + rest.get(report.verdict, "")
 
 
-def _inseparable(report: Report, chosen: NextAction) -> list[str]:
+def _inseparable(report: Contents, chosen: NextAction) -> list[str]:
     """Return each group that no permitted action separates, and what would."""
     beyond = None if chosen.outside is None else frozenset(chosen.outside_separates)
     groups = [*chosen.inseparable]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sbi_active.criticism.report.conditions import first_paragraph
+from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import (
     plot_before_after,
     plot_probabilities,
@@ -22,7 +23,6 @@ from sbi_active.criticism.report.sections import sections
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sbi_active.criticism.report.report import Report
 
 __all__ = ["figures", "to_html", "to_markdown", "to_text"]
 
@@ -53,7 +53,7 @@ figcaption { font-size: .85rem; color: #5d6870; }
 """.strip()
 
 
-def figures(report: Report) -> dict[str, Figure]:
+def figures(report: Contents) -> dict[str, Figure]:
     """Return the report's figures by name."""
     found = {
         "residuals": plot_residuals(
@@ -70,7 +70,7 @@ def figures(report: Report) -> dict[str, Figure]:
     return found
 
 
-def to_text(report: Report) -> str:
+def to_text(report: Contents) -> str:
     """Return the report as plain text, the verdict in the first line."""
     lines = [verdict_line(report), *_wrapped(first_paragraph(report))]
     for section in sections(report):
@@ -85,7 +85,7 @@ def to_text(report: Report) -> str:
     return "\n".join(lines)
 
 
-def to_markdown(report: Report) -> str:
+def to_markdown(report: Contents) -> str:
     """Return the report as Markdown."""
     lines = [f"# {verdict_line(report)}", "", first_paragraph(report)]
     for section in sections(report):
@@ -106,7 +106,7 @@ def to_markdown(report: Report) -> str:
     return "\n".join(lines) + "\n"
 
 
-def to_html(report: Report) -> str:
+def to_html(report: Contents) -> str:
     """Return the report as one page without references to other files."""
     title, e = html.escape(verdict_line(report)), html.escape
     drawn = figures(report)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from sbi_active.criticism.report import findings, outlook
+from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.section import Section
-
-if TYPE_CHECKING:
-    from sbi_active.criticism.report.report import Report
 
 __all__ = ["sections"]
 
 
-def sections(report: Report) -> Iterator[Section]:
+def sections(report: Contents) -> Iterator[Section]:
     """Yield the parts of a report in order."""
     if report.warnings:
         yield Section("Warnings", items=report.warnings)
@@ -29,7 +26,7 @@ def sections(report: Report) -> Iterator[Section]:
     yield _record(report)
 
 
-def _record(report: Report) -> Section:
+def _record(report: Contents) -> Section:
     evidences = report.tracing.evidences
     spent = sum(e.num_simulations for e in evidences.values())
     items = [f"evidence cost {spent:,} simulated trials"]

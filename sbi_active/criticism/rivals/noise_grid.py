@@ -12,10 +12,10 @@ from torch.distributions import Distribution
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation import NoiseModel
+from sbi_active.simulation.noise.base import NoiseModel, declared_sds
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 
-__all__ = ["declared_noise", "declared_sds", "scattered"]
+__all__ = ["declared_noise", "scattered"]
 
 Array = NDArray[Any]
 
@@ -24,7 +24,6 @@ Array = NDArray[Any]
 NUM_TIMES, INDEPENDENT = 14, 0.3
 #: Draws that stand for a posterior over noise parameters.
 NUM_DRAWS = 24
-NUM_SAMPLES = 4_096
 #: Inflation of the noise, 1 + |N(0, 2.5^2)|, by its quantiles.
 INFLATION_SD, NUM_INFLATIONS = 2.5, 14
 
@@ -116,23 +115,6 @@ def _product(
     ]
     scales = (nodes / middle).numpy()
     return NoiseGrid(cells, scales=scales, log_weights=weights[0].numpy())
-
-
-def declared_sds(noise: NoiseModel) -> torch.Tensor:
-    """Return the standard deviations of a noise model, shape (1,) or (channels,).
-
-    One that has no such parameter is sampled around zero.
-    """
-    sds = [
-        v
-        for name, v in zip(noise.parameter_names, noise.parameters, strict=True)
-        if name.startswith("sd")
-    ]
-    if sds:
-        return torch.stack(sds).double()
-    with forked_generators(0, "sd"):
-        draws = noise.sample(torch.zeros(NUM_SAMPLES, 1, dtype=torch.float64))
-    return draws.std().reshape(1).double()
 
 
 def scattered(noise: NoiseGrid) -> NoiseGrid:

@@ -87,7 +87,7 @@ def _density(
     rivals: RivalSet, names: tuple[str, ...] = (), *, error: str | None = None
 ) -> LeaveOneOut:
     # ArviZ takes seconds to import.
-    from sbi_active.export import pareto_smoothed
+    from sbi_active.arviz_versions import pareto_smoothed
 
     evidence = rivals.evidence(names, error=error)
     prediction = predict(rivals, names=names, error=error, num_draws=NUM_DRAWS)

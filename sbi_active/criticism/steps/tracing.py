@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.outliers import gross_errors
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import (
@@ -30,6 +29,7 @@ from sbi_active.criticism.steps.coarsening import coarsening
 from sbi_active.criticism.steps.combinations import grow
 from sbi_active.criticism.steps.detection import REFUTED, THRESHOLD, alternatives
 from sbi_active.criticism.steps.equivalence import equivalent_effects
+from sbi_active.criticism.steps.gross_errors import gross_errors
 from sbi_active.criticism.steps.influence import (
     is_left_to_chance,
     needed_trials,

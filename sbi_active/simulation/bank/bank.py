@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -28,7 +28,10 @@ from sbi_active.simulation.bank.positions import positions
 from sbi_active.simulation.bank.shelf import COLUMN_NAMES, Shelf
 from sbi_active.simulation.bank.stored_index import StoredIndex
 from sbi_active.simulation.outcomes import Outcome, Simulations
-from sbi_active.simulation.workers.store import run_digest
+from sbi_active.simulation.workers.store import StoredRows, run_digest
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["Bank", "LabeledStore"]
 
@@ -229,44 +232,21 @@ class Bank:
         )
         return torch.from_numpy(index), torch.from_numpy(x), torch.from_numpy(status)
 
-    def save(
-        self,
-        run: str,
-        *,
-        index: Tensor,
-        theta: Tensor,
-        action: Tensor,
-        x: Tensor,
-        status: Tensor,
-        seed: int,
-    ) -> None:
+    def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
         """Store rows of a run; they are on the disk when this returns.
 
         A row whose index is stored already is left as it is.
 
         Args:
             run: Name of the run: the same one for the same theta, action and seed.
-            index: Of the rows in the run, shape (k,), int64.
-            theta: Shape (k, theta_dim).
-            action: Shape (k, action_dim).
-            x: Shape (k, *x_shape).
-            status: An :class:`Outcome` a row, shape (k,).
-            seed: Of the run.
+            **rows: The rows, as keywords of :class:`.StoredRows`.
 
         Raises:
             ValueError: If the rows do not fit the bank, or it was opened to read.
             LockedError: If somebody else is writing.
             OSError: If the disk is full or cannot be written.
         """
-        self.drawn_from(None, label=None).save(
-            run,
-            index=index,
-            theta=theta,
-            action=action,
-            x=x,
-            status=status,
-            seed=seed,
-        )
+        self.drawn_from(None, label=None).save(run, **rows)
 
     def read(self, rows: Tensor | Sequence[int] | slice | None = None) -> Simulations:
         """Return rows.

@@ -3,54 +3,59 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.simulation.bank.log_density import log_density
+from sbi_active.simulation.workers.store import StoredRows
 
 if TYPE_CHECKING:
-    from sbi_active.simulation.bank.bank import Bank
+    from typing_extensions import Unpack
 
 __all__ = ["LabeledStore"]
+
+
+class Rows(Protocol):
+    """Where rows are kept: a bank."""
+
+    def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Return what is stored of a run."""
+        ...
+
+    def store(self, run: dict[str, Any], columns: dict[str, NDArray[Any]]) -> None:
+        """Store columns of a run's rows."""
+        ...
 
 
 class LabeledStore:
     """A bank that notes which proposal theta was drawn from; see ``drawn_from``."""
 
     def __init__(
-        self, bank: Bank, proposal: Distribution | None, label: str, log_action: Tensor
+        self, bank: Rows, proposal: Distribution | None, label: str, log_action: Tensor
     ) -> None:
         self._bank = bank
         self._proposal, self._label, self._log_action = proposal, label, log_action
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """As :meth:`Bank.load`."""
+        """Return what is stored of a run, as :meth:`.Bank.load` does."""
         return self._bank.load(run)
 
-    def save(
-        self,
-        run: str,
-        *,
-        index: Tensor,
-        theta: Tensor,
-        action: Tensor,
-        x: Tensor,
-        status: Tensor,
-        seed: int,
-    ) -> None:
-        """As :meth:`Bank.save`."""
-        rows = {"theta": theta, "action": action, "x": x, "status": status}
-        if any(len(column) != len(index) for column in rows.values()):
-            lengths = {name: len(column) for name, column in rows.items()}
+    def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
+        """Store rows of a run, as :meth:`.Bank.save` does."""
+        index, theta, seed = rows["index"], rows["theta"], rows["seed"]
+        columns = {name: rows[name] for name in ("theta", "action", "x", "status")}
+        if any(len(column) != len(index) for column in columns.values()):
+            lengths = {name: len(column) for name, column in columns.items()}
             raise ValueError(
                 f"expected {len(index)} rows, one an index; got {lengths}; do give "
                 "columns of one length"
             )
         for name in ("theta", "action", "x"):
-            _require_storable(name, rows[name])
+            _require_storable(name, columns[name])
         log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
         if self._proposal is not None:
             log_proposal = log_density(self._proposal, theta)
@@ -63,16 +68,16 @@ class LabeledStore:
                 )
         log_action = self._log_action.double()
         log_action = log_action[index] if log_action.ndim else log_action
-        columns = {
+        stored = {
             "index": index.to(torch.int64),
-            **{name: rows[name].float() for name in ("theta", "action", "x")},
-            "status": status.to(torch.int8),
+            **{name: columns[name].float() for name in ("theta", "action", "x")},
+            "status": columns["status"].to(torch.int8),
             "log_proposal": log_proposal,
             "log_action": log_action.expand(len(index)),
         }
         self._bank.store(
             {"digest": run, "seed": int(seed), "label": self._label},
-            {name: c.detach().cpu().numpy() for name, c in columns.items()},
+            {name: c.detach().cpu().numpy() for name, c in stored.items()},
         )
 
 

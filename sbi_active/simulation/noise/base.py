@@ -15,8 +15,15 @@ from torch.distributions import Distribution
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
 
-__all__ = ["NoiseModel", "ScaleNoise", "observed_terms", "standard_normals"]
+__all__ = [
+    "NoiseModel",
+    "ScaleNoise",
+    "declared_sds",
+    "observed_terms",
+    "standard_normals",
+]
 
+NUM_SAMPLES = 4_096  # for the deviation of a noise that declares none
 NUM_DRAWS = 256  # of a posterior that is not one of this library's own
 
 
@@ -276,6 +283,23 @@ class ScaleNoise(NoiseModel):
     def _by_channel(self, terms: Tensor) -> Tensor:
         """Return sums over all but the channels, (n, *x_shape) -> (n, num_sd)."""
         return terms.reshape(len(terms), -1, self._num_sd).sum(1)
+
+
+def declared_sds(noise: NoiseModel) -> Tensor:
+    """Return the standard deviations of a noise model, shape (1,) or (channels,).
+
+    One that has no such parameter is sampled around zero.
+    """
+    sds = [
+        v
+        for name, v in zip(noise.parameter_names, noise.parameters, strict=True)
+        if name.startswith("sd")
+    ]
+    if sds:
+        return torch.stack(sds).double()
+    with forked_generators(0, "sd"):
+        draws = noise.sample(torch.zeros(NUM_SAMPLES, 1, dtype=torch.float64))
+    return draws.std().reshape(1).double()
 
 
 def _copied(values: Any) -> Tensor:

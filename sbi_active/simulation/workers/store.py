@@ -4,12 +4,35 @@ from __future__ import annotations
 
 import hashlib
 import time
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, TypedDict
 
 import torch
 from torch import Tensor
 
-__all__ = ["Recorder", "RowStore", "run_digest"]
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+__all__ = ["Recorder", "RowStore", "StoredRows", "run_digest"]
+
+
+class StoredRows(TypedDict):
+    """Rows of a set, as a store gets them.
+
+    Attributes:
+        index: Which of the set's rows these are, shape (k,), int64.
+        theta: Parameters, shape (k, theta_dim).
+        action: Actions, shape (k, action_dim).
+        x: Outcomes, shape (k, *x_shape), float32.
+        status: An :class:`.Outcome` a row, shape (k,), int8.
+        seed: Of the whole set.
+    """
+
+    index: Tensor
+    theta: Tensor
+    action: Tensor
+    x: Tensor
+    status: Tensor
+    seed: int
 
 
 class RowStore(Protocol):
@@ -30,27 +53,12 @@ class RowStore(Protocol):
         """
         ...
 
-    def save(
-        self,
-        run: str,
-        *,
-        index: Tensor,
-        theta: Tensor,
-        action: Tensor,
-        x: Tensor,
-        status: Tensor,
-        seed: int,
-    ) -> None:
+    def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
         """Store rows; they are on disk when this returns.
 
         Args:
             run: Digest of the set.
-            index: Which of its rows these are, shape (k,), int64.
-            theta: Parameters, shape (k, theta_dim).
-            action: Actions, shape (k, action_dim).
-            x: Outcomes, shape (k, *x_shape), float32.
-            status: An :class:`.Outcome` a row, shape (k,), int8.
-            seed: Of the whole set.
+            **rows: The rows, as keywords.
         """
         ...
 

@@ -1,0 +1,134 @@
+"""What a report holds, apart from how it is set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from torch.distributions import Distribution
+
+from sbi_active.criticism.results import (
+    NONE,
+    UNEXPLAINED,
+    Detection,
+    Evaluation,
+    NextAction,
+    Residuals,
+    SevereTest,
+    Tracing,
+)
+from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
+from sbi_active.simulation.model import SimulatorModel
+
+__all__ = ["Contents"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Contents:
+    """What the closed loop found.
+
+    Attributes:
+        residuals: Of the bare model.
+        residuals_after: Of the augmented one; None where nothing was added.
+        detection: Whether the bare model misses the data.
+        tracing: Which effect the data point to.
+        evaluation: Error before and after; None where no trial was scored.
+        next_action: What to do next; its ``action`` is None where nothing is to be
+            gained. None without permitted actions.
+        simulator: The augmented simulator, or the bare one where nothing was added.
+        prior: Of its parameters (never a posterior).
+        warnings: One sentence each.
+        digest: Hash of noise, library and priors as they were before the data.
+        exploratory: Library or priors were changed after the data were seen.
+        num_trials: Trials that could be fitted.
+        action_labels: One an entry of the action, with its unit.
+        channel_names: One an entry of x's last axis, where known.
+        leave_one_out: Of the bare model and of the one that was chosen, where trials
+            are independent given their parameters.
+        severe_tests: Where a verdict that names effects would be put to the test most:
+            a permitted action, and one beyond.
+    """
+
+    residuals: Residuals
+    residuals_after: Residuals | None
+    detection: Detection
+    tracing: Tracing
+    evaluation: Evaluation | None
+    next_action: NextAction | None
+    simulator: SimulatorModel
+    prior: Distribution
+    warnings: tuple[str, ...]
+    digest: str
+    exploratory: bool
+    num_trials: int
+    action_labels: tuple[str, ...]
+    channel_names: tuple[str, ...] | None
+    leave_one_out: tuple[LeaveOneOut, ...] = ()
+    severe_tests: tuple[SevereTest, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """A catch-all ("none", "unexplained", ...) or effects joined by " + "."""
+        return self.tracing.verdict
+
+    @property
+    def probabilities(self) -> dict[str, float]:
+        """Posterior probability by effect and catch-all, "outlier" after an alarm."""
+        return self.tracing.probabilities
+
+    @property
+    def credible_set(self) -> tuple[str, ...]:
+        """Smallest set of names that holds 90 % of the probability."""
+        return self.tracing.credible_set
+
+    @property
+    def equivalent(self) -> tuple[frozenset[str], ...]:
+        """Groups of names that no permitted action separates."""
+        return self.tracing.equivalent
+
+    @property
+    def guess(self) -> str | None:
+        """A formula that explains what no declared effect does: not declared."""
+        if self.verdict != UNEXPLAINED or not self.tracing.guesses:
+            return None
+        return self.tracing.guesses[0][0]
+
+    @property
+    def before_after(self) -> pd.DataFrame:
+        """Columns metric, before, after, ratio, interval (90 %, (low, high) or None).
+
+        The ratio of "log predictive density" and "coverage" is their difference.
+        """
+        columns = ["metric", "before", "after", "ratio", "interval"]
+        if self.evaluation is None:
+            return pd.DataFrame(columns=pd.Index(columns))
+        table = self.evaluation.table
+        ends = zip(table["low"], table["high"], strict=True)
+        interval = [
+            (float(low), float(high)) if np.isfinite([low, high]).all() else None
+            for low, high in ends
+        ]
+        table = table.assign(interval=pd.Series(interval, dtype=object))
+        return table.loc[:, columns]
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """Columns parameter, before, before_sd, after, after_sd; phi has no before."""
+        evidences = self.tracing.evidences
+        before, after = evidences[NONE], evidences.get(self.verdict)
+        rows = {
+            name: [*_moments(before.draws[:, i]), np.nan, np.nan]
+            for i, name in enumerate(before.names)
+        }
+        if after is not None and self.verdict != NONE:
+            for i, name in enumerate(after.names):
+                row = rows.setdefault(name, [np.nan] * 4)
+                row[2:] = _moments(after.draws[:, i])
+        names = ["before", "before_sd", "after", "after_sd"]
+        table = pd.DataFrame.from_dict(rows, orient="index", columns=pd.Index(names))
+        return table.rename_axis("parameter").reset_index()
+
+
+def _moments(draws: np.ndarray) -> list[float]:
+    return [float(draws.mean()), float(draws.std())]
