@@ -56,7 +56,7 @@ from sbi_active.seeding import forked_generators, row_normals
 from sbi_active.tasks import get_task
 
 FIGURES = Path(__file__).with_name("figures.json")
-#: Of a run that differs: the last bit of some sums depends on where arrays happen to lie.
+#: Of a run that differs: the last bit of some sums depends on where an array lies.
 NUM_REPEATS = 3
 PACKAGES = ("torch", "numpy", "scipy", "scikit-learn", "sbi", "mujoco")
 SMALL = CampaignOptions(

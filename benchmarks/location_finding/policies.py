@@ -131,7 +131,7 @@ class Myopic(Policy):
             simulator=self.task.simulator,
             seed=derive_seed(self.seed, "update", len(self.action)),
         )
-        self.num_simulations += self.belief.diagnostics["num_simulations"]
+        self.num_simulations += self.belief.diagnostics.num_simulations
 
 
 class MyopicParticles(Myopic):

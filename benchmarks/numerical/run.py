@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from sbi_active import Campaign, CampaignOptions, Refinement, Trial
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
@@ -122,7 +123,7 @@ def round_row(
     exact_draws = exact.sample(2_000, seed=index)
     exact_log_p = exact.log_prob(exact_draws)
     chosen = trial.design.index
-    diagnostics = getattr(belief, "diagnostics", {})
+    diagnostics = getattr(belief, "diagnostics", Diagnostics()).to_dict()
     row: dict[str, object] = {
         "theta_true": " ".join(f"{v:.6g}" for v in truth.tolist()),
         "action": " ".join(f"{v:g}" for v in trial.action.tolist()),
@@ -137,9 +138,9 @@ def round_row(
         "exact_hpd": float((exact_log_p > log_p).double().mean()),
         "mass_positive": float((draws[:, 0] > 0).double().mean()),
         "num_simulations": trial.num_simulations,
-        "chained_loss": diagnostics.get("chained_loss", ""),
-        "chained_bluntness": diagnostics.get("chained_bluntness", ""),
-        "trustworthy": diagnostics.get("trustworthy", ""),
+        "chained_loss": diagnostics.get("chained_loss"),
+        "chained_bluntness": diagnostics.get("chained_bluntness"),
+        "trustworthy": diagnostics.trustworthy,
     }
     if gain is not None:
         row |= {"exact_eig": gain[chosen], "regret": gain.max() - gain[chosen]}

@@ -125,7 +125,7 @@ def seldom_measured(method: str) -> None:
 
     c = tell(campaign(method, lost, num_scored=1_000))
     c.update()
-    assert c.belief.diagnostics["trustworthy"] is False  # pyright: ignore
+    assert c.belief.diagnostics.trustworthy is False  # pyright: ignore
     c.ask()
 
 

@@ -116,8 +116,8 @@ def right(c: Campaign, width: float = 0.15) -> None:
 def doubted(c: Campaign, index: int) -> None:
     """Require a belief that says which trial is to be mended."""
     diagnostics = c.belief.diagnostics  # pyright: ignore
-    assert diagnostics["trustworthy"] is False
-    text = " ".join(diagnostics["warnings"])
+    assert diagnostics.trustworthy is False
+    text = " ".join(diagnostics.warnings)
     assert f"trial {index} at" in text, text
     assert f"withdraw({index})" in text, text
 

@@ -174,16 +174,16 @@ def row_of(
         return row | {"failure": f"{type(error).__name__}: {error}"[:200]}
     seconds = time.process_time() - start
     diagnostics = belief.diagnostics
-    broken = [name for name, a in diagnostics["assumptions"].items() if not a["holds"]]
+    broken = [name for name, a in diagnostics.assumptions.items() if not a.holds]
     figures = problem.divergence(belief) | {
-        "error_nats": diagnostics.get("error_nats", float("nan")),
-        "effective_sample_size": diagnostics["effective_sample_size"],
+        "error_nats": diagnostics.error_nats,
+        "effective_sample_size": diagnostics.effective_sample_size,
     }
     return (
         row
         | {name: f"{figure:.4g}" for name, figure in figures.items()}
         | {
-            "trustworthy": diagnostics["trustworthy"],
+            "trustworthy": diagnostics.trustworthy,
             "assumptions": " ".join(broken),
             "cpu_seconds": f"{seconds:.1f}",
         }

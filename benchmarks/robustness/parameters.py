@@ -295,7 +295,7 @@ def few_simulations(case: tuple[int, int]) -> None:
         problem.simulator, problem.prior, problem.action, problem.x, _one(problem)
     )
     divergence = one.divergence(belief)["kl"]
-    trusted = belief.diagnostics["trustworthy"]
+    trusted = belief.diagnostics.trustworthy
     assert not (divergence > 0.5 and trusted), f"trusted, though {divergence:.2f} off"
     assert trusted or divergence > 0.1, f"not trusted, though {divergence:.2f} off"
 

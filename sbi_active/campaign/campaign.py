@@ -117,7 +117,7 @@ class Campaign:
         A trial that nothing in the prior explains, as after a slip of the unit, is left
         out of it: five times the range of all simulations from the prior beyond them,
         the model's word would be an extrapolation that pushes the belief to an edge.
-        ``belief.diagnostics["trustworthy"]`` is then False and ``["warnings"]`` names
+        ``belief.diagnostics.trustworthy`` is then False and ``warnings`` names
         the trial, until it is told again or withdrawn. Trials that are beyond all
         simulations but nearer stay in the belief and are named as well.
         """

@@ -26,6 +26,7 @@ from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference import information_gained
 from sbi_active.inference.beliefs.belief import require_support, require_width
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed, forked_generators
@@ -119,7 +120,7 @@ class Learner:
             score.num_simulations,
             score.num_missing,
             surprise=score.surprise,
-            belief_error=_error(getattr(self.belief, "diagnostics", {})),
+            belief_error=_error(getattr(self.belief, "diagnostics", Diagnostics())),
             log_score=score.log_score,
             version=state.version.number,
         )
@@ -193,8 +194,8 @@ class Learner:
         figures = belief.diagnostics
         self._account(
             trial.index,
-            figures.get("num_simulations", 0),
-            figures.get("num_missing", 0),
+            figures.num_simulations,
+            figures.num_missing,
             information_gained=gained,
             misfit=misfit(figures),
         )
@@ -297,23 +298,22 @@ class Learner:
         return rows.x.shape[1:]
 
 
-def misfit(diagnostics: dict[str, Any]) -> float | None:
+def misfit(diagnostics: Diagnostics) -> float | None:
     """Return a belief's tail probability, of all trials or the worst, both counted.
 
     Args:
         diagnostics: Of the belief; without tail probabilities there is none, nor where
             it is off by more than a test of the simulator can bear.
     """
-    if "tail_probability" not in diagnostics or _error(diagnostics) > LARGE:
+    each, joint = diagnostics.tail_probability_of_trial, diagnostics.tail_probability
+    if joint is None or _error(diagnostics) > LARGE:
         return None
-    each = diagnostics["tail_probability_of_trial"]
-    worst = min(diagnostics["tail_probability"], len(each) * min(each))
-    return min(1.0, 2 * float(worst))
+    return min(1.0, 2 * min(joint, len(each) * min(each)))
 
 
-def _error(diagnostics: dict[str, Any]) -> float:
+def _error(diagnostics: Diagnostics) -> float:
     """Return the nats that a belief is off as its simulations are few, 0 if unknown."""
-    modes = diagnostics.get("assumptions", {}).get("few_modes", {"holds": True})
-    if not modes["holds"]:  # whatever the others found is without a bound
-        return math.inf
-    return float(diagnostics.get("error_nats_if_explained", 0.0))
+    modes = diagnostics.assumptions.get("few_modes")
+    if modes is not None and not modes.holds:
+        return math.inf  # whatever the other figures say of those that were found
+    return diagnostics.error_nats_if_explained or 0.0

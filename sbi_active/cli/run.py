@@ -22,6 +22,7 @@ from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.methods import METHODS, faithful_options, find_method
 from sbi_active.cli.options import add_options, make_task
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
@@ -108,11 +109,8 @@ def _run(arguments: argparse.Namespace) -> int:
         task.parameter_names, mean, sd, task.theta_true, strict=True
     ):
         print(f"{name}: {m:.4g} +- {s:.2g} (truth {truth:g})")
-    diagnostics = getattr(campaign.belief, "diagnostics", {})
-    for warning in (
-        *diagnostics.get("warnings", []),
-        *diagnostics.get("network_warnings", []),
-    ):
+    diagnostics = getattr(campaign.belief, "diagnostics", Diagnostics())
+    for warning in (*diagnostics.warnings, *diagnostics.network_warnings):
         print(f"note: {warning}")
     print(f"{wall:.1f} s; figure: {figure_path}; results: {arguments.out}")
     return 0

@@ -54,7 +54,7 @@ def test_ask_tell_update():
     assert trial.information_gained > 0.5
     stages = {"simulation", "training", "design", "scoring", "update"}
     assert {*trial.cpu_seconds} == stages
-    spent = belief.diagnostics["num_simulations"] + OPTIONS.num_scored
+    spent = belief.diagnostics.num_simulations + OPTIONS.num_scored
     assert trial.num_simulations == 600 + trial.design.num_simulations + spent
     assert belief.label == "refined"
 
@@ -72,7 +72,7 @@ def test_three_rounds_narrow_the_belief():
     # Noise .1 over actions of at most 3, three times, and 1 % of the prior.
     draws = c.belief.sample((4_000,))
     assert float((draws - 0.7).abs().median()) < 0.1
-    assert c.belief.diagnostics["num_simulations"] > 0
+    assert c.belief.diagnostics.num_simulations > 0
 
 
 def test_without_refinement_beliefs_are_chained():

@@ -75,8 +75,8 @@ def test_a_number_that_nothing_explains_is_named_and_left_out(method, bad):
     with pytest.warns(UserWarning, match=r"trial 0 at action \[1\]: x = \["):
         belief = c.update()
     diagnostics = belief.diagnostics
-    assert diagnostics["trustworthy"] is False
-    text = diagnostics["warnings"][0]
+    assert diagnostics.trustworthy is False
+    text = diagnostics.warnings[0]
     assert "trial 0" in text
     assert "tell(x, trial=0)" in text
     assert "withdraw(0)" in text
@@ -99,7 +99,7 @@ def test_the_first_trial_alone_leaves_the_prior_marked():
     c.tell(1e15, action=[1.0])
     with pytest.warns(UserWarning, match="trial 0"):
         belief = c.update()
-    assert belief.diagnostics["trustworthy"] is False
+    assert belief.diagnostics.trustworthy is False
     theta = torch.linspace(0, 0.99, 5)[:, None]
     assert torch.equal(belief.log_prob(theta), PRIOR.log_prob(theta))
     assert c.update() is belief
@@ -111,8 +111,8 @@ def test_a_number_beyond_all_simulations_but_near_stays_and_is_named():
     c.tell(2.5, action=[1.0])
     with pytest.warns(UserWarning, match="trial 0"):
         belief = c.update()
-    assert belief.diagnostics["trustworthy"] is False
-    assert "leaves it out" not in belief.diagnostics["warnings"][0]
+    assert belief.diagnostics.trustworthy is False
+    assert "leaves it out" not in belief.diagnostics.warnings[0]
     assert float(belief.mean) > 0.9
 
 
@@ -144,7 +144,7 @@ def test_a_measurement_that_is_too_rare_to_simulate():
     c = tell(campaign(simulator=almost_never, num_scored=1_000))
     with pytest.warns(UserWarning, match="trial 1"):
         belief = c.update()
-    assert belief.diagnostics["trustworthy"] is False
+    assert belief.diagnostics.trustworthy is False
     c.ask()
 
 
@@ -156,7 +156,7 @@ def test_a_corrected_trial_is_as_if_told_at_once(method):
     assert wrong.health == "alarm"
     told = wrong.tell(TOLD[0][1], trial=0)
     assert (told.status, told.surprise) == ("ok", None)
-    assert "corrected since" in wrong.belief.diagnostics["warnings"][0]
+    assert "corrected since" in wrong.belief.diagnostics.warnings[0]
     wrong.update()
     assert torch.equal(draws(right), draws(wrong))
     assert scores(right) == scores(wrong)
@@ -232,7 +232,7 @@ def test_a_correction_behind_an_adoption():
     wrong.tell(500.0, trial=1)
     wrong.update()
     assert wrong.health == "alarm"
-    assert wrong.belief.diagnostics["trustworthy"] is False
+    assert wrong.belief.diagnostics.trustworthy is False
     truth = torch.tensor([0.6, 0.8])
     assert bool(((wrong.belief.mean - truth).abs() < 0.3).all())
     wrong.tell(told[1][1], trial=1)

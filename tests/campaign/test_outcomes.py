@@ -45,7 +45,7 @@ def test_each_kind_of_outcome_counts():
     c.tell(status="invalid", action=[2.0])
     assert float(c.update().mean) == pytest.approx(0.7, abs=0.03)
     assert c.belief.label == "refined"
-    assert c.belief.diagnostics["share_invalid"] > 0.2
+    assert c.belief.diagnostics.share_invalid > 0.2
     c.tell([0.62], action=[1.0])
     mean = float(c.update().mean)
     assert mean == pytest.approx(0.62, abs=0.05)
@@ -147,8 +147,8 @@ def test_a_faulty_simulator_completes_a_campaign(tmp_path):
         share = trial.num_missing / trial.num_simulations
         assert abs(share - 0.06) < 3 * (0.06 / trial.num_simulations) ** 0.5 + 0.01
     diagnostics = c.belief.diagnostics
-    assert 0.05 < diagnostics["share_invalid"] < 0.15
-    assert diagnostics["num_missing"] > 0
+    assert 0.05 < diagnostics.share_invalid < 0.15
+    assert diagnostics.num_missing > 0
     assert float(c.belief.mean) == pytest.approx(0.6, abs=0.1)
     assert len(c.state.processed) == 2
 

@@ -83,7 +83,7 @@ def test_a_simulator_refines_and_is_counted():
     belief = observe(inference, simulator=simulator, refinement=settings)
     # 500 rows an action or more in the last stage: .08 noise deviations of f, twice.
     assert abs(divergence(belief)) < 0.1
-    assert belief.diagnostics["num_simulations"] == 2_000  # two actions each
+    assert belief.diagnostics.num_simulations == 2_000  # two actions each
     trials = inference.trials
     again = inference.update_all(trials, simulator, refinement=settings, seed=3)
     assert abs(divergence(again)) < 0.1
@@ -137,7 +137,7 @@ def test_kernels_have_the_stated_bandwidth():
     torch.manual_seed(0)
     draws = PRIOR.sample((1_000,))
     belief = KernelBelief(PRIOR, draws)
-    assert belief.diagnostics["bandwidth"] == pytest.approx(1_000 ** (-1 / 6))
+    assert belief.diagnostics.bandwidth == pytest.approx(1_000 ** (-1 / 6))
     widened = KernelBelief(PRIOR, draws, bandwidth=2.0).sample((4_000,))
     # 1 + h^2 times the variance of the draws, to a few per cent.
     ratio = float(widened.var() / draws.var())

@@ -60,7 +60,7 @@ def test_errors_of_a_chained_belief_do_not_stay():
         trial.x, action=trial.action, simulator=simulator, refinement=SETTINGS, seed=0
     )
     assert divergence(belief, exact(TRIALS[:1])) < 0.06
-    assert belief.diagnostics["chained_loss"] > 5
+    assert belief.diagnostics.chained_loss > 5
 
 
 def test_update_all_starts_from_scratch_and_order_does_not_matter():
@@ -103,7 +103,7 @@ def test_invalid_trials_count_whatever_their_place(first):
         belief = inference.update_all([invalid], hides, seed=0)
     assert float((belief.sample((2_000,))[:, 0] > 0.5).float().mean()) > 0.99
     both = inference.update_all(trials, hides, seed=0)
-    assert not both.diagnostics["trustworthy"]  # no parameter explains both
+    assert not both.diagnostics.trustworthy  # no parameter explains both
 
 
 def test_an_invalid_trial_no_simulation_explains_changes_nothing():
@@ -111,8 +111,8 @@ def test_an_invalid_trial_no_simulation_explains_changes_nothing():
     trials = [*TRIALS, invalid]
     belief = ASBI(PRIOR).update_all(trials, simulator, refinement=SETTINGS, seed=0)
     assert divergence(belief, exact(TRIALS)) < 0.06
-    assert belief.diagnostics["probability_of_outcome"] == [1, 1, 1, 0]
-    assert "the simulator lacks a way to fail" in belief.diagnostics["warnings"][-1]
+    assert belief.diagnostics.probability_of_outcome == [1, 1, 1, 0]
+    assert "the simulator lacks a way to fail" in belief.diagnostics.warnings[-1]
 
 
 def test_a_lost_network_does_not_lose_the_posterior_of_earlier_trials():
@@ -168,14 +168,14 @@ def test_a_blunt_and_an_overconfident_network_are_told_apart(network, kind):
     """Blunt by a factor 6 in two dimensions: 2 log 6 = 3.6 nats of entropy."""
     belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)
     compare(belief, network)
-    warnings = belief.diagnostics.get("network_warnings", [])
+    warnings = belief.diagnostics.network_warnings
     if kind is None:
         assert not warnings
     else:
         assert kind in warnings[0]
     if kind == "under-confident":
         expected = 2 * torch.tensor(6.0).log()
-        assert abs(belief.diagnostics["chained_bluntness"] - expected) < 0.3
+        assert abs(belief.diagnostics.chained_bluntness - expected) < 0.3
 
 
 def test_refined_beliefs_travel():
@@ -208,20 +208,20 @@ def test_the_faithful_network_is_flagged_as_blunt():
         simulator=task.simulator,
         seed=0,
     )
-    assert belief.diagnostics["trustworthy"]
-    assert belief.diagnostics["chained_bluntness"] > 3
-    assert "under-confident" in belief.diagnostics["network_warnings"][0]
+    assert belief.diagnostics.trustworthy
+    assert belief.diagnostics.chained_bluntness > 3
+    assert "under-confident" in belief.diagnostics.network_warnings[0]
 
 
 def test_a_second_refinement_in_reverse_order_agrees():
     settings = Refinement(num_histories=600, check_order=True)
     belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=settings, seed=0)
-    assert -0.02 < belief.diagnostics["order_swap_kl"] < 0.1
+    assert -0.02 < belief.diagnostics.order_swap_kl < 0.1
     single = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)
-    spent = belief.diagnostics["num_simulations"]
-    assert spent > 1.5 * single.diagnostics["num_simulations"]
+    spent = belief.diagnostics.num_simulations
+    assert spent > 1.5 * single.diagnostics.num_simulations
     # negative control: the beliefs of other trials differ, and that is said
     other = ASBI(PRIOR).update_all(TRIALS[:1], simulator, refinement=SETTINGS, seed=0)
     compare_orders(belief, other)
-    assert belief.diagnostics["order_swap_kl"] > 0.2
-    assert not belief.diagnostics["trustworthy"]
+    assert belief.diagnostics.order_swap_kl > 0.2
+    assert not belief.diagnostics.trustworthy

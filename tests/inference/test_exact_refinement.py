@@ -203,14 +203,14 @@ def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):
     first = refine(model, BOX, ACTION[:2], x[:2], settings=FEW, seed=0)
     second = refine(model, BOX, ACTION, x, past=first.histories, settings=FEW, seed=1)
     assert isinstance(second, ExactBelief)
-    assert second.diagnostics["trustworthy"], second.diagnostics["warnings"]
+    assert second.diagnostics.trustworthy, second.diagnostics.warnings
     assert isinstance(first, ExactBelief)
     kept = first.histories.pool.proposals  # pyright: ignore
     every = second.histories.pool.proposals  # pyright: ignore
     assert all(a[1] is b[1] for a, b in zip(kept, every, strict=False))
     assert len(every) >= len(kept) > 2
     exact = grid_evidence(model, ACTION, x)
-    assert second.diagnostics["log_evidence"] == pytest.approx(exact, abs=0.5)
+    assert second.diagnostics.log_evidence == pytest.approx(exact, abs=0.5)
 
     # Draws of the second were simulated at the first's actions, and are free there.
     with forked_generators(0):
@@ -234,8 +234,8 @@ def test_it_ends_at_the_effective_draws_that_are_asked_for(model: SimulatorModel
         settings = replace(settings, num_effective=num_effective, num_draws=150)
         belief = refine(model, BOX, ACTION[:1], x, settings=settings, seed=0)
         assert isinstance(belief, ExactBelief)
-        assert belief.diagnostics["effective_sample_size"] >= num_effective
-        spent.append(belief.diagnostics["num_simulations"])
+        assert belief.diagnostics.effective_sample_size >= num_effective
+        spent.append(belief.diagnostics.num_simulations)
         numbers = [num for num, _ in belief.histories.pool.proposals]  # pyright: ignore
         assert set(numbers) == {750, 150}  # those of the first proposals, then of all
     assert spent[0] < spent[1]
@@ -281,8 +281,8 @@ def test_a_fault_loses_its_draw_alone(model: SimulatorModel):
     with pytest.warns(MissingRowsWarning):
         belief = refine(faulty, BOX, ACTION, x, settings=FEW, seed=0)
     assert isinstance(belief, ExactBelief)
-    assert belief.diagnostics["num_missing"] > 0
-    assert belief.diagnostics["log_evidence"] == pytest.approx(
+    assert belief.diagnostics.num_missing > 0
+    assert belief.diagnostics.log_evidence == pytest.approx(
         grid_evidence(model, ACTION, x), abs=0.5
     )
 

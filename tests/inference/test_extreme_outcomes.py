@@ -74,7 +74,7 @@ def test_what_the_network_cannot_say_changes_nothing(x):
         return
     with pytest.warns(UserWarning, match="its density is finite nowhere"):
         belief = trainer.update(torch.tensor([x]), action=torch.ones(1))
-    assert belief.diagnostics["trustworthy"] is False
+    assert belief.diagnostics.trustworthy is False
     theta = torch.tensor([[0.2], [0.7]])
     assert torch.equal(belief.log_prob(theta), PRIOR.log_prob(theta))
 
@@ -92,7 +92,7 @@ def test_refinement_says_that_it_is_not_to_be_trusted(model, x):
             settings=SETTINGS,
             seed=0,
         )
-    assert belief.diagnostics["trustworthy"] is False
+    assert belief.diagnostics.trustworthy is False
     assert bool(belief.sample((50,)).isfinite().all())
 
 

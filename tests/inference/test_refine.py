@@ -78,7 +78,7 @@ def test_linear_gaussian_closed_form():
     theta = exact.sample(torch.Size([2_000]))
     log_ratio = exact.log_prob(theta) - belief.log_prob(theta).double()
     assert abs(float(log_ratio.mean())) < 0.1
-    assert belief.diagnostics["trustworthy"], belief.diagnostics["warnings"]
+    assert belief.diagnostics.trustworthy, belief.diagnostics.warnings
 
 
 @pytest.mark.parametrize("num_histories", [500, 3_000])
@@ -104,7 +104,7 @@ def test_a_single_trial_leaves_a_ridge_across_the_box(variant: str, action: floa
     gap, divergence, belief = scored(variant, [action], 3_000, seed=2)
     assert abs(gap) < 1.0
     assert -0.02 < divergence < 0.1
-    assert belief.diagnostics["trustworthy"]
+    assert belief.diagnostics.trustworthy
 
 
 @pytest.mark.slow
@@ -206,7 +206,7 @@ def test_budget_is_respected(num_histories: int):
     settings = Refinement(num_histories=num_histories)
     belief = refine(simulator, BOX, action, x, settings=settings, seed=0)
     assert rows <= 2 * num_histories
-    assert belief.diagnostics["num_simulations"] == rows
+    assert belief.diagnostics.num_simulations == rows
 
 
 def test_start_is_a_hint_without_weight(linear):
@@ -228,10 +228,10 @@ def test_hard_edged_noise_is_flagged(noise: str, num_seeds: int, num_histories: 
     for seed in range(num_seeds):
         x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, seed)
         belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
-        holds = belief.diagnostics["assumptions"]["gaussian_noise"]["holds"]
+        holds = belief.diagnostics.assumptions["gaussian_noise"].holds
         assert holds == (noise == "gaussian")
         if noise == "uniform":
-            assert not belief.diagnostics["trustworthy"]
+            assert not belief.diagnostics.trustworthy
 
 
 @pytest.mark.parametrize("num_histories", [500, 1_000, 3_000])
@@ -245,33 +245,34 @@ def test_four_sharp_modes_are_flagged(num_seeds: int, num_histories: int):
             theta = BOX.sample((1,))
         x = observe(simulator, theta, action, seed)
         belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
-        assert not belief.diagnostics["trustworthy"]
-        assert not belief.diagnostics["assumptions"]["smooth_response"]["holds"]
+        assert not belief.diagnostics.trustworthy
+        assert not belief.diagnostics.assumptions["smooth_response"].holds
 
 
 def test_impossible_observation_is_flagged(linear):
-    assert 0.01 < linear[0].diagnostics["tail_probability"] <= 1
+    assert 0.01 < linear[0].diagnostics.tail_probability <= 1
     action = torch.tensor([[0.0], [0.0], [5.0]])
     x = torch.tensor([[50.0], [-50.0], [200.0]])  # the same action, 100 sigma apart
     for seed in range(3):
         diagnostics = refine(numerical(), BOX, action, x, seed=seed).diagnostics
-        assert diagnostics["tail_probability"] < 1e-3
-        warnings = " ".join(diagnostics["warnings"])
+        assert diagnostics.tail_probability < 1e-3
+        warnings = " ".join(diagnostics.warnings)
         assert "unlike anything simulated" in warnings
 
 
 def test_diagnostics_are_plain(linear):
-    diagnostics = linear[0].diagnostics
-    assert json.loads(json.dumps(diagnostics)) == diagnostics
-    assert diagnostics["trustworthy"]
-    assert not diagnostics["warnings"]
-    assert 0.5 < diagnostics["residual_to_noise"] < 1.5
-    assert diagnostics["effective_sample_size"] > 1_000
-    assert sum(diagnostics["region_mass"]) == pytest.approx(1, abs=1e-6)
-    assert len(diagnostics["tail_probability_of_trial"]) == 4
+    known = linear[0].diagnostics
+    plain = known.to_dict()
+    assert json.loads(json.dumps(plain)) == plain
+    assert known.trustworthy
+    assert not known.warnings
+    assert 0.5 < known.residual_to_noise < 1.5
+    assert known.effective_sample_size > 1_000
+    assert sum(known.region_mass) == pytest.approx(1, abs=1e-6)
+    assert len(known.tail_probability_of_trial) == 4
     assert {
         "num_stages",
         "num_regions",
         "prior_edge_mass",
         "surrogate_kl_last_stage",
-    } <= set(diagnostics)
+    } <= set(plain)

@@ -56,7 +56,7 @@ def test_invalid_simulations_are_counted():
     action = torch.tensor([[0.0], [5.0]])
     x = observe(numerical(), torch.tensor([[2.0, 1.0]]), action, 0)
     belief = refine(simulator, BOX, action, x, seed=0)
-    assert 0.1 < belief.diagnostics["share_invalid"] < 0.5
+    assert 0.1 < belief.diagnostics.share_invalid < 0.5
     assert abs(float(draws(belief, 2_000)[:, 0].median()) - 2.0) < 0.2
     with pytest.raises(ValueError, match="with a measurement"):
         refine(lambda t, a: torch.full((len(t), 1), torch.nan), BOX, action, x, seed=0)
@@ -73,7 +73,7 @@ def test_a_constant_channel_does_no_harm():
     theta = exact.sample(1_000, seed=0)
     log_ratio = exact.log_prob(theta) - belief.log_prob(theta).double()
     assert float(log_ratio.mean()) < 0.1
-    assert belief.diagnostics["trustworthy"], belief.diagnostics["warnings"]
+    assert belief.diagnostics.trustworthy, belief.diagnostics.warnings
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_past_histories_are_used_first():
                 past=past if reuse else None, seed=t,
             )  # fmt: skip
             past = belief.histories
-            assert belief.diagnostics["num_simulations"] == count[0]
+            assert belief.diagnostics.num_simulations == count[0]
         rows.append(count[0])
         difference = exact.log_prob(theta) - belief.log_prob(theta.float())
         divergences.append(float(difference.mean()))

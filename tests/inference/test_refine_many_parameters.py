@@ -47,8 +47,8 @@ def test_ten_and_twenty_parameters(dim: int, num_histories: int):
 def test_trust_follows_the_error_and_not_the_dimension(num: int, num_histories: int):
     divergence, belief = refined(10, num, seed=1, num_histories=num_histories)
     diagnostics = belief.diagnostics
-    assert diagnostics["error_nats"] == pytest.approx(divergence, rel=0.7, abs=0.05)
-    assert diagnostics["trustworthy"] == (divergence < 0.2)
+    assert diagnostics.error_nats == pytest.approx(divergence, rel=0.7, abs=0.05)
+    assert diagnostics.trustworthy == (divergence < 0.2)
 
 
 def refine_two_of(dim: int):
@@ -66,8 +66,8 @@ def refine_two_of(dim: int):
 def test_many_edges_are_no_edge():
     """A prior of forty parameters has most of its mass near one edge or another."""
     belief = refine_two_of(40)
-    assert belief.diagnostics["prior_edge_mass"] < 0.1
-    assert not any("edge" in text for text in belief.diagnostics["warnings"])
+    assert belief.diagnostics.prior_edge_mass < 0.1
+    assert not any("edge" in text for text in belief.diagnostics.warnings)
 
 
 def test_too_few_histories_are_no_unexplained_outcome():

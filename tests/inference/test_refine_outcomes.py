@@ -102,7 +102,7 @@ def test_close_to_the_exact_posterior(name: str, all_invalid: bool, num_seeds: i
     ]
     divergences = torch.tensor([run[0] for run in runs])
     assert divergences.max() < 0.1
-    assert all(run[2].diagnostics["trustworthy"] for run in runs)
+    assert all(run[2].diagnostics.trustworthy for run in runs)
     # Negative control: what trials without a measurement tell is missed without them.
     ignoring = torch.tensor([run[1] for run in runs])
     assert ignoring.max() > 0.1 if name == "dropout" else ignoring.mean() > 0.2
@@ -172,8 +172,8 @@ def test_an_edge_that_the_regression_cannot_follow_is_flagged():
     stripes = World(lambda t, a: ((t[:, :1] * 10).floor() % 2 == 0).double())
     action, x = torch.ones(1, 1), torch.full((1, 1), torch.nan)
     diagnostics = refine(stripes, PRIOR, action, x, seed=0).diagnostics
-    assert not diagnostics["assumptions"]["outcomes_followed"]["holds"]
-    assert "followed coarsely" in " ".join(diagnostics["warnings"])
+    assert not diagnostics.assumptions["outcomes_followed"].holds
+    assert "followed coarsely" in " ".join(diagnostics.warnings)
 
 
 def test_lost_rows_cost_their_histories_and_nothing_else():
@@ -189,7 +189,7 @@ def test_lost_rows_cost_their_histories_and_nothing_else():
     with pytest.warns(UserWarning, match="simulations of the refinement are missing"):
         belief = refine(faulty, PRIOR, action, x, seed=0)
     diagnostics = belief.diagnostics
-    assert 0 < diagnostics["num_missing"] < 0.3 * diagnostics["num_simulations"]
+    assert 0 < diagnostics.num_missing < 0.3 * diagnostics.num_simulations
     log_b = belief.log_prob(GRID.float()).double() + LOG_CELL
     assert divergence(world.log_exact(action, x), log_b) < 0.1
 

@@ -75,7 +75,7 @@ def test_seqbed_weighs_particles():
     # Of 40 particles a dozen count.
     sd = float(variance.sqrt())
     assert float(belief.mean) == pytest.approx(float(mean), abs=3 * sd / 12**0.5)
-    effective = belief.diagnostics["effective_sample_size"]
+    effective = belief.diagnostics.effective_sample_size
     assert 3 < effective < 30
     # The kernels add h^2 of the particles' own variance.
     assert 0.7 * sd < float(belief.variance.sqrt()) < 2 * sd
@@ -96,11 +96,11 @@ def test_seqbed_with_a_simulator():
     assert float(belief.mean) == pytest.approx(
         float(mean), abs=3 * float(variance.sqrt()) / 12**0.5
     )
-    assert belief.diagnostics["num_simulations"] == 1_600
-    assert belief.diagnostics["num_particles"] == 40
+    assert belief.diagnostics.num_simulations == 1_600
+    assert belief.diagnostics.num_particles == 40
     trials = [*inference.trials, *inference.trials]
     both = inference.update_all(trials, simulator, refinement=settings, seed=1)
-    assert both.diagnostics["num_simulations"] == 3_200
+    assert both.diagnostics.num_simulations == 3_200
     assert float(both.variance) < float(belief.variance)
 
 
@@ -145,7 +145,7 @@ def test_amortized_ratios_meet_the_closed_form(trainer):
     sd = 6**-0.5
     assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.35 * sd)
     assert belief.variance.sqrt().tolist() == pytest.approx([sd] * DIM, rel=0.25)
-    assert belief.diagnostics["num_simulations"] == 2_000
+    assert belief.diagnostics.num_simulations == 2_000
 
 
 def test_no_measurement_is_information():

@@ -97,7 +97,7 @@ def test_many_correlated_numbers_of_the_right_simulator_are_not_unlike_it(lost):
         belief = refine(
             simulator, prior, torch.ones(1, 1), x, settings=settings, seed=seed
         )
-        tails.append(belief.diagnostics["tail_probability"])
+        tails.append(belief.diagnostics.tail_probability)
     assert min(tails) > 0.01
 
 

@@ -216,7 +216,7 @@ def test_refined_belief_is_the_exact_posterior():
     weight = (log_p - log_p.logsumexp(0)).exp()
     exact = task.prior.log_prob(theta.float()) - log_evidence
     exact += history_log_likelihood(theta[None], action, x)[0]
-    sizes = belief.diagnostics["effective_sample_size"], 1 / weight.square().sum()
+    sizes = belief.diagnostics.effective_sample_size, 1 / weight.square().sum()
     error = math.sqrt(sum(1 / float(size) for size in sizes))
     assert error < 0.1
     assert abs(float(belief.log_prob(theta) - exact)) < 4 * error

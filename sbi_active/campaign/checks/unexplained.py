@@ -113,12 +113,8 @@ def in_doubt(
         marked = copy.copy(belief)
     else:
         marked = UnchangedBelief(prior, belief)
-    known = marked.diagnostics.get("warnings", [])
-    marked.diagnostics = {
-        **marked.diagnostics,
-        "trustworthy": False,
-        "warnings": [*texts, *known],
-    }
+    known = marked.diagnostics
+    marked.diagnostics = known.extended(warnings=()).warned(*texts, *known.warnings)
     return marked
 
 

@@ -14,6 +14,7 @@ from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.seeding import forked_generators
 
 __all__ = [
@@ -40,7 +41,7 @@ class Belief(Distribution, ABC):
     Attributes:
         prior: The original prior.
         label: How the belief was made, for reports.
-        diagnostics: Figures about its quality, by name.
+        diagnostics: What is known of its quality.
     """
 
     arg_constraints = {}  # pyright: ignore
@@ -50,7 +51,7 @@ class Belief(Distribution, ABC):
         dim = parameter_dim(prior)
         super().__init__(torch.Size(), torch.Size([dim]), validate_args=False)
         self.prior = prior
-        self.diagnostics: dict[str, Any] = {}
+        self.diagnostics = Diagnostics()
 
     @abstractmethod
     def _sample(self, num_samples: int) -> Tensor:
@@ -160,7 +161,7 @@ class ChainedBelief(Belief):
             draws = estimator.sample(torch.Size([num_samples]), condition)[:, 0]
             inside = within_support(prior, draws)
         acceptance = float(inside.double().mean())
-        self.diagnostics["mass_inside_prior"] = acceptance
+        self.diagnostics = self.diagnostics.extended(mass_inside_prior=acceptance)
         self._particles: Tensor | None = None
         if acceptance >= MINIMAL_ACCEPTANCE:
             self._log_normalizer = torch.tensor(acceptance).log()
@@ -190,7 +191,7 @@ class ChainedBelief(Belief):
             return self._particles[torch.randint(len(self._particles), (num_samples,))]
         kept: list[Tensor] = []
         missing = num_samples
-        acceptance = self.diagnostics["mass_inside_prior"]
+        acceptance = self.diagnostics.mass_inside_prior
         while missing > 0:
             size = min(int(1.1 * missing / acceptance) + 20, 1_000_000)
             draws = self._estimator.sample(torch.Size([size]), self._condition)[:, 0]

@@ -31,8 +31,8 @@ def compare(
     overconfidence or a wrong place. The loss is bounded by 60 nats.
 
     Args:
-        refined: Its ``diagnostics`` gain "refined_log_score", "chained_log_score",
-            "chained_loss", "chained_bluntness" and, beyond half a nat, a warning.
+        refined: Its ``diagnostics`` gain refined_log_score, chained_log_score,
+            chained_loss, chained_bluntness and, beyond half a nat, a warning.
         chained: The network's value at the same trial.
         num_samples: Draws of each.
     """
@@ -44,12 +44,12 @@ def compare(
     score = float(chained_log_prob.clamp_min(refined_score + FLOOR).mean())
     entropy = -float(chained.log_prob(chained_draws).double().mean())
     loss, bluntness = refined_score - score, entropy + refined_score
-    refined.diagnostics |= {
-        "refined_log_score": refined_score,
-        "chained_log_score": score,
-        "chained_loss": loss,
-        "chained_bluntness": bluntness,
-    }
+    refined.diagnostics = refined.diagnostics.extended(
+        refined_log_score=refined_score,
+        chained_log_score=score,
+        chained_loss=loss,
+        chained_bluntness=bluntness,
+    )
     if loss <= TOLERANCE:
         return
     kind = (
@@ -57,8 +57,8 @@ def compare(
         if bluntness > 0.5 * loss
         else f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
     )
-    refined.diagnostics.setdefault("network_warnings", []).append(
-        f"the amortized network is {kind}"
+    refined.diagnostics = refined.diagnostics.extended(
+        network_warnings=(f"the amortized network is {kind}",)
     )
 
 
@@ -72,7 +72,7 @@ def compare_orders(belief: Belief, other: Belief, *, num_samples: int = 2_000) -
     a product over trials, so anything beyond Monte Carlo error is an error.
 
     Args:
-        belief: Its ``diagnostics`` gain "order_swap_kl" and, beyond .2 nat, a warning.
+        belief: Its ``diagnostics`` gain order_swap_kl and, beyond .2 nat, a warning.
         other: Of the same trials.
         num_samples: Draws.
     """
@@ -80,12 +80,12 @@ def compare_orders(belief: Belief, other: Belief, *, num_samples: int = 2_000) -
         draws = belief.sample((num_samples,))
     difference = (belief.log_prob(draws) - other.log_prob(draws)).double()
     divergence = float(difference.clamp_max(-FLOOR).mean())
-    diagnostics = belief.diagnostics
-    diagnostics["order_swap_kl"] = divergence
-    diagnostics["num_simulations"] += other.diagnostics["num_simulations"]
+    spent = belief.diagnostics.num_simulations + other.diagnostics.num_simulations
+    belief.diagnostics = belief.diagnostics.extended(
+        order_swap_kl=divergence, num_simulations=spent
+    )
     if divergence > ORDER_TOLERANCE:
-        diagnostics["trustworthy"] = False
-        diagnostics["warnings"].append(
+        belief.diagnostics = belief.diagnostics.warned(
             f"a second refinement of the same trials, in reverse order, differs by "
             f"{divergence:.2g} nats; do raise num_histories"
         )

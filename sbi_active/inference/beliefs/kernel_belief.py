@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.seeding import forked_generators
 
 __all__ = ["Bandwidth", "KernelBelief"]
@@ -79,13 +80,12 @@ class KernelBelief(Belief):
         with forked_generators(0, "kernels"):
             inside = within_support(prior, self._draw(NUM_TRIED).float())
         self._kept = max(float(inside.double().mean()), 1 / NUM_TRIED)
-        self.diagnostics = {
-            "bandwidth": width,
-            "rule": bandwidth,
-            "effective_sample_size": effective,
-            "mass_inside_prior": self._kept,
-            "warnings": [],
-        }
+        self.diagnostics = Diagnostics().extended(
+            effective_sample_size=effective,
+            bandwidth=width,
+            rule=bandwidth,
+            mass_inside_prior=self._kept,
+        )
 
     def _draw(self, num_samples: int) -> Tensor:
         index = torch.multinomial(self._weight, num_samples, replacement=True)

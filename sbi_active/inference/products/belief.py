@@ -6,6 +6,7 @@ import numpy as np
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.products.product import NUM_COMPONENTS, Product
 from sbi_active.inference.refinement.learned_belief import RefinedBelief
 from sbi_active.inference.regression.regions import PriorProposal
@@ -61,17 +62,15 @@ def sample_product(
     )
     belief = ProductBelief(prior, product, particles, defensive=defensive)
     effective = particles.effective_sample_size
-    belief.diagnostics = {
-        "likelihood": "learned",
-        "effective_sample_size": effective,
-        "log_normalizer": particles.log_normalizer,
-        "num_steps": num_steps,
-        "warnings": [],
-    }
+    belief.diagnostics = Diagnostics().extended(
+        effective_sample_size=effective,
+        likelihood="learned",
+        log_normalizer=particles.log_normalizer,
+        num_steps=num_steps,
+    )
     if effective < ENOUGH:
-        belief.diagnostics["warnings"].append(
-            f"the belief rests on {effective:.0f} effective draws; do raise "
-            "num_particles"
+        belief.diagnostics = belief.diagnostics.warned(
+            f"the belief rests on {effective:.0f} effective draws; raise num_particles"
         )
     return belief
 

@@ -46,7 +46,7 @@ class ChainBelief(Belief):
             )
         self.label = f"product over trials, by {method}"
         self._product, self._factors, self._method = product, factors, method
-        self.diagnostics = dict(product.diagnostics)
+        self.diagnostics = product.diagnostics
 
     def _log_prob(self, theta: Tensor) -> Tensor:
         return self._product.log_prob(theta)

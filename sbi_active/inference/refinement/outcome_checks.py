@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.surrogate import Surrogate
 
@@ -20,18 +21,18 @@ UNHEARD = 0.01  # probability of an outcome that calls for a warning
 
 
 def check_outcomes(
-    diagnostics: dict[str, Any], surrogate: Surrogate, draws: Array, pool: Histories
-) -> None:
-    r"""Add figures on trials without a measurement to a belief's diagnostics.
+    diagnostics: Diagnostics, surrogate: Surrogate, draws: Array, pool: Histories
+) -> Diagnostics:
+    r"""Return a belief's diagnostics with figures on trials without a measurement.
 
-    "probability_of_outcome" is :math:`E_b[P(\text{as observed} | \theta)]` of each
+    ``probability_of_outcome`` is :math:`E_b[P(\text{as observed} | \theta)]` of each
     trial. Near zero, the trial did what simulations near the belief do not do: the
     simulator lacks a way of failing, or a fault was told as "invalid". The assumption
     "outcomes_followed" compares repeated simulations: where those agree and the
     regression expects them to differ, it misses an edge.
 
     Args:
-        diagnostics: Gains the entries and, where they call for it, warnings.
+        diagnostics: Without them.
         surrogate: The final one.
         draws: Of the belief, shape (n, d).
         pool: All simulations.
@@ -48,24 +49,24 @@ def check_outcomes(
             if len(z) > LIVE * len(draws):
                 blur = max(blur, outcome.blur)
     probability = [float(p) for p in total / len(draws)]
-    diagnostics["probability_of_outcome"] = probability
-    diagnostics["num_missing"] = pool.num_missing
     followed = blur <= BLURRED
-    diagnostics["assumptions"]["outcomes_followed"] = {
-        "holds": followed,
-        "figure": blur,
-    }
+    texts = []
     if not followed:
-        diagnostics["warnings"].append(
+        texts.append(
             "where simulations have a measurement and where they have none is followed "
             f"coarsely ({blur:.0%} of repeated simulations would differ that do not), "
-            "so that the belief is too wide; do raise num_histories"
+            "so that the belief is too wide; raise num_histories"
         )
     unheard = [k for k, p in enumerate(probability) if p < UNHEARD]
     if unheard:
-        diagnostics["warnings"].append(
+        texts.append(
             f"trials {', '.join(map(str, unheard))} had a measurement, or none, where "
             f"less than {UNHEARD:.0%} of the simulations near the belief do the same: "
             "the simulator lacks a way to fail, or the status of the trial is wrong"
         )
-    diagnostics["trustworthy"] = not diagnostics["warnings"]
+    assumption = Assumption(followed, float(blur))
+    return diagnostics.extended(
+        probability_of_outcome=probability,
+        num_missing=pool.num_missing,
+        assumptions={**diagnostics.assumptions, "outcomes_followed": assumption},
+    ).warned(*texts)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.importance import WeightedPool, importance_sample
 from sbi_active.inference.refinement.settings import Refinement
 from sbi_active.inference.refinement.simulated_belief import ExactBelief
@@ -125,13 +126,11 @@ def refine_exactly(
     belief = ExactBelief(
         prior, coordinates, likelihood, pool, defensive=settings.defensive
     )
-    belief.diagnostics = _diagnose(likelihood, coordinates, pool, seed)
     num_simulations = table.num_simulations - before[0]
     num_missing = table.num_missing - before[1]
-    belief.diagnostics |= {
-        "num_simulations": num_simulations,
-        "num_missing": num_missing,
-    }
+    belief.diagnostics = _diagnose(likelihood, coordinates, pool, seed).extended(
+        num_simulations=num_simulations, num_missing=num_missing
+    )
     belief.histories = ExactRecord.of(histories, likelihood, coordinates, pool)
     if num_missing:
         warnings.warn(
@@ -148,7 +147,7 @@ def _diagnose(
     coordinates: PriorCoordinates,
     pool: WeightedPool,
     seed: int,
-) -> dict[str, Any]:
+) -> Diagnostics:
     """Return figures about the draws, as of a learned likelihood where they apply."""
     effective = pool.effective_sample_size
     near_edge = np.abs(pool.z[:, coordinates.bounded]) > 0.98
@@ -172,20 +171,20 @@ def _diagnose(
             f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
             "prior may exclude the truth"
         )
-    return {
-        "likelihood": "simulated",
-        "num_stages": len(pool.proposals),
-        "effective_sample_size": effective,
-        "log_evidence": pool.log_evidence,
-        "prior_edge_mass": edge_mass,
-        "tail_probability": tail[-1],
-        "tail_probability_of_trial": tail[:-1],
-        "assumptions": {
-            "enough_draws": {"holds": effective >= COARSE, "figure": effective}
+    return Diagnostics(
+        trustworthy=not warnings,
+        warnings=(*warnings,),
+        assumptions={"enough_draws": Assumption(effective >= COARSE, effective)},
+        effective_sample_size=effective,
+        tail_probability=tail[-1],
+        tail_probability_of_trial=(*tail[:-1],),
+        figures={
+            "likelihood": "simulated",
+            "num_stages": len(pool.proposals),
+            "log_evidence": pool.log_evidence,
+            "prior_edge_mass": edge_mass,
         },
-        "trustworthy": not warnings,
-        "warnings": warnings,
-    }
+    )
 
 
 def _tail_probability(

@@ -259,7 +259,8 @@ def _refine(
                 seed=seed,
             )
             if exact is not None:
-                exact.diagnostics["num_simulations"] += histories.num_simulations
+                spent = exact.diagnostics.num_simulations + histories.num_simulations
+                exact.diagnostics = exact.diagnostics.extended(num_simulations=spent)
                 return exact
 
     diagnostics = diagnose(
@@ -269,7 +270,7 @@ def _refine(
         num_trials=len(action),
         rng=rng,
     )
-    check_outcomes(diagnostics, surrogate, stage.draws, histories)
+    diagnostics = check_outcomes(diagnostics, surrogate, stage.draws, histories)
     # The residuals have served the diagnostics and would only weigh on the pickle.
     empty = np.zeros((0, observed.size))
     slim = [replace(r, residual=empty, standardized=empty) for r in regressions]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
+from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.regression_error import (
     LARGE,
     SMALL,
@@ -142,7 +143,7 @@ def diagnose(
     share_invalid: float,
     num_trials: int,
     rng: np.random.Generator,
-) -> dict[str, Any]:
+) -> Diagnostics:
     """Return figures about the last stage, its assumptions and warnings in words.
 
     Args:
@@ -151,11 +152,6 @@ def diagnose(
         share_invalid: Share of histories without a measurement in some trial.
         num_trials: Trials t.
         rng: Source of randomness.
-
-    Returns:
-        Numbers, strings, lists and dicts of them only, so that JSON can hold it.
-        ``assumptions`` maps each to ``{"holds": bool, "figure": float}``;
-        ``trustworthy`` is whether there are no ``warnings``.
     """
     last = course.stages[-1]
     fits = last.surrogate.regressions
@@ -235,31 +231,33 @@ def diagnose(
             f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
             "prior may exclude the truth"
         )
-    return {
-        "num_simulations": num_simulations,
-        "num_stages": len(course.stages),
-        "effective_sample_size": float(last.particles.effective_sample_size),
-        "residual_to_noise": float(ratio),
-        "num_regions": len(fits),
-        "error_nats": last.error,
-        "error_nats_if_explained": expected_error(
-            last.surrogate, last.draws, rng, explained=True
-        ),
-        "region_mass": [float(mass) for mass in last.mass],
-        "prior_edge_mass": edge_mass,
-        "tail_probability": joint,
-        "tail_probability_of_trial": tail,
-        "surrogate_kl_last_stage": (
-            course.divergence if len(course.stages) > 1 else -1.0
-        ),
-        "share_invalid": share_invalid,
-        "assumptions": {
-            name: {"holds": bool(ok), "figure": float(figure)}
+    return Diagnostics(
+        trustworthy=not warnings,
+        warnings=(*warnings,),
+        assumptions={
+            name: Assumption(bool(ok), float(figure))
             for name, (ok, figure, _) in assumptions.items()
         },
-        "trustworthy": not warnings,
-        "warnings": warnings,
-    }
+        num_simulations=num_simulations,
+        effective_sample_size=float(last.particles.effective_sample_size),
+        error_nats=last.error,
+        error_nats_if_explained=expected_error(
+            last.surrogate, last.draws, rng, explained=True
+        ),
+        tail_probability=joint,
+        tail_probability_of_trial=(*tail,),
+        figures={
+            "num_stages": len(course.stages),
+            "residual_to_noise": float(ratio),
+            "num_regions": len(fits),
+            "region_mass": [float(mass) for mass in last.mass],
+            "prior_edge_mass": edge_mass,
+            "surrogate_kl_last_stage": (
+                course.divergence if len(course.stages) > 1 else -1.0
+            ),
+            "share_invalid": share_invalid,
+        },
+    )
 
 
 def _noise_shape(

@@ -181,7 +181,7 @@ class ASBI(ActionNPE):
                 stacklevel=3,
             )
             unchanged = UnchangedBelief(prior, previous)
-            unchanged.diagnostics |= {"trustworthy": False, "warnings": [fault]}
+            unchanged.diagnostics = unchanged.diagnostics.warned(fault)
             return unchanged
         with warnings.catch_warnings():
             if not required:  # refinement repairs what the network misses

@@ -252,10 +252,9 @@ class ProductRounds(ActionRounds):
                 self.train()
             belief = self._product(trials, settings, derive_seed(own, "product"))
         assert isinstance(belief, Belief)
-        belief.diagnostics |= {
-            "num_simulations": num_simulations,
-            "num_missing": num_missing,
-        }
+        belief.diagnostics = belief.diagnostics.extended(
+            num_simulations=num_simulations, num_missing=num_missing
+        )
         return belief
 
     def _places(self, belief: Distribution, num: int, seed: int) -> Tensor:
@@ -314,8 +313,7 @@ class ProductRounds(ActionRounds):
             sampled = ChainBelief(belief, product, self._sampler)
         num_lost = len(trials[-1:] if chained else trials) - len(counted)
         if num_lost:
-            sampled.diagnostics["trustworthy"] = False
-            sampled.diagnostics.setdefault("warnings", []).append(
+            sampled.diagnostics = sampled.diagnostics.warned(
                 f"{num_lost} trials are left out, at which the network's density is "
                 "finite nowhere: a measurement is wrong, or the simulator lacks much"
             )

@@ -274,13 +274,13 @@ class SeqBED:
         current: Distribution = self._prior
         for k, trial in enumerate(trials):
             own = derive_seed(seed, "trial", k)
-            current = self._simulated(current, trial, simulator, settings, own)
-            spent = {name: n + current.diagnostics[name] for name, n in spent.items()}
-        assert isinstance(current, Belief)
-        current.diagnostics |= spent
+            belief = self._simulated(current, trial, simulator, settings, own)
+            found, current = belief.diagnostics, belief
+            spent = {name: n + getattr(found, name) for name, n in spent.items()}
+        belief.diagnostics = belief.diagnostics.extended(**spent)
         self.trials = [*trials]
-        self._belief, self._model, self._rows = current, None, []
-        return current
+        self._belief, self._model, self._rows = belief, None, []
+        return belief
 
     def _simulated(
         self,
@@ -336,16 +336,15 @@ class SeqBED:
         weight = log_ratio.nan_to_num(-torch.inf).softmax(0)
         belief = KernelBelief(self._prior, particles, weight, bandwidth=self._bandwidth)
         belief.label = "weighted particles"
-        effective = belief.diagnostics["effective_sample_size"]
-        belief.diagnostics |= {"num_particles": n, **spent}
+        effective = belief.diagnostics.effective_sample_size or 0.0
+        belief.diagnostics = belief.diagnostics.extended(num_particles=n, **spent)
         if says_nothing:
-            belief.diagnostics["trustworthy"] = False
-            belief.diagnostics["warnings"].append(
+            belief.diagnostics = belief.diagnostics.warned(
                 "the ratios are finite nowhere at the last trial, which is left out: a "
                 "measurement is wrong, or the simulator lacks much"
             )
         if effective < 0.1 * n:
-            belief.diagnostics["warnings"].append(
+            belief.diagnostics = belief.diagnostics.warned(
                 f"{effective:.1f} of {n} particles are effective: the belief is as "
                 "wide as its kernels"
             )

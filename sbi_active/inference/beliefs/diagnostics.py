@@ -1,0 +1,139 @@
+"""How far a belief is to be trusted, and the figures behind that."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any
+
+__all__ = ["Assumption", "Diagnostics"]
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """What a method takes for granted, and what was found of it.
+
+    Attributes:
+        holds: Whether it may be relied on.
+        figure: What that was judged by.
+    """
+
+    holds: bool
+    figure: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnostics:
+    """What is known of a belief's quality.
+
+    ``print(belief.diagnostics)`` says it in words.
+
+    Attributes:
+        trustworthy: Whether nothing that was checked speaks against the belief; None
+            where nothing was.
+        warnings: What speaks against it and what to do, a sentence each.
+        network_warnings: Of the amortized network beside a refined belief.
+        assumptions: By name, each with the figure that it was judged by.
+        num_simulations: Rows that the belief cost.
+        num_missing: Those of them lost to faults of the simulator.
+        effective_sample_size: Of the weighted draws behind it.
+        error_nats: Expected divergence from the belief of endless simulations.
+        error_nats_if_explained: The same, were the observations as simulations are.
+        tail_probability: How often a simulation from the belief lies as far out as all
+            trials together do.
+        tail_probability_of_trial: The same of each trial.
+        figures: Further ones, by the method; each is an attribute as well.
+    """
+
+    trustworthy: bool | None = None
+    warnings: tuple[str, ...] = ()
+    network_warnings: tuple[str, ...] = ()
+    assumptions: Mapping[str, Assumption] = field(default_factory=lambda: _NOTHING)
+    num_simulations: int = 0
+    num_missing: int = 0
+    effective_sample_size: float | None = None
+    error_nats: float | None = None
+    error_nats_if_explained: float | None = None
+    tail_probability: float | None = None
+    tail_probability_of_trial: tuple[float, ...] = ()
+    figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+
+    def extended(self, **changes: Any) -> Diagnostics:
+        """Return these with other values; names that are no field become figures."""
+        names = {f.name for f in fields(self)}
+        own = {name: value for name, value in changes.items() if name in names}
+        further = {n: value for n, value in changes.items() if n not in names}
+        return replace(self, **own, figures={**self.figures, **further})
+
+    def warned(self, *texts: str) -> Diagnostics:
+        """Return these with further warnings, no longer trustworthy if there are any.
+
+        Args:
+            *texts: A sentence each.
+        """
+        if not texts:
+            return self
+        return replace(self, trustworthy=False, warnings=(*self.warnings, *texts))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all that is known, in a form that JSON can hold."""
+        known: dict[str, Any] = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name != "figures"
+        }
+        known["assumptions"] = {
+            name: {"holds": a.holds, "figure": a.figure}
+            for name, a in self.assumptions.items()
+        }
+        for name in ("warnings", "network_warnings", "tail_probability_of_trial"):
+            known[name] = [*known[name]]
+        known |= self.figures
+        empty = (None, (), [], {})
+        return {name: v for name, v in known.items() if not _is_any_of(v, empty)}
+
+    def __str__(self) -> str:
+        verdicts = {True: "trustworthy", False: "not trustworthy", None: "not checked"}
+        lines = [verdicts[self.trustworthy], *(f"- {text}" for text in self.warnings)]
+        lines += [f"- {text}" for text in self.network_warnings]
+        broken = [name for name, a in self.assumptions.items() if not a.holds]
+        if broken:
+            lines.append(f"assumptions that do not hold: {', '.join(broken)}")
+        if self.num_simulations:
+            lines.append(f"{self.num_simulations} simulations")
+        if self.effective_sample_size is not None:
+            lines.append(f"{self.effective_sample_size:.0f} effective draws")
+        if self.error_nats is not None:
+            lines.append(f"off by about {self.error_nats:.2g} nats")
+        if self.tail_probability is not None:
+            lines.append(f"tail probability of the trials {self.tail_probability:.2g}")
+        return "\n".join(lines)
+
+    def __getattr__(self, name: str) -> Any:
+        figures = self.__dict__.get("figures", {})
+        if name not in figures:
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        return figures[name]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        plain = ("assumptions", "figures")  # a view of a dict does not pickle
+        return _restored, (parts | {name: dict(parts[name]) for name in plain},)
+
+    def __getitem__(self, name: str) -> Any:
+        warnings.warn(
+            f"diagnostics[{name!r}] is deprecated; use diagnostics.{name} or to_dict()",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return self.to_dict()[name]
+
+
+def _is_any_of(value: Any, others: tuple[Any, ...]) -> bool:
+    return any(type(value) is type(other) and value == other for other in others)
+
+
+def _restored(parts: dict[str, Any]) -> Diagnostics:
+    return Diagnostics(**parts)

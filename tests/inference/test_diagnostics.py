@@ -1,0 +1,74 @@
+"""What is known of a belief, as a value."""
+
+import copy
+import json
+import pickle
+from dataclasses import FrozenInstanceError, fields
+
+import pytest
+
+from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
+
+KNOWN = Diagnostics(
+    trustworthy=True,
+    assumptions={"settled": Assumption(False, 0.3)},
+    num_simulations=300,
+    tail_probability=0.4,
+    tail_probability_of_trial=(0.4, 0.6),
+    error_nats=0.02,
+).extended(bandwidth=0.1, num_missing=2)
+
+
+def test_trust_comes_first():
+    assert [f.name for f in fields(Diagnostics)][:2] == ["trustworthy", "warnings"]
+
+
+def test_who_adds_makes_another():
+    more = KNOWN.extended(num_simulations=500, num_regions=3)
+    assert (more.num_simulations, more.num_regions, more.bandwidth) == (500, 3, 0.1)
+    assert KNOWN.num_simulations == 300
+    assert "num_regions" not in KNOWN.figures
+    with pytest.raises(FrozenInstanceError):
+        KNOWN.trustworthy = False  # pyright: ignore
+
+
+def test_a_warning_takes_the_trust():
+    assert KNOWN.warned() is KNOWN
+    warned = KNOWN.warned("one").warned("two")
+    assert not warned.trustworthy
+    assert warned.warnings == ("one", "two")
+
+
+def test_in_words():
+    text = str(KNOWN.warned("the belief is too wide; raise num_histories"))
+    assert text.splitlines()[:2] == [
+        "not trustworthy",
+        "- the belief is too wide; raise num_histories",
+    ]
+    assert "settled" in text
+    assert "300 simulations" in text
+    assert str(Diagnostics()) == "not checked"
+
+
+def test_as_plain_data():
+    plain = KNOWN.to_dict()
+    assert json.loads(json.dumps(plain)) == plain
+    assert plain["assumptions"] == {"settled": {"holds": False, "figure": 0.3}}
+    assert plain["bandwidth"] == 0.1
+    assert "effective_sample_size" not in plain  # not known
+
+
+@pytest.mark.parametrize("known", [KNOWN, Diagnostics()])
+def test_it_travels(known):
+    assert copy.deepcopy(known) == known
+    assert pickle.loads(pickle.dumps(known)) == known
+
+
+def test_a_name_that_is_not_there():
+    with pytest.raises(AttributeError, match="no attribute 'width'"):
+        _ = KNOWN.width
+
+
+def test_entries_by_name_go_in_the_next_version():
+    with pytest.warns(DeprecationWarning, match=r"use diagnostics\.trustworthy"):
+        assert KNOWN["trustworthy"]
