@@ -140,7 +140,7 @@ def round_row(
         "num_simulations": trial.num_simulations,
         "chained_loss": diagnostics.get("chained_loss"),
         "chained_bluntness": diagnostics.get("chained_bluntness"),
-        "trustworthy": diagnostics.trustworthy,
+        "trustworthy": diagnostics.get("trustworthy"),
     }
     if gain is not None:
         row |= {"exact_eig": gain[chosen], "regret": gain.max() - gain[chosen]}
