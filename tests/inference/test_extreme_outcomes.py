@@ -11,7 +11,7 @@ from sbi_active import ALHI, ASBI, GaussianNoise, Refinement, SeqBED, SimulatorM
 from sbi_active.inference import SeqBED_C
 from sbi_active.inference.refinement.stages import refine
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.population import normalized
+from sbi_active.inference.sampling.weights import normalized
 from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

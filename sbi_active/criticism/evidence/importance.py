@@ -12,6 +12,7 @@ from scipy.special import gammaln
 
 from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.weights import systematic
 
 __all__ = ["ImportanceSample", "TMixture", "importance_sample", "lower_factors"]
 
@@ -60,9 +61,7 @@ class TMixture:
         """Return the component of each draw, in proportion to the weights, (num,)."""
         if self.weights is None:
             return np.arange(num) % len(self.means)
-        ladder = (0.5 + np.arange(num)) / num
-        which = np.searchsorted(np.cumsum(self.weights), ladder)
-        return np.minimum(which, len(self.means) - 1)
+        return systematic(self.weights, num, 0.5)
 
     def log_prob(self, u: Array) -> Array:
         """Return log densities, shape (n,)."""

@@ -20,6 +20,7 @@ from sbi_active.criticism.evidence.jumps import quadratic
 from sbi_active.criticism.evidence.least_squares import Modes, along_ridges
 from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.weights import effective_sample_size
 
 __all__ = ["ridges", "regressions"]
 
@@ -138,8 +139,7 @@ def _tempered(target: Array, effective: float) -> Array:
     low, high = 0.0, 1.0
     for _ in range(50):
         power = 0.5 * (low + high)
-        w = np.exp(power * apart)
-        if w.sum() ** 2 / (w**2).sum() < effective:
+        if effective_sample_size(power * apart) < effective:
             high = power
         else:
             low = power

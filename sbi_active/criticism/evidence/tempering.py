@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.importance import ImportanceSample, lower_factors
 from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.weights import systematic
 
 __all__ = ["temper"]
 
@@ -65,8 +66,7 @@ def temper(
         mean = w @ u
         cov = (w[:, None] * (u - mean)).T @ (u - mean)
         factor = lower_factors(cov + 1e-16 * np.eye(rival.dim))
-        ladder = (rng.uniform() + np.arange(num_particles)) / num_particles
-        which = np.minimum(np.searchsorted(np.cumsum(w), ladder), len(w) - 1)
+        which = systematic(w, num_particles, rng.uniform())
         u, log_l, b = u[which], log_l[which], b + step
         ancestor = ancestor[which]
         u, log_l, width = _move(

@@ -34,7 +34,8 @@ from scipy.special import logsumexp
 from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
-from sbi_active.inference.sampling.population import Proposal, normalized
+from sbi_active.inference.sampling.population import Proposal
+from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
 __all__ = ["WeightedPool", "importance_sample"]
 
@@ -106,7 +107,7 @@ class WeightedPool:
     @property
     def effective_sample_size(self) -> float:
         r""":math:`(\sum w_i)^2 / \sum w_i^2`."""
-        return _effective(self.log_weight)
+        return effective_sample_size(self.log_weight)
 
     def restart(self) -> None:
         """Rest the posterior on draws to come."""
@@ -253,10 +254,10 @@ def _flattened(pool: WeightedPool) -> Array:
 
 def _largest_power(log_rest: Array, log_new: Array, needed: float = FEWEST) -> float:
     """Return the largest power of a likelihood that leaves enough draws effective."""
-    needed = min(needed, 0.5 * _effective(log_rest))
+    needed = min(needed, 0.5 * effective_sample_size(log_rest))
 
     def suffices(power: float) -> bool:
-        return _effective(log_rest + power * log_new) >= needed
+        return effective_sample_size(log_rest + power * log_new) >= needed
 
     if suffices(1.0):
         return 1.0
@@ -266,10 +267,3 @@ def _largest_power(log_rest: Array, log_new: Array, needed: float = FEWEST) -> f
         middle = 0.5 * (low + high) if low > 0 else 0.1 * high
         low, high = (middle, high) if suffices(middle) else (low, middle)
     return max(low, 1e-10)
-
-
-def _effective(log_weight: Array) -> float:
-    if not np.isfinite(log_weight).any():
-        return 0.0
-    weight = np.exp(log_weight - log_weight.max())
-    return float(weight.sum() ** 2 / (weight**2).sum())

@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from sbi_active.inference.sampling.unbounding import Unbounding
+from sbi_active.inference.sampling.weights import (
+    effective_sample_size,
+    normalized,
+    systematic,
+)
 
 __all__ = [
     "GaussianMixture",
     "Particles",
     "Proposal",
     "StudentProposal",
-    "normalized",
     "population_monte_carlo",
 ]
 
@@ -30,20 +34,6 @@ SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
 FITTED = 8  # of them for each number in a covariance
-
-
-def normalized(log_weight: Array) -> Array:
-    """Return weights that sum to one, shape (n,), whatever their size.
-
-    Args:
-        log_weight: Shape (n,). Beyond 1e16 a sum of several is lost in the rounding of
-            its logarithm; where none is finite, all count the same.
-    """
-    if not np.isfinite(log_weight).any():
-        return np.full(len(log_weight), 1 / len(log_weight))
-    weight = np.exp(log_weight - np.asarray(logsumexp(log_weight)))
-    total = weight.sum()
-    return weight if abs(total - 1) < 1e-9 else weight / total
 
 
 class Proposal(Protocol):
@@ -85,11 +75,11 @@ class Particles:
     @property
     def effective_sample_size(self) -> float:
         r""":math:`(\sum w_i)^2 / \sum w_i^2`."""
-        return _effective_sample_size(self.log_weight)
+        return effective_sample_size(self.log_weight)
 
     def resample(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return equally weighted particles, shape (n, d), by systematic resampling."""
-        return self.z[_systematic(self.weight, num_samples, rng)]
+        return self.z[systematic(self.weight, num_samples, rng.random())]
 
 
 @dataclass(frozen=True)
@@ -309,7 +299,7 @@ def population_monte_carlo(
         tempered = _tempered(log_base, log_target, log_q, beta)
         weight = normalized(tempered)
         num_fitted = max(NUM_FITTED, FITTED * _num_moments(z.shape[1]))
-        points = z[_systematic(weight, num_fitted, rng)]
+        points = z[systematic(weight, num_fitted, rng.random())]
         proposal = StudentProposal.fit(points, num_components, base, rng, unbounding)
     return (particles if best is None else best), step + 1
 
@@ -332,7 +322,7 @@ def _next_beta(
 
     def suffices(candidate: float) -> bool:
         log_weight = _tempered(log_base, log_target, log_q, candidate)
-        return _effective_sample_size(log_weight) > share * len(log_weight)
+        return effective_sample_size(log_weight) > share * len(log_weight)
 
     if suffices(1.0):
         return 1.0
@@ -342,19 +332,6 @@ def _next_beta(
         middle = 0.5 * (low + high) if low > 0 else 0.1 * high
         low, high = (middle, high) if suffices(middle) else (low, middle)
     return max(low, beta + 1e-10)
-
-
-def _effective_sample_size(log_weight: Array) -> float:
-    top = log_weight.max()
-    if not np.isfinite(top):
-        return 0.0
-    weight = np.exp(log_weight - top)
-    return float(weight.sum() ** 2 / (weight**2).sum())
-
-
-def _systematic(weight: Array, num: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    place = (np.arange(num) + rng.random()) / num
-    return np.minimum(np.searchsorted(np.cumsum(weight), place), len(weight) - 1)
 
 
 def _spread_responsibility(z: Array, k: int, rng: np.random.Generator) -> Array:

@@ -1,0 +1,61 @@
+"""Weighted draws: normalizing, how many of them count, resampling."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+__all__ = ["effective_sample_size", "normalized", "systematic"]
+
+Array = NDArray[Any]
+
+
+def normalized(log_weight: Array) -> Array:
+    """Return weights that sum to one, shape (n,), whatever their size.
+
+    Args:
+        log_weight: Shape (n,). Beyond 1e16 a sum of several is lost in the rounding of
+            its logarithm; where none is finite, all count the same.
+    """
+    if not np.isfinite(log_weight).any():
+        return np.full(len(log_weight), 1 / len(log_weight))
+    weight = np.exp(log_weight - np.asarray(logsumexp(log_weight)))
+    total = weight.sum()
+    return weight if abs(total - 1) < 1e-9 else weight / total
+
+
+def effective_sample_size(log_weight: Array) -> float:
+    r"""Return :math:`(\sum w_i)^2 / \sum w_i^2`; 0 where no weight is positive.
+
+    Args:
+        log_weight: Not normalized, shape (n,).
+
+    References:
+        Kong, Liu & Wong, Journal of the American Statistical Association 89 (1994).
+    """
+    top = log_weight.max(initial=-np.inf)
+    if not np.isfinite(top):
+        return 0.0
+    weight = np.exp(log_weight - top)
+    return float(weight.sum() ** 2 / (weight**2).sum())
+
+
+def systematic(weight: Array, num: int, offset: float) -> NDArray[np.intp]:
+    """Return indices by systematic resampling, ascending, shape (num,).
+
+    Each index is drawn as often as its weight times ``num`` says, rounded up or down.
+
+    Args:
+        weight: Normalized, shape (n,).
+        num: Indices to return.
+        offset: Uniform in [0, 1); a fixed one gives indices without randomness.
+
+    References:
+        Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.
+    """
+    place = (np.arange(num) + offset) / num
+    # The cumulative sum ends at one but for rounding.
+    return np.minimum(np.searchsorted(np.cumsum(weight), place), len(weight) - 1)
