@@ -35,6 +35,7 @@ from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikeli
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
 from sbi_active.inference.sampling.population import Proposal
+from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
 __all__ = ["WeightedPool", "importance_sample"]
@@ -259,11 +260,4 @@ def _largest_power(log_rest: Array, log_new: Array, needed: float = FEWEST) -> f
     def suffices(power: float) -> bool:
         return effective_sample_size(log_rest + power * log_new) >= needed
 
-    if suffices(1.0):
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        # By powers of ten first: the first step may be of the order of 1e-8.
-        middle = 0.5 * (low + high) if low > 0 else 0.1 * high
-        low, high = (middle, high) if suffices(middle) else (low, middle)
-    return max(low, 1e-10)
+    return largest_power(suffices)

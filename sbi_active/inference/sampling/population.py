@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
+from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
@@ -324,14 +325,7 @@ def _next_beta(
         log_weight = _tempered(log_base, log_target, log_q, candidate)
         return effective_sample_size(log_weight) > share * len(log_weight)
 
-    if suffices(1.0):
-        return 1.0
-    low, high = beta, 1.0
-    for _ in range(25):
-        # By powers of ten first: the first step may be of the order of 1e-8.
-        middle = 0.5 * (low + high) if low > 0 else 0.1 * high
-        low, high = (middle, high) if suffices(middle) else (low, middle)
-    return max(low, beta + 1e-10)
+    return largest_power(suffices, start=beta, num_steps=25)
 
 
 def _spread_responsibility(z: Array, k: int, rng: np.random.Generator) -> Array:

@@ -1,0 +1,41 @@
+"""How far to go from one density towards another in a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+__all__ = ["largest_power"]
+
+#: Least step, so that a sequence of them moves on.
+LEAST = 1e-10
+
+
+def largest_power(
+    suffices: Callable[[float], bool],
+    *,
+    start: float = 0.0,
+    end: float = 1.0,
+    num_steps: int = 40,
+) -> float:
+    """Return the largest power that suffices, between a start and an end.
+
+    By bisection; from 0 by powers of ten first, since where a likelihood is narrow the
+    first power may be of the order of 1e-8.
+
+    Args:
+        suffices: Whether a power of a likelihood, or of a ratio of densities, leaves
+            draws enough effective; true up to the answer and false beyond.
+        start: Taken to suffice.
+        end: Returned where it suffices.
+        num_steps: Of the bisection.
+
+    Returns:
+        The power, at least 1e-10 above the start even where that does not suffice.
+    """
+    if suffices(end):
+        return end
+    low, high = start, end
+    for _ in range(num_steps):
+        middle = 0.5 * (low + high) if low > 0 else 0.1 * high
+        low, high = (middle, high) if suffices(middle) else (low, middle)
+    return max(low, start + LEAST)
