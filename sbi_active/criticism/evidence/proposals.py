@@ -20,6 +20,7 @@ from sbi_active.criticism.evidence.jumps import quadratic
 from sbi_active.criticism.evidence.least_squares import Modes, along_ridges
 from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size
 
 __all__ = ["ridges", "regressions"]
@@ -136,12 +137,9 @@ def _tempered(target: Array, effective: float) -> Array:
     """Return weights in proportion to a power of exp(target), so many effective."""
     finite = np.where(np.isfinite(target), target, -1e300)
     apart = finite - finite.max()
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        power = 0.5 * (low + high)
-        if effective_sample_size(power * apart) < effective:
-            high = power
-        else:
-            low = power
-    w = np.exp(low * apart)
+
+    def suffices(power: float) -> bool:
+        return effective_sample_size(power * apart) >= effective
+
+    w = np.exp(largest_power(suffices, least=0.0) * apart)
     return w / w.sum()

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.importance import ImportanceSample, lower_factors
 from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.inference.sampling.weights import systematic
+from sbi_active.inference.sampling.tempering import largest_power
+from sbi_active.inference.sampling.weights import effective_sample_size, systematic
 
 __all__ = ["temper"]
 
@@ -90,20 +91,10 @@ def temper(
 def _step(log_l: Array, most: float, target: float) -> float:
     """Return the longest step of b that leaves so many particles effective."""
 
-    def effective(step: float) -> float:
-        log_w = step * log_l
-        return float(np.exp(2 * log_sum_exp(log_w) - log_sum_exp(2 * log_w)))
+    def suffices(step: float) -> bool:
+        return effective_sample_size(step * log_l) >= target
 
-    if effective(most) >= target:
-        return most
-    low, high = 0.0, most
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        if effective(middle) < target:
-            high = middle
-        else:
-            low = middle
-    return max(low, 1e-12)
+    return largest_power(suffices, end=most)
 
 
 def _move(

@@ -6,15 +6,13 @@ from collections.abc import Callable
 
 __all__ = ["largest_power"]
 
-#: Least step, so that a sequence of them moves on.
-LEAST = 1e-10
-
 
 def largest_power(
     suffices: Callable[[float], bool],
     *,
     start: float = 0.0,
     end: float = 1.0,
+    least: float = 1e-10,
     num_steps: int = 40,
 ) -> float:
     """Return the largest power that suffices, between a start and an end.
@@ -27,10 +25,9 @@ def largest_power(
             draws enough effective; true up to the answer and false beyond.
         start: Taken to suffice.
         end: Returned where it suffices.
+        least: Gone beyond the start even where that does not suffice, so that a
+            sequence of steps moves on.
         num_steps: Of the bisection.
-
-    Returns:
-        The power, at least 1e-10 above the start even where that does not suffice.
     """
     if suffices(end):
         return end
@@ -38,4 +35,4 @@ def largest_power(
     for _ in range(num_steps):
         middle = 0.5 * (low + high) if low > 0 else 0.1 * high
         low, high = (middle, high) if suffices(middle) else (low, middle)
-    return max(low, start + LEAST)
+    return max(low, start + least)

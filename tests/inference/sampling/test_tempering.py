@@ -40,3 +40,7 @@ def test_the_power_of_a_gaussian_leaves_the_share_that_its_moments_say():
     # (1 + s)^2 share^2 = 1 + 2 s for s = b c.
     s = (1 - share**2 + np.sqrt(1 - share**2)) / share**2
     assert power * c == pytest.approx(s, rel=0.03)
+
+
+def test_no_step_need_be_made_where_none_is_asked_for():
+    assert largest_power(lambda _: False, least=0.0) == 0
