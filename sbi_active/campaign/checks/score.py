@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.campaign.checks.spread import Spread
+from sbi_active.inference.sampling.bandwidth import silverman
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
@@ -183,7 +184,7 @@ def _log_density(drawn: Tensor, observed: Tensor) -> float:
     log_unit = -root.diagonal().log().sum() - 0.5 * q * math.log(2 * math.pi)
     log_density = -0.5 * z[-1].square().sum()
     if n > 1 and q <= MAX_DIM:
-        width = (4 / ((q + 2) * n)) ** (1 / (q + 4))
+        width = silverman(n, q)
         gap = (z[:-1] - z[-1]).square().sum(1) / width**2
         kernel = (-0.5 * gap).logsumexp(0) - math.log(n) - q * math.log(width)
         log_density = torch.logaddexp(log_density, kernel) - math.log(2)

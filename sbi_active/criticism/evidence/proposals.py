@@ -20,6 +20,7 @@ from sbi_active.criticism.evidence.jumps import quadratic
 from sbi_active.criticism.evidence.least_squares import Modes, along_ridges
 from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.bandwidth import scott
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size
 
@@ -126,7 +127,7 @@ def _by_regression(
         center = w @ draws
         cov = ((draws - center) * w[:, None]).T @ (draws - center)
         # Scott's width, of kernels whose mixture has the draws' covariance.
-        width = NUM_COMPONENTS ** (-1 / (dim + 4))
+        width = scott(NUM_COMPONENTS, dim)
         kernel = lower_factors(width**2 * cov + 1e-12 * np.eye(dim))
         means = draws[rng.choice(len(draws), NUM_COMPONENTS, p=w)]
         proposal = TMixture(means, np.repeat(kernel[None], NUM_COMPONENTS, 0))

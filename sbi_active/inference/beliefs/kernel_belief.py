@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.sampling.bandwidth import scott, silverman
 from sbi_active.seeding import forked_generators
 
 __all__ = ["Bandwidth", "KernelBelief"]
@@ -114,9 +115,9 @@ class KernelBelief(Belief):
 
 def _width(bandwidth: Bandwidth, num: float, dim: int) -> float:
     if bandwidth == "scott":
-        return num ** (-1 / (dim + 4))
+        return scott(num, dim)
     if bandwidth == "silverman":
-        return (num * (dim + 2) / 4) ** (-1 / (dim + 4))
+        return silverman(num, dim)
     if isinstance(bandwidth, str) or not bandwidth > 0:
         raise ValueError(
             f"expected bandwidth 'scott', 'silverman' or a number > 0; got "

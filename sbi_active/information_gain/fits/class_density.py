@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from sbi_active.inference.sampling.bandwidth import silverman
 from sbi_active.information_gain.fits.reduction import Reduction
 
 __all__ = ["TEMPERATURES", "LogDensities", "class_members"]
@@ -120,7 +121,7 @@ def _log_kernels(
     columns = []
     for row, spread in zip(rows, covariance, strict=True):
         n = len(row)
-        width = factor * (4 / ((d + 2) * n)) ** (1 / (d + 4))
+        width = factor * silverman(n, d)
         root = torch.linalg.cholesky(spread)
         white, knots = (
             torch.linalg.solve_triangular(root, part.T, upper=False).T

@@ -20,6 +20,7 @@ import math
 import torch
 from torch import Tensor
 
+from sbi_active.inference.sampling.bandwidth import silverman
 from sbi_active.information_gain.fits.class_density import LogDensities
 
 __all__ = ["MOST_NUMBERS", "noise_members"]
@@ -80,7 +81,7 @@ class _NoiseKernels:
         spread = torch.linalg.eigvalsh(unit[:, None] * covariance * unit)
         d = max(1, int((spread > 1).sum()))
         num = max(2, len(mean.unique(dim=0)))
-        h = min(factor * (4 / ((d + 2) * num)) ** (1 / (d + 4)), 1.0)
+        h = min(factor * silverman(num, d), 1.0)
         self.knots = center + math.sqrt(1 - h**2) * apart
         self.factors = torch.linalg.cholesky(noise.diag_embed() + h**2 * covariance)
         self.center = center

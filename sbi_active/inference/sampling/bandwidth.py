@@ -1,0 +1,33 @@
+"""Rules for the width of kernels, in deviations of the draws."""
+
+from __future__ import annotations
+
+__all__ = ["scott", "silverman"]
+
+
+def scott(num: float, dim: int) -> float:
+    r"""Return Scott's width, :math:`n^{-1 / (d + 4)}`.
+
+    Args:
+        num: n, the number of draws that count.
+        dim: d.
+
+    References:
+        Scott, *Multivariate Density Estimation*, 1992.
+    """
+    return num ** (-1 / (dim + 4))
+
+
+def silverman(num: float, dim: int) -> float:
+    r"""Return Silverman's width, :math:`(4 / ((d + 2)\, n))^{1 / (d + 4)}`.
+
+    It has the least mean integrated squared error where the draws are normal.
+
+    Args:
+        num: n, the number of draws that count.
+        dim: d.
+
+    References:
+        Silverman, *Density Estimation for Statistics and Data Analysis*, 1986.
+    """
+    return (4 / ((dim + 2) * num)) ** (1 / (dim + 4))
