@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import JointPrior
+from sbi_active.inference.sampling.coordinates import support_bounds
 from sbi_active.seeding import forked_generators
 
 __all__ = ["SearchCoordinates"]
@@ -160,31 +161,13 @@ class SearchCoordinates:
 
     def _bounds(self) -> tuple[Array, Array]:
         pairs = [
-            _interval(part.support, size)
+            support_bounds(part.support, size)
             for part, size in zip(self.joint._parts(), self.joint.sizes, strict=True)
         ]
         for e in self.nuisances:
-            low, high = _interval(e.prior.support, e.phi_dim)
+            low, high = support_bounds(e.prior.support, e.phi_dim)
             pairs.append(
                 (np.tile(low, self.num_trials), np.tile(high, self.num_trials))
             )
         low, high = zip(*pairs, strict=True)
         return np.concatenate(low), np.concatenate(high)
-
-
-def _interval(support: Any, size: int) -> tuple[Array, Array]:
-    """Return the bounds of each number of a support, infinite where there are none."""
-    while hasattr(support, "base_constraint"):
-        support = support.base_constraint
-    if hasattr(support, "cseq"):
-        parts = [
-            _interval(c, k) for c, k in zip(support.cseq, support.lengths, strict=True)
-        ]
-        low, high = zip(*parts, strict=True)
-        return np.concatenate(low), np.concatenate(high)
-    ends = []
-    for name, default in (("lower_bound", -np.inf), ("upper_bound", np.inf)):
-        end = getattr(support, name, default)
-        end = np.asarray(torch.as_tensor(end).double()).reshape(-1)
-        ends.append(np.broadcast_to(end, (size,)).copy())
-    return ends[0], ends[1]

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 
-__all__ = ["PriorCoordinates"]
+__all__ = ["PriorCoordinates", "support_bounds"]
 
 Array = NDArray[Any]
 
@@ -46,7 +46,7 @@ class PriorCoordinates:
         with forked_generators(int(rng.integers(2**31))):
             theta = prior.sample(torch.Size([2_000])).double().numpy()
         self.dim = theta.shape[1]
-        self.low, self.high = _bounds(prior.support, self.dim)
+        self.low, self.high = support_bounds(prior.support, self.dim)
         self.bounded = np.isfinite(self.low) & np.isfinite(self.high)
         # +1 for theta > low, -1 for theta < high, 0 for no logarithm.
         self._side = np.isfinite(self.low).astype(int) - np.isfinite(self.high)
@@ -119,13 +119,21 @@ class PriorCoordinates:
         return np.where(self._side == 0, theta, logarithm)
 
 
-def _bounds(support: Any, dim: int) -> tuple[Array, Array]:
-    """Return finite bounds of a torch constraint, axis by axis, else infinities."""
+def support_bounds(support: Any, dim: int) -> tuple[Array, Array]:
+    """Return the bounds of each number of a support, infinite where there are none.
+
+    Args:
+        support: A torch constraint.
+        dim: Numbers that it constrains.
+
+    Returns:
+        Lower and upper bounds, shapes (dim,).
+    """
     if hasattr(support, "base_constraint"):
-        return _bounds(support.base_constraint, dim)
+        return support_bounds(support.base_constraint, dim)
     if hasattr(support, "cseq"):  # constraints.cat
         parts = [
-            _bounds(part, int(length))
+            support_bounds(part, int(length))
             for part, length in zip(support.cseq, support.lengths, strict=True)
         ]
         low, high = zip(*parts, strict=True)

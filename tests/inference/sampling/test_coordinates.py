@@ -1,0 +1,66 @@
+"""Coordinates of a prior, against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import (
+    Beta,
+    Distribution,
+    Exponential,
+    Independent,
+    LogNormal,
+    MultivariateNormal,
+    Normal,
+    Uniform,
+    constraints,
+)
+
+from sbi_active.inference.sampling.coordinates import PriorCoordinates, support_bounds
+
+ONES = torch.ones(2)
+PRIORS: dict[str, Distribution] = {
+    "box": BoxUniform(-ONES, 3 * ONES),
+    "normal": MultivariateNormal(ONES, 4 * torch.eye(2)),
+    "log-normal": Independent(LogNormal(ONES, 0.5 * ONES), 1),
+}
+
+
+@pytest.mark.parametrize(
+    ("prior", "low", "high"),
+    [
+        (BoxUniform(-ONES, torch.tensor([2.0, 3.0])), [-1, -1], [2, 3]),
+        (Independent(Normal(0 * ONES, ONES), 1), [-np.inf] * 2, [np.inf] * 2),
+        (Independent(Exponential(ONES), 1), [0, 0], [np.inf] * 2),
+        (Independent(Beta(ONES, ONES), 1), [0, 0], [1, 1]),
+        (Uniform(2.0, 5.0), [2, 2], [5, 5]),
+    ],
+)
+def test_the_bounds_of_a_support(prior, low, high):
+    found = support_bounds(prior.support, 2)
+    assert found[0].tolist() == low
+    assert found[1].tolist() == high
+
+
+def test_the_bounds_of_joined_supports():
+    joined = constraints.cat(
+        [constraints.interval(-1.0, 1.0), constraints.positive], lengths=[2, 1]
+    )
+    low, high = support_bounds(constraints.independent(joined, 0), 3)
+    assert low.tolist() == [-1, -1, 0]
+    assert high.tolist() == [1, 1, np.inf]
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_coordinates_lead_back_and_the_density_integrates_to_one(name):
+    prior, rng = PRIORS[name], np.random.default_rng(0)
+    coordinates = PriorCoordinates(prior, rng)
+    theta = prior.sample(torch.Size([500]))
+    z = coordinates.to_z(theta)
+    assert coordinates.to_theta(z).numpy() == pytest.approx(theta.numpy(), abs=1e-5)
+    assert coordinates.inside(z).all()
+    wide = rng.uniform(-2, 2, (200_000, 2))
+    mass = np.exp(coordinates.log_prior(wide)).mean() * 16
+    assert mass == pytest.approx(1, abs=0.02)
