@@ -12,12 +12,13 @@ from torch import Tensor
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
-from sbi_active.criticism.rivals.row_cache import SimulatedRows
+from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
 __all__ = ["TrialSimulator"]
 
 Array = NDArray[Any]
+Prediction = tuple[Array, "Array | None", Array]
 
 #: Draws a row from which a stochastic simulator's mean and deviation are taken.
 NUM_REPLICATES = 32
@@ -66,7 +67,7 @@ class TrialSimulator:
         self.is_stochastic = model.noise is None
         self.num_simulations, self.failed = 0, False
         self._dtype = torch.float64
-        self._known = SimulatedRows(KEPT)
+        self._known: RowCache[Prediction] = RowCache(KEPT)
         self._has_repeats = len(torch.unique(trials.action, dim=0)) < len(trials)
         # The scale of a declared noise is no part of the mean.
         self._of_noise = {
@@ -96,10 +97,16 @@ class TrialSimulator:
         columns = [theta, *[phi[name].reshape(len(theta), -1) for name in names]]
         rows = torch.cat([part.double() for part in columns], 1).numpy()
 
-        def simulate(at: Array) -> tuple[Array, Array | None, Array]:
-            return self._predict_all(theta[at], {k: p[at] for k, p in phi.items()})
+        def simulate(at: Array) -> list[Prediction]:
+            some = {k: p[at] for k, p in phi.items()}
+            mean, sd, valid = self._predict_all(theta[at], some)
+            each = [None] * len(at) if sd is None else sd
+            return [*zip(mean, each, valid, strict=True)]
 
-        return self._known.get(names, rows, simulate)
+        found = self._known.get((*names,), rows, simulate)
+        mean, sd, valid = zip(*found, strict=True)
+        joined = None if sd[0] is None else np.stack(sd)
+        return np.stack(mean), joined, np.stack(valid)
 
     def _predict_all(
         self, theta: Tensor, phi: dict[str, Tensor]

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
 
@@ -57,13 +58,7 @@ class MeanTable:
         self.num_simulations = self.num_missing = 0
         # The same object at each call, so that worker processes are kept.
         self._bare = simulator.without_noise()
-        self._known: dict[bytes, Array | None] = {}
-
-    def knows(self, theta: Tensor, action: Tensor) -> NDArray[np.bool_]:
-        """Return which parameters, shape (n, d), were simulated at an action."""
-        suffix = action.numpy().tobytes()
-        keys = [row.tobytes() + suffix for row in theta.numpy()]
-        return np.array([key in self._known for key in keys], dtype=bool)
+        self._known: RowCache[Array | None] = RowCache()
 
     def mean(self, theta: Tensor, action: Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return noise-free outcomes at one action, and which rows are lost to faults.
@@ -75,14 +70,11 @@ class MeanTable:
         Returns:
             Shapes (n, *x_shape), NaN where there is no measurement, and (n,).
         """
-        suffix = action.numpy().tobytes()
-        keys = [row.tobytes() + suffix for row in theta.numpy()]
-        new = {key: i for i, key in enumerate(keys) if key not in self._known}
-        if new:
-            rows = torch.tensor([*new.values()])
-            for key, x in zip(new, self._simulate(theta[rows], action), strict=True):
-                self._known[key] = x
-        found = [self._known[key] for key in keys]
+
+        def simulated(rows: NDArray[np.int64]) -> list[Array | None]:
+            return self._simulate(theta[torch.from_numpy(rows)], action)
+
+        found = self._known.get(action.numpy().tobytes(), theta.numpy(), simulated)
         lost = np.array([x is None for x in found])
         shape = next((x.shape for x in found if x is not None), (1,))
         gap = np.full(shape, np.nan)
@@ -140,13 +132,6 @@ class SimulatedLikelihood:
 
     def __len__(self) -> int:
         return len(self.action)
-
-    def knows(self, theta: Tensor) -> NDArray[np.bool_]:
-        """Return which parameters, shape (n, d), were simulated in every trial."""
-        known = np.ones(len(theta), dtype=bool)
-        for action in self.action:
-            known &= self.table.knows(theta, action)
-        return known
 
     def terms(self, theta: Tensor, trial: int) -> Array:
         """Return the log likelihood of one trial, shape (n,)."""
