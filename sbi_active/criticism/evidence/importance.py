@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.inference.sampling.weights import systematic
+from sbi_active.inference.sampling.weights import log_sum_exp, systematic
 
 __all__ = ["ImportanceSample", "TMixture", "importance_sample", "lower_factors"]
 

@@ -28,10 +28,10 @@ from sbi_active.criticism.rivals.error_models import (
     NoiseCell,
     NoiseGrid,
     Whitener,
-    log_sum_exp,
     student,
 )
 from sbi_active.criticism.rivals.residual_process import smooth_features
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["OneOutlier"]
 

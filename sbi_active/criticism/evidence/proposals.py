@@ -18,11 +18,10 @@ from sbi_active.criticism.evidence.importance import (
 )
 from sbi_active.criticism.evidence.jumps import quadratic
 from sbi_active.criticism.evidence.least_squares import Modes, along_ridges
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.bandwidth import scott
 from sbi_active.inference.sampling.tempering import largest_power
-from sbi_active.inference.sampling.weights import effective_sample_size
+from sbi_active.inference.sampling.weights import effective_sample_size, log_sum_exp
 
 __all__ = ["ridges", "regressions"]
 

@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.importance import ImportanceSample, lower_factors
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.tempering import largest_power
-from sbi_active.inference.sampling.weights import effective_sample_size, systematic
+from sbi_active.inference.sampling.weights import (
+    effective_sample_size,
+    log_sum_exp,
+    systematic,
+)
 
 __all__ = ["temper"]
 

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.rivals.error_models import log_sum_exp
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["SCALES", "log_evidence"]
 

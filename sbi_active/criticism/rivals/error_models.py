@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "log_sum_exp", "student"]
+__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "student"]
 
 Array = NDArray[Any]
 Whitener = Callable[[Array], Array]
@@ -193,12 +194,3 @@ def student(e: Array, df: float) -> Array:
     log_norm = gammaln(0.5 * (df + 1)) - gammaln(0.5 * df)
     log_norm -= 0.5 * np.log(np.pi * (df - 2))
     return log_norm - 0.5 * (df + 1) * np.log1p(e**2 / (df - 2))
-
-
-def log_sum_exp(values: Array, axis: int | None = None) -> Any:
-    """Return the log of a sum of exponentials; -inf where every term vanishes."""
-    top = values.max(axis=axis, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        total = np.log(np.exp(values - top).sum(axis=axis))
-    return total + (top.reshape(()) if axis is None else top.squeeze(axis))

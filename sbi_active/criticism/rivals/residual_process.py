@@ -32,8 +32,8 @@ from sbi_active.criticism.rivals.error_models import (
     ErrorModel,
     NoiseGrid,
     Whitener,
-    log_sum_exp,
 )
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["LENGTHS", "ResidualProcess", "smooth_features"]
 

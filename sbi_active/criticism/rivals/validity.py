@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.results import Residuals
-from sbi_active.criticism.rivals.error_models import log_sum_exp
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["DISAGREEMENT", "UNKNOWN_RATES", "log_outcomes", "surprising_outcomes"]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.rival_set import HOPELESS, RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import CATCH_ALLS, NONE
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
 __all__ = ["grow", "log_prior"]

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection
-from sbi_active.criticism.rivals.error_models import log_sum_exp
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["REFUTED", "THRESHOLD", "alternatives", "detect"]
 

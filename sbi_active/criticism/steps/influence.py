@@ -25,8 +25,8 @@ from sbi_active.criticism.results import (
     Evaluation,
     Tracing,
 )
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["is_left_to_chance", "needed_trials", "unless_refuted", "withdrawn"]
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, Tracing
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.steps.predictive import predict
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["LeaveOneOut", "leave_one_out"]
 

@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.rivals.error_models import (
-    LOG_2PI,
-    NoiseCell,
-    NoiseGrid,
-    log_sum_exp,
-)
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
+from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 
 __all__ = ["Prediction", "predict"]

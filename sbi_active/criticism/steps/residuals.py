@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import Residuals
-from sbi_active.criticism.rivals.error_models import NoiseGrid, log_sum_exp
+from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["find_residuals"]
 

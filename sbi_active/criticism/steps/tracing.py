@@ -24,7 +24,6 @@ from sbi_active.criticism.results import (
     Evidence,
     Tracing,
 )
-from sbi_active.criticism.rivals.error_models import log_sum_exp
 from sbi_active.criticism.steps.coarsening import coarsening
 from sbi_active.criticism.steps.combinations import grow
 from sbi_active.criticism.steps.detection import REFUTED, THRESHOLD, alternatives
@@ -36,6 +35,7 @@ from sbi_active.criticism.steps.influence import (
     withdrawn,
 )
 from sbi_active.criticism.steps.near_aliases import near_aliases
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["log_priors", "trace"]
 
