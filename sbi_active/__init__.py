@@ -2,69 +2,58 @@
 
 Choose the action whose outcome tells most about the simulator's parameters, update a
 neural posterior with the measurement, and go on. An extension of sbi.
+
+Here stand the names that most programs need; each is imported when it is first used.
+All others are in the packages: ``actions``, ``simulation``, ``inference``,
+``information_gain``, ``search``, ``design``, ``campaign`` and ``criticism``.
 """
 
 from __future__ import annotations
 
-from importlib.metadata import version
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from sbi_active.actions import (
-    ActionSpace,
-    BoxActions,
-    DiscreteActions,
-    MixedActions,
-)
-from sbi_active.campaign import Campaign, CampaignOptions, StopRules, Trial
-from sbi_active.design.designer import Design, InformationGainDesigner, RandomDesigner
-from sbi_active.inference import (
-    ALHI,
-    ASBI,
-    ActionEmbedding,
-    ActionLikelihood,
-    ActionPosterior,
-    ActionRatio,
-    ActiveInference,
-    Belief,
-    MixtureDensity,
-    Refinement,
-    SeqBED,
-    SeqBED_B,
-    SeqBED_C,
-)
-from sbi_active.simulation import (
-    AutocorrelatedNoise,
-    Bank,
-    GaussianNoise,
-    Simulations,
-    SimulatorModel,
-    StudentTNoise,
-    estimate_noise,
-    simulate,
-    unknown_noise,
-)
+from sbi_active.renamed import former_names
 
 if TYPE_CHECKING:
+    from sbi_active.actions import BoxActions, DiscreteActions, MixedActions
+    from sbi_active.campaign import Campaign, CampaignOptions, StopRules
+    from sbi_active.design import InformationGainDesigner, RandomDesigner
     from sbi_active.export import to_inference_data
+    from sbi_active.inference import (
+        ALHI,
+        ASBI,
+        ActionEmbedding,
+        Belief,
+        MixtureDensity,
+        Refinement,
+        SeqBED,
+        SeqBED_B,
+        SeqBED_C,
+    )
+    from sbi_active.simulation import (
+        AutocorrelatedNoise,
+        Bank,
+        GaussianNoise,
+        SimulatorModel,
+        StudentTNoise,
+        estimate_noise,
+        simulate,
+        unknown_noise,
+    )
 
-__version__ = version("sbi-active")
+    __version__: str
 
 __all__ = [
     "ALHI",
     "ASBI",
     "ActionEmbedding",
-    "ActionLikelihood",
-    "ActionPosterior",
-    "ActionRatio",
-    "ActionSpace",
-    "ActiveInference",
     "AutocorrelatedNoise",
     "Bank",
     "Belief",
     "BoxActions",
     "Campaign",
     "CampaignOptions",
-    "Design",
     "DiscreteActions",
     "GaussianNoise",
     "InformationGainDesigner",
@@ -75,21 +64,78 @@ __all__ = [
     "SeqBED",
     "SeqBED_B",
     "SeqBED_C",
-    "Simulations",
     "SimulatorModel",
     "StopRules",
     "StudentTNoise",
-    "Trial",
     "estimate_noise",
     "simulate",
     "to_inference_data",
     "unknown_noise",
 ]
 
+#: Where the names above are defined or re-exported.
+_HOMES = {
+    "actions": ("BoxActions", "DiscreteActions", "MixedActions"),
+    "campaign": ("Campaign", "CampaignOptions", "StopRules"),
+    "criticism": (),
+    "design": ("InformationGainDesigner", "RandomDesigner"),
+    "export": ("to_inference_data",),
+    "inference": (
+        "ALHI",
+        "ASBI",
+        "ActionEmbedding",
+        "Belief",
+        "MixtureDensity",
+        "Refinement",
+        "SeqBED",
+        "SeqBED_B",
+        "SeqBED_C",
+    ),
+    "information_gain": (),
+    "search": (),
+    "simulation": (
+        "AutocorrelatedNoise",
+        "Bank",
+        "GaussianNoise",
+        "SimulatorModel",
+        "StudentTNoise",
+        "estimate_noise",
+        "simulate",
+        "unknown_noise",
+    ),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+_former = former_names(
+    __name__,
+    {
+        "ActionLikelihood": "sbi_active.inference:ActionLikelihood",
+        "ActionPosterior": "sbi_active.inference:ActionPosterior",
+        "ActionRatio": "sbi_active.inference:ActionRatio",
+        "ActionSpace": "sbi_active.actions:ActionSpace",
+        "ActiveInference": "sbi_active.inference:ActiveInference",
+        "Design": "sbi_active.design:Design",
+        "Simulations": "sbi_active.simulation:Simulations",
+        "Trial": "sbi_active.campaign:Trial",
+    },
+    stacklevel=3,
+)
+
 
 def __getattr__(name: str) -> Any:
-    if name == "to_inference_data":  # ArviZ takes seconds to import
-        from sbi_active.export import to_inference_data
+    if name in _HOME:
+        value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    elif name in _HOMES:
+        value = import_module(f"{__name__}.{name}")
+    elif name == "__version__":
+        from importlib.metadata import version
 
-        return to_inference_data
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = version("sbi-active")
+    else:
+        return _former(name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_HOMES, "__version__"})

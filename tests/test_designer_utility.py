@@ -12,11 +12,11 @@ from sbi_active import (
     InformationGainDesigner,
     MixedActions,
     RandomDesigner,
-    Simulations,
     SimulatorModel,
 )
 from sbi_active.design.choice import choose
 from sbi_active.design.elimination import Estimates
+from sbi_active.simulation import Simulations
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
 from tests.test_designer import ACTIONS, VALUES
 

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 from benchmarks.robustness.attacks import Attacks
-from sbi_active import Bank, Simulations, simulate
+from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import reuse
+from sbi_active.simulation import Simulations, reuse
 from sbi_active.simulation.bank import LockedError
 
 ATTACKS = Attacks()

@@ -6,13 +6,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-from sbi_active import (
-    ActionSpace,
-    BoxActions,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-)
+from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.actions import ActionSpace
 from sbi_active.criticism import Criticism, Effect, Trials, generic_effects
 from sbi_active.criticism.next_trial.outside import extrapolated
 from sbi_active.criticism.next_trial.severe_tests import severe_tests

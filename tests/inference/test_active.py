@@ -7,7 +7,8 @@ import torch
 from sbi.inference import NLE_A, NRE_B, NRE_C
 from sbi.utils import BoxUniform
 
-from sbi_active import ALHI, ASBI, ActiveInference, SeqBED, SeqBED_B, SeqBED_C
+from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B, SeqBED_C
+from sbi_active.inference import ActiveInference
 from sbi_active.inference.rounds.tracking import SilentTracker
 
 PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))

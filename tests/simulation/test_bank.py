@@ -10,8 +10,9 @@ import traceback
 import pytest
 import torch
 
-from sbi_active import Bank, GaussianNoise, Simulations, SimulatorModel, simulate
+from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
+from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import LockedError, shelf
 
 

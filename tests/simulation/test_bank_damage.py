@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active import Bank, Simulations
+from sbi_active import Bank
 from sbi_active.cli import main
-from sbi_active.simulation import reuse
+from sbi_active.simulation import Simulations, reuse
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.segments import read_segment, write_segment
 

@@ -11,8 +11,9 @@ import h5py
 import pytest
 import torch
 
-from sbi_active import Bank, GaussianNoise, Simulations, SimulatorModel, simulate
+from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
+from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
 

@@ -6,9 +6,9 @@ from sbi.utils import BoxUniform
 from scipy import stats
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from sbi_active import Bank, Simulations, simulate
+from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import reuse
+from sbi_active.simulation import Simulations, reuse
 
 NOISE = 0.3
 

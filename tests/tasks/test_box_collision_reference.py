@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from sbi_active import GaussianNoise, SimulatorModel, Trial
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.campaign import Trial
 from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("mujoco")

@@ -1,0 +1,85 @@
+"""The public names: few, importable, and what was renamed still works."""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sbi_active
+
+PACKAGES = [
+    "sbi_active",
+    *(f"sbi_active.{name}" for name in sbi_active._HOMES if name != "export"),
+]
+
+
+def former() -> list[tuple[str, str, str]]:
+    """Return package, former name and where it is now, read from the sources."""
+    found = []
+    for package in PACKAGES:
+        path = importlib.import_module(package).__file__
+        assert path is not None
+        for node in ast.walk(ast.parse(Path(path).read_text())):
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Name)
+                and node.func.id == "former_names"
+            ):
+                names = ast.literal_eval(node.args[1])
+                found += [(package, old, new) for old, new in names.items()]
+    return found
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_public_names_are_there(package):
+    module = importlib.import_module(package)
+    assert len({*module.__all__}) == len(module.__all__)
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    assert {*module.__all__} <= {*dir(module)}
+
+
+def test_the_top_level_s_three_lists_agree():
+    """Pyright and editors read the imports under TYPE_CHECKING."""
+    assert sbi_active.__file__ is not None
+    tree = ast.parse(Path(sbi_active.__file__).read_text())
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    typed = {
+        (alias.name, str(node.module).removeprefix("sbi_active."))
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert typed == {*sbi_active._HOME.items()}
+    assert {name for name, _ in typed} == {*sbi_active.__all__}
+
+
+def test_importing_it_imports_nothing_heavy():
+    code = (
+        "import sys, sbi_active; before = {*sys.modules}; sbi_active.Campaign; "
+        "print(before & {'torch', 'numpy', 'sbi'}, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "set() True\n", done.stderr
+
+
+@pytest.mark.parametrize(("package", "old", "new"), former())
+def test_former_names_warn_with_the_new_one(package, old, new):
+    home, _, name = new.partition(":")
+    text = f"{package}.{old} goes in the next version: use {home}.{name}"
+    with pytest.warns(DeprecationWarning, match=text) as noted:
+        value = getattr(importlib.import_module(package), old)
+    assert noted[0].filename == __file__
+    now = importlib.import_module(home)
+    for part in name.split("."):
+        now = getattr(now, part)
+    assert value == now
+    assert old not in importlib.import_module(package).__all__
+
+
+def test_other_names_are_errors():
+    with pytest.raises(AttributeError, match="no attribute 'campain'"):
+        sbi_active.campain  # noqa: B018 # pyright: ignore
