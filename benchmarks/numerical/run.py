@@ -24,7 +24,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active import Campaign, CampaignOptions, Refinement, Trial
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active import Campaign, CampaignOptions, Refinement
 from sbi_active.campaign import Trial

@@ -1,18 +1,18 @@
-"""The command line ``sbi-active``: one command a module."""
+"""The command line ``sbi-active``.
+
+Here live the parser, and one module a command, which reads its arguments, calls the
+library and prints. Nothing that a user of Python might want lives here.
+"""
 
 from __future__ import annotations
 
-import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 
-from sbi_active import __version__
-from sbi_active.cli import bank, check, criticize, run
+from sbi_active.cli.parser import make_parser
 
 __all__ = ["main"]
-
-#: Modules with ``add_parser(commands)``, in the order of the help text.
-COMMANDS = (run, bank, check, criticize)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -24,21 +24,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status.
     """
-    arguments = _parser().parse_args(argv)
+    arguments = make_parser().parse_args(argv)
+    module, function = arguments.command
+    command = getattr(importlib.import_module(f"sbi_active.cli.{module}"), function)
     try:
-        return arguments.command(arguments)
+        return command(arguments)
     except (ValueError, OSError) as error:
         print(f"sbi-active: {error}", file=sys.stderr)
         return 2
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="sbi-active",
-        description="Tune a black-box simulator from a handful of real trials.",
-    )
-    parser.add_argument("--version", action="version", version=__version__)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in COMMANDS:
-        module.add_parser(commands)
-    return parser

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,16 +15,15 @@ from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
 from sbi_active.cli.loading import load_object
-from sbi_active.cli.options import add_options, make_task
+from sbi_active.cli.options import make_task
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate
 from sbi_active.simulation.bank import Bank
 from sbi_active.simulation.bank.labeled import LabeledStore
 from sbi_active.simulation.workers.store import run_digest
-from sbi_active.tasks import TASKS  # pyright: ignore
 
-__all__ = ["add_parser"]
+__all__ = ["build", "inspect"]
 
 #: Rows that are drawn and simulated at once. Part of the definition of a bank's theta
 #: and action given a seed, so it is never a setting.
@@ -35,44 +33,8 @@ BLOCK = 8192
 LINES = 30
 
 
-def add_parser(commands: Any) -> None:
-    """Add the command to the parser.
-
-    Args:
-        commands: What ``ArgumentParser.add_subparsers`` returned.
-    """
-    bank = commands.add_parser("bank", help="simulate into a bank, and inspect one")
-    actions = bank.add_subparsers(required=True, metavar="ACTION")
-    build = actions.add_parser(
-        "build",
-        help="simulate prior draws into a bank; run again, it goes on",
-    )
-    build.set_defaults(command=_build)
-    build.add_argument("folder", type=Path, help="of the bank")
-    source = build.add_mutually_exclusive_group(required=True)
-    source.add_argument("--task", help=f"one of: {', '.join(TASKS)}")
-    source.add_argument("--simulator", metavar="MODULE:NAME")
-    add_options(build)
-    build.add_argument("--prior", metavar="MODULE:NAME", help="with --simulator")
-    build.add_argument("--actions", metavar="MODULE:NAME", help="with --simulator")
-    build.add_argument(
-        "--simulator-version",
-        default="",
-        help="yours; given, it stands for the simulator's source code",
-    )
-    build.add_argument("--rows", type=int, required=True, help="in the bank, in all")
-    build.add_argument("--seed", type=int, default=0)
-    build.add_argument("--workers", type=int, default=1, help="processes (1)")
-    inspect = actions.add_parser(
-        "inspect", help="show rows and outcomes, and compare checksums"
-    )
-    inspect.set_defaults(command=_inspect)
-    inspect.add_argument("folder", type=Path, help="of the bank")
-
-
-def _build(arguments: argparse.Namespace) -> int:
-    if arguments.rows < 1:
-        raise ValueError(f"expected --rows >= 1; got {arguments.rows}; do use 100000")
+def build(arguments: argparse.Namespace) -> int:
+    """Simulate prior draws into a bank, from where it ended."""
     simulator, prior, actions = _source(arguments)
     missing = 0
     with (
@@ -152,7 +114,8 @@ def _source(
     )
 
 
-def _inspect(arguments: argparse.Namespace) -> int:
+def inspect(arguments: argparse.Namespace) -> int:
+    """Print what a bank holds; status 1 where checksums fail."""
     bank = Bank(arguments.folder)
     problems = bank.verify()
     if problems:

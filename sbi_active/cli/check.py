@@ -14,59 +14,15 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.campaign import CampaignOptions
 from sbi_active.cli.loading import load_object
 from sbi_active.simulation.check import check_simulator
-from sbi_active.tasks import TASKS, get_task  # pyright: ignore
+from sbi_active.tasks import get_task  # pyright: ignore
 
-__all__ = ["actions_of", "add_parser", "numbers_of", "prior_of"]
+__all__ = ["actions_of", "check", "numbers_of", "prior_of"]
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
 
 
-def add_parser(commands: Any) -> None:
-    """Add the command to the parser.
-
-    Args:
-        commands: What ``ArgumentParser.add_subparsers`` returned.
-    """
-    check = commands.add_parser(
-        "check",
-        help="look a simulator over before a campaign",
-        description=(
-            "Shapes, seeds, noise, lost rows, parameters that change nothing, and the "
-            "cost of a campaign. Exit status 1 where something keeps a campaign from "
-            "working. Write negative numbers as in --theta-low=-5,-5."
-        ),
-    )
-    check.set_defaults(command=_check)
-    check.add_argument(
-        "simulator",
-        nargs="?",
-        metavar="MODULE:FUNCTION",
-        help="or file.py:FUNCTION; not with --task",
-    )
-    check.add_argument("--task", help=f"one of: {', '.join(TASKS)}")
-    check.add_argument("--theta-low", metavar="A,B,...", help="one a parameter")
-    check.add_argument("--theta-high", metavar="A,B,...", help="one a parameter")
-    check.add_argument("--prior", metavar="MODULE:NAME", help="in place of bounds")
-    check.add_argument(
-        "--actions",
-        nargs="+",
-        metavar="SPEC",
-        help="for each entry of the action LOW:HIGH:COUNT or A,B,...; or one "
-        "MODULE:NAME of an action space",
-    )
-    check.add_argument("--rows", type=int, default=256, help="a check (256)")
-    check.add_argument("--rounds", type=int, default=4, help="of the campaign (4)")
-    check.add_argument("--workers", type=int, default=1, help="of the campaign (1)")
-    check.add_argument("--seed", type=int, default=0)
-
-
-def _check(arguments: argparse.Namespace) -> int:
-    for name in ("rows", "rounds", "workers"):
-        if getattr(arguments, name) < 1:
-            raise ValueError(
-                f"expected --{name} >= 1; got {getattr(arguments, name)}; do give a "
-                "positive number"
-            )
+def check(arguments: argparse.Namespace) -> int:
+    """Look a simulator over; status 1 where a campaign cannot run."""
     simulator, prior, actions = _source(arguments)
     num_simulations = _campaign_size(actions, arguments.rounds)
     report = check_simulator(

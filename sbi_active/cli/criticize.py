@@ -22,76 +22,9 @@ from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
 from sbi_active.criticism.data.table import TrialTable, read_table
 from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import GaussianNoise, SimulatorModel
-from sbi_active.tasks import TASKS, get_task  # pyright: ignore
+from sbi_active.tasks import get_task  # pyright: ignore
 
-__all__ = ["add_parser"]
-
-
-def add_parser(commands: Any) -> None:
-    """Add the command to the parser.
-
-    Args:
-        commands: What ``ArgumentParser.add_subparsers`` returned.
-    """
-    criticize = commands.add_parser(
-        "criticize",
-        help="find what a simulator lacks, from measured trials",
-        description=(
-            "Compare a simulator with measured trials: find the residual, trace it to "
-            "an effect that the simulator lacks, add it, and report the error before "
-            "and after. TRIALS.csv has one row a trial, with columns action_* and x_* "
-            "and optionally role (fit or 'held out'), index and repeat_of; or one row "
-            "a sample, with columns trial and time besides. Units stand in brackets, "
-            "as in x_height[m], and are those of the simulator. An empty cell is what "
-            "was not measured. Write negative numbers as in --theta-low=-5,-5."
-        ),
-    )
-    criticize.set_defaults(command=_criticize)
-    criticize.add_argument("trials", metavar="TRIALS.csv", type=Path)
-    criticize.add_argument(
-        "--columns",
-        nargs="+",
-        metavar="KEY=NAME[,NAME...]",
-        help="columns that are trial, time, action, x, role, index or repeat_of, where "
-        "they are named otherwise, as in trial=ball,drop time=time_s x=height_m",
-    )
-    criticize.add_argument(
-        "--units",
-        nargs="+",
-        metavar="NAME=UNIT",
-        help="of columns without a unit in the header",
-    )
-    source = criticize.add_mutually_exclusive_group(required=True)
-    source.add_argument("--task", help=f"one of: {', '.join(TASKS)}")
-    source.add_argument("--simulator", metavar="MODULE:FUNCTION")
-    criticize.add_argument("--prior", metavar="MODULE:NAME", help="with --simulator")
-    criticize.add_argument("--theta-low", metavar="A,B,...", help="in place of --prior")
-    criticize.add_argument("--theta-high", metavar="A,B,...")
-    criticize.add_argument(
-        "--noise",
-        metavar="SD[,SD...]",
-        help="standard deviation of a measurement, one or one a column of x; without "
-        "it, the simulator's own, or that of at least 3 repeats of one action",
-    )
-    criticize.add_argument(
-        "--actions",
-        nargs="+",
-        metavar="SPEC",
-        help="the permitted ones, for the next action: for each entry LOW:HIGH:COUNT "
-        "or A,B,...; or one MODULE:NAME",
-    )
-    criticize.add_argument(
-        "--effects",
-        metavar="MODULE:NAME",
-        help="a list of Effect, or a function that returns one, besides the generic",
-    )
-    criticize.add_argument(
-        "--designed",
-        action="store_true",
-        help="the actions were chosen for their information",
-    )
-    criticize.add_argument("--out", type=Path, help="folder for the report")
-    criticize.add_argument("--seed", type=int, default=0)
+__all__ = ["criticize"]
 
 
 @dataclass(frozen=True)
@@ -104,7 +37,8 @@ class _Source:
     effects: list[Effect]
 
 
-def _criticize(arguments: argparse.Namespace) -> int:
+def criticize(arguments: argparse.Namespace) -> int:
+    """Compare a simulator with measured trials, and print the report."""
     table, trials = _trials(arguments)
     source = _source(arguments, trials)
     # Only scales are taken from these where the permitted actions are unknown.

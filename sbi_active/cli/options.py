@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import json
 from collections.abc import Sequence
@@ -10,23 +9,7 @@ from typing import Any
 
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 
-__all__ = ["add_options", "make_task"]
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--option`` to a command that takes a task.
-
-    Args:
-        parser: Of the command.
-    """
-    parser.add_argument(
-        "--option",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="of the task, as often as wanted: variant=sinh, target=2, noise=0.01, "
-        "theta_true=[0.3,0.4,0.5]; the value is read as JSON, else as text",
-    )
+__all__ = ["make_task"]
 
 
 def make_task(name: str, options: Sequence[str]) -> Task:

@@ -12,7 +12,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,51 +19,23 @@ from tqdm import tqdm
 
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
-from sbi_active.campaign.methods import METHODS, faithful_options, find_method
-from sbi_active.cli.options import add_options, make_task
+from sbi_active.campaign.methods import faithful_options, find_method
+from sbi_active.cli.options import make_task
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
-from sbi_active.tasks import TASKS, Task  # pyright: ignore
+from sbi_active.tasks import Task  # pyright: ignore
 
-__all__ = ["add_parser"]
+__all__ = ["SETTINGS", "run"]
 
 SETTINGS = {"default": lambda _: CampaignOptions(), "faithful": faithful_options}
 
 
-def add_parser(commands: Any) -> None:
-    """Add the command to the parser.
-
-    Args:
-        commands: What ``ArgumentParser.add_subparsers`` returned.
-    """
-    run = commands.add_parser("run", help="run a campaign on a task")
-    run.set_defaults(command=_run)
-    run.add_argument("task", help=f"one of: {', '.join(TASKS)}")
-    run.add_argument(
-        "--method", default="asbi", help=f"one of: {', '.join(METHODS)} (asbi)"
-    )
-    run.add_argument("--rounds", type=int, default=4, help="real trials (4)")
-    run.add_argument("--seed", type=int, default=0)
-    run.add_argument("--out", type=Path, required=True, help="folder for the results")
-    add_options(run)
-    run.add_argument(
-        "--setting",
-        choices=[*SETTINGS],
-        default="default",
-        help="faithful: the paper's network and chained beliefs",
-    )
-    run.add_argument("--simulations", type=int, help="to train on, a round")
-    run.add_argument("--samples", type=int, help="for the gain, a candidate action")
-    run.add_argument("--iterations", type=int, help="training steps a round")
-
-
-def _run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
+    """Run a campaign on a task, and save its table, figure and results."""
     task = make_task(arguments.task, arguments.option)
-    if arguments.rounds < 1:
-        raise ValueError(f"expected --rounds >= 1; got {arguments.rounds}; do use 4")
     campaign = Campaign(
         task.simulator,
         task.prior,

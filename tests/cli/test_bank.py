@@ -99,13 +99,11 @@ def test_inspect_names_a_damaged_file(capsys):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["--task", "numerica"], "expected a task among"),
         (
             ["--task", "oscillator", "--option", "variant=x"],
             "expected options of 'oscillator' among",
         ),
         (["--simulator", "m:f"], "expected --prior and --actions with --simulator"),
-        (["--task", "numerical", "--rows", "0"], "expected --rows >= 1; got 0"),
         (
             ["--simulator", "math", "--prior", "a:b", "--actions", "a:b"],
             "expected MODULE:NAME; got 'math'",

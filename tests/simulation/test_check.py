@@ -216,7 +216,6 @@ def test_tasks_are_ready(capsys):
             ["math:sin", "--theta-low=1", "--theta-high=0"],
             "expected as many bounds, low below high; got [1.0] and [0.0]",
         ),
-        (["math:sin", *SPACE, "--rows", "0"], "expected --rows >= 1; got 0"),
         (
             ["math:sin", *SPACE[:2], "--actions", "0:1:2:3"],
             "expected LOW:HIGH:COUNT or A,B,...; got '0:1:2:3'",
