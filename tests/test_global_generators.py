@@ -22,9 +22,7 @@ from sbi_active import (
 )
 from sbi_active.actions import BoxActions, MixedActions
 from sbi_active.criticism import Trials, close_loop
-from sbi_active.inference import SeqBED_C
-from sbi_active.inference.refinement.stages import refine
-from sbi_active.inference.rounds.rows import Observation
+from sbi_active.inference import Observation, SeqBED_C, refine
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import check_simulator, estimate_noise
 from tests.campaign.test_corrections import OPTIONS, RATIOS

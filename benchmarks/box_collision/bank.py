@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.bank import Bank
-from sbi_active.simulation.workers.store import run_digest
+from sbi_active.simulation.workers import run_digest
 from sbi_active.tasks import Task
 
 __all__ = ["PriorBank"]

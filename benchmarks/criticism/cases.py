@@ -20,7 +20,7 @@ from benchmarks.criticism.refit import residual_sum_of_squares
 from benchmarks.criticism.worlds import World
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Context, Effect, Trials
-from sbi_active.criticism.data.trials import Role
+from sbi_active.criticism.data import Role
 from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
 
 __all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]

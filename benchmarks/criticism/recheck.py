@@ -22,7 +22,7 @@ from scipy.stats import chi2, multivariate_normal
 from benchmarks.criticism.cases import KINDS, draw_case
 from benchmarks.criticism.worlds import get_world
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence import RivalSet
 
 WIDER = 4.0  # covariance of the proposal by that of the posterior
 BLOCK = 1_000  # parameters simulated at a time

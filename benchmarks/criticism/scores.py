@@ -14,8 +14,7 @@ from torch import Tensor
 from benchmarks.criticism.cases import Case
 from benchmarks.criticism.oracle import oracle_rmse
 from sbi_active import SimulatorModel
-from sbi_active.criticism import close_loop
-from sbi_active.criticism.report.report import Report
+from sbi_active.criticism import Report, close_loop
 
 __all__ = ["COLUMNS", "counted", "score_case"]
 

@@ -10,13 +10,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism import Trials
+from sbi_active.criticism.evidence import RivalSet
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED
-from sbi_active.criticism.rivals.error_models import NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import declared_noise
-from sbi_active.criticism.rivals.residual_process import ResidualProcess
-from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.rivals import (
+    NoiseGrid,
+    ResidualProcess,
+    TrialSimulator,
+    declared_noise,
+)
 
 __all__ = ["Forecast", "aligned_error", "forecast"]
 

@@ -35,7 +35,7 @@ from benchmarks.measured.servo_rates import RATES, by_rate
 from benchmarks.measured.servo_tables import tables
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Tracing
-from sbi_active.criticism.steps.predictive import predict
+from sbi_active.criticism.steps import predict
 from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.noise import servo_noise  # pyright: ignore

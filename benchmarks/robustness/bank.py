@@ -20,8 +20,7 @@ from benchmarks.robustness.bank_in_use import ATTACKS as IN_USE
 from sbi_active import Bank
 from sbi_active.cli import main
 from sbi_active.simulation import Simulations, reuse
-from sbi_active.simulation.bank import CorruptSegmentError
-from sbi_active.simulation.bank.segments import read_segment, write_segment
+from sbi_active.simulation.bank import CorruptSegmentError, read_segment, write_segment
 
 ATTACKS = Attacks(IN_USE)
 

@@ -157,7 +157,7 @@ def parts(case: int) -> None:
 
 
 def _digest(theta: torch.Tensor, action: torch.Tensor) -> str:
-    from sbi_active.simulation.workers.store import run_digest
+    from sbi_active.simulation.workers import run_digest
 
     return run_digest(5, theta, action)
 

@@ -27,9 +27,8 @@ from benchmarks.robustness.small_loop import (
     usual,
 )
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.data.trials import Role
-from sbi_active.criticism.report.report import Report
+from sbi_active.criticism import Criticism, Effect, Report, Trials
+from sbi_active.criticism.data import Role
 from sbi_active.criticism.report.suspects import suspects
 
 ATTACKS = Attacks()

@@ -46,7 +46,7 @@ from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
 from sbi_active import ASBI, Refinement
-from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 
 DIMS = (2, 4, 6, 8, 10, 15, 20)

@@ -25,7 +25,7 @@ from torch.distributions import (
 from benchmarks.robustness.attacks import Attacks
 from benchmarks.robustness.exact import Problem
 from sbi_active import ASBI, Refinement
-from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference import Belief
 from sbi_active.seeding import forked_generators
 
 ATTACKS = Attacks()

@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials, close_loop
-from sbi_active.criticism.report.report import Report
+from sbi_active.criticism import Effect, Report, Trials, close_loop
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))

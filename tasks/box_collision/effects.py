@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Beta, Distribution, HalfNormal, Independent, Normal
 
-from sbi_active.criticism import Effect
-from sbi_active.criticism.effects.effect import Context
+from sbi_active.criticism import Context, Effect
 
 __all__ = ["make_effects"]
 

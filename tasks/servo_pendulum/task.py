@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sbi_active.actions import DiscreteActions
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.data.trials import Role
+from sbi_active.criticism.data import Role
 from sbi_active.simulation import NoiseModel, SimulatorModel
 from sbi_active.tasks.base import Task
 from sbi_active.tasks.servo_pendulum.effects import make_effects

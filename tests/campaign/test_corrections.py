@@ -18,7 +18,7 @@ from sbi_active import (
     Refinement,
     SimulatorModel,
 )
-from sbi_active.campaign.checks.unexplained import outlyingness
+from sbi_active.campaign.checks import outlyingness
 from sbi_active.criticism import Effect
 from sbi_active.inference import RatioClassifier
 

@@ -8,14 +8,9 @@ import torch
 from scipy.integrate import quad
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_active.campaign.checks.health import assess, log_e_value
-from sbi_active.campaign.checks.score import score_outcome
-from sbi_active.campaign.state import (
-    CampaignOptions,
-    CampaignState,
-    ModelVersion,
-    Trial,
-)
+from sbi_active.campaign import CampaignOptions, Trial
+from sbi_active.campaign.checks import assess, log_e_value, score_outcome
+from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.seeding import derive_seed
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))

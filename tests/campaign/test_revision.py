@@ -16,7 +16,7 @@ from sbi_active import (
     Refinement,
     SimulatorModel,
 )
-from sbi_active.campaign.checks.unlike import most_unlike
+from sbi_active.campaign.checks import most_unlike
 from sbi_active.criticism import Effect
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import binom
 from torch.distributions import MultivariateNormal
 
-from sbi_active.campaign.checks.score import score_outcome
+from sbi_active.campaign.checks import score_outcome
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
 ACTION = torch.ones(1)

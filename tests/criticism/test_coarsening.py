@@ -7,7 +7,7 @@ from torch.distributions import Normal
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.steps.coarsening import power
+from sbi_active.criticism.steps import power
 from sbi_active.simulation import AutocorrelatedNoise, unknown_noise
 
 SENSOR = 0.01

@@ -11,13 +11,15 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import SCALES, log_evidence
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import declared_noise
-from sbi_active.criticism.rivals.residual_process import ResidualProcess
-from sbi_active.criticism.steps.combinations import log_prior
+from sbi_active.criticism.data import Measurements
+from sbi_active.criticism.evidence import SCALES, RivalSet, log_evidence
+from sbi_active.criticism.rivals import (
+    NoiseCell,
+    NoiseGrid,
+    ResidualProcess,
+    declared_noise,
+)
+from sbi_active.criticism.steps import log_prior
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 ACTION = torch.linspace(-2, 2, 8)[:, None]

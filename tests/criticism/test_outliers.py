@@ -11,22 +11,16 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
-from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.evidence.importance import lower_factors
-from sbi_active.criticism.evidence.outliers import OneOutlier
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.data import Measurements
+from sbi_active.criticism.evidence import OneOutlier, RivalSet, lower_factors
 from sbi_active.criticism.report.suspects import (
     of_noise,
     of_trials,
     suspects,
     verdict_clause,
 )
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
-from sbi_active.criticism.steps.influence import (
-    is_left_to_chance,
-    unless_refuted,
-    withdrawn,
-)
+from sbi_active.criticism.rivals import NoiseCell, NoiseGrid
+from sbi_active.criticism.steps import is_left_to_chance, unless_refuted, withdrawn
 from tests.criticism.reports import evaluation, flat, report, tracing
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))

@@ -10,11 +10,8 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.arviz_versions import pareto_smoothed
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.steps.leave_one_out import (
-    NUM_DRAWS,
-    LeaveOneOut,
-    leave_one_out,
-)
+from sbi_active.criticism.steps import LeaveOneOut
+from sbi_active.criticism.steps.leave_one_out import NUM_DRAWS, leave_one_out
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 NOISE = 0.5

@@ -72,7 +72,7 @@ def test_residual_panels_by_kind_of_observation(shape):
         residuals=residuals(shape, size=40.0, times=times),
         residuals_after=residuals(shape, times=times),
     )
-    from sbi_active.criticism.report.figures import plot_residuals
+    from sbi_active.criticism.report import plot_residuals
 
     figure = plot_residuals(made.residuals, made.residuals_after)
     labels = [ax.get_xlabel() for ax in figure.axes]

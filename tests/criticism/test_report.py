@@ -9,8 +9,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active.criticism import SevereTest, Trials, joint_prior
-from sbi_active.criticism.report.cautions import find_warnings
-from sbi_active.criticism.report.headline import with_error
+from sbi_active.criticism.report import find_warnings, with_error
 from tests.criticism.reports import (
     DRAG,
     evaluation,

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.data import Measurements
 
 
 def test_ragged_trajectories_are_padded_and_masked():

@@ -9,7 +9,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B, SeqBED_C
 from sbi_active.inference import ActiveInference
-from sbi_active.inference.rounds.tracking import SilentTracker
+from sbi_active.inference.rounds import SilentTracker
 
 PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))
 TRAINERS = [ASBI, ALHI, SeqBED, SeqBED_B, SeqBED_C]

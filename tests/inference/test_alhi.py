@@ -10,10 +10,9 @@ from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, Refinement
-from sbi_active.inference import KernelBelief
-from sbi_active.inference.products.product import Product, TrainedRegion, widened
-from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference import KernelBelief, Observation
+from sbi_active.inference.products import Product, TrainedRegion, widened
+from sbi_active.inference.sampling import PriorCoordinates
 from tests.linear_gaussian import DIM, PRIOR, simulator
 
 SETTINGS = MixtureDensity(hidden_features=(16,), num_iterations=100)

@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, Refinement
 from sbi_active.inference import ChainedBelief, Observation, refine
-from sbi_active.inference.beliefs.comparison import compare, compare_orders
+from sbi_active.inference.beliefs import compare, compare_orders
 from sbi_active.inference.trainers import asbi
 from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator

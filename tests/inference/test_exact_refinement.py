@@ -12,21 +12,23 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.inference.refinement.importance import importance_sample
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
-from sbi_active.inference.refinement.simulated_belief import ExactBelief
-from sbi_active.inference.refinement.simulated_likelihood import (
+from sbi_active.inference import Refinement, refine
+from sbi_active.inference.refinement import (
+    ExactBelief,
     MeanTable,
+    RefinedBelief,
     SimulatedLikelihood,
     declares_noise,
+    importance_sample,
 )
-from sbi_active.inference.refinement.stages import Refinement, refine
-from sbi_active.inference.regression.regions import PriorProposal
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
+from sbi_active.inference.regression import PriorProposal
+from sbi_active.inference.sampling import (
+    EitherProposal,
+    KernelProposal,
+    PriorCoordinates,
+)
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation import GaussianNoise, SimulatorModel
-from sbi_active.simulation.outcomes import MissingRowsWarning
+from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
 
 BOX = BoxUniform(-torch.ones(2), torch.ones(2))
 SD, CELL = 0.02, 0.02

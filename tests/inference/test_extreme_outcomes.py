@@ -8,10 +8,9 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, ASBI, GaussianNoise, Refinement, SeqBED, SimulatorModel
-from sbi_active.inference import SeqBED_C
-from sbi_active.inference.refinement.stages import refine
-from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.weights import normalized
+from sbi_active.inference import SeqBED_C, refine
+from sbi_active.inference.rounds import UnexplainedOutcomeError
+from sbi_active.inference.sampling import normalized
 from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

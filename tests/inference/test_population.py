@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from sbi_active.inference.sampling.population import (
+from sbi_active.inference.sampling import (
     GaussianMixture,
     StudentProposal,
+    Unbounding,
     population_monte_carlo,
 )
-from sbi_active.inference.sampling.unbounding import Unbounding
 
 
 class Box:

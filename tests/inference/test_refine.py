@@ -13,8 +13,8 @@ from torch.distributions import (
     MultivariateNormal,
 )
 
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
-from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference import Refinement, refine
+from sbi_active.inference.refinement import RefinedBelief
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from tests.inference.refined_worlds import BOX, draws, numerical, observe

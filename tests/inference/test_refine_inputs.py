@@ -16,7 +16,7 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference import Refinement, refine
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior

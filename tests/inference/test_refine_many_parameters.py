@@ -8,8 +8,8 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference.refinement.stages import Refinement, refine
-from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference import Refinement, refine
+from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.seeding import forked_generators
 
 

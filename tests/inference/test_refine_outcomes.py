@@ -11,7 +11,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference import Refinement, refine
 from sbi_active.seeding import forked_generators
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
-from sbi_active.inference.regression.regions import PriorProposal
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import Particles
+from sbi_active.inference.refinement import RefinedBelief
+from sbi_active.inference.regression import PriorProposal
+from sbi_active.inference.sampling import Particles, PriorCoordinates
 
 
 def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():

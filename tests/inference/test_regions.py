@@ -17,7 +17,7 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference.regression.regions import (
+from sbi_active.inference.regression import (
     SPREAD,
     PriorProposal,
     Region,
@@ -26,8 +26,7 @@ from sbi_active.inference.regression.regions import (
     nearest_region,
     whole_space,
 )
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import Particles
+from sbi_active.inference.sampling import Particles, PriorCoordinates
 
 PRIORS = {
     "box": BoxUniform(torch.tensor([-5.0, 0.0]), torch.tensor([5.0, 1e-3])),

@@ -5,13 +5,14 @@ import math
 import pytest
 import torch
 
-from sbi_active.inference.networks.action_scaling import (
+from sbi_active.inference.networks import (
     ActionScaling,
+    Baseline,
     Polynomials,
+    Response,
     exponents_of,
 )
-from sbi_active.inference.networks.baseline import Baseline, _cholesky
-from sbi_active.inference.networks.response import Response
+from sbi_active.inference.networks.baseline import _cholesky
 
 
 @pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbi_active.inference.regression.basis import Basis
-from sbi_active.inference.regression.regions import whole_space
-from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
+from sbi_active.inference.regression import (
+    Basis,
+    LocalRegression,
+    estimate_noise,
+    whole_space,
+)
 
 NUM = 400
 

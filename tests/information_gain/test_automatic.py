@@ -16,10 +16,7 @@ from sbi_active.information_gain import (
     PosteriorGain,
     RatioGain,
 )
-from sbi_active.information_gain.estimators.automatic import (
-    choose_estimator,
-    disagreements,
-)
+from sbi_active.information_gain.estimators import choose_estimator, disagreements
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihood,

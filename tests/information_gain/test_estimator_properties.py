@@ -16,7 +16,7 @@ from sbi_active.information_gain import (
     RatioGain,
     VariationalNestedGain,
 )
-from sbi_active.information_gain.estimators.automatic import ESTIMATORS as NAMES
+from sbi_active.information_gain.estimators import ESTIMATORS as NAMES
 from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,

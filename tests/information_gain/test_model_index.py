@@ -12,7 +12,7 @@ import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.information_gain import ModelIndexGain, RivalSampler
-from sbi_active.information_gain.fits.noise_kernels import noise_members
+from sbi_active.information_gain.fits import noise_members
 
 ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
 X = torch.linspace(-30, 30, 60_001).double()

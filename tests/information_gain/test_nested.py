@@ -10,11 +10,9 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active.information_gain import CandidateSimulations, EntropyGain, NestedGain
-from sbi_active.information_gain.estimators.entropy import with_control
-from sbi_active.information_gain.fits.emulator import MeanEmulator
-from sbi_active.information_gain.fits.smoothing import declare
-from sbi_active.simulation import GaussianNoise
-from sbi_active.simulation.noise.gaussian import NoiseModel
+from sbi_active.information_gain.estimators import with_control
+from sbi_active.information_gain.fits import MeanEmulator, declare
+from sbi_active.simulation import GaussianNoise, NoiseModel
 from sbi_active.tasks.oscillator import model
 from sbi_active.tasks.oscillator.reference import OscillatorReference
 from tests.information_gain.test_entropy import ACTIONS, declared

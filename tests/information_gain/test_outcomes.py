@@ -22,10 +22,11 @@ from sbi_active.information_gain import (
     NestedGain,
     PosteriorGain,
 )
-from sbi_active.information_gain.fits.classification import cross_fitted, probability
-from sbi_active.information_gain.fits.presence import (
+from sbi_active.information_gain.fits import (
+    cross_fitted,
     presence_information,
     presence_notes,
+    probability,
     random_presence,
 )
 from sbi_active.information_gain.race import standard_error

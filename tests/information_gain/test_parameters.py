@@ -12,11 +12,8 @@ from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
 from sbi_active.information_gain import CandidateSimulations, ParameterGain
-from sbi_active.information_gain.estimators.parameters import NormalScores
-from sbi_active.information_gain.fits.cross_fitting import (
-    cross_fit,
-    patterns_of_numbers,
-)
+from sbi_active.information_gain.estimators import NormalScores
+from sbi_active.information_gain.fits import cross_fit, patterns_of_numbers
 
 COVARIANCE = torch.tensor([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
 BELIEF = MultivariateNormal(torch.zeros(3), COVARIANCE)

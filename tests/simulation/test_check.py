@@ -9,7 +9,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions
 from sbi_active.cli import main
-from sbi_active.simulation.check import check_simulator
+from sbi_active.simulation import check_simulator
 
 HEAD = "import numpy as np\nimport torch\nfrom sbi_active import *\n"
 SPACE = ["--theta-low=0,-1", "--theta-high=1,1", "--actions", "0.5:2:4"]

@@ -15,8 +15,7 @@ import torch
 from sbi_active import GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome, SimulationInterrupted
-from sbi_active.simulation.workers.pace import Pace
-from sbi_active.simulation.workers.store import run_digest
+from sbi_active.simulation.workers import Pace, run_digest
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])

@@ -17,9 +17,8 @@ import torch
 from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
-from sbi_active.simulation.workers.cluster import DaskPool, _answer_apart
-from sbi_active.simulation.workers.pools import pickled
-from sbi_active.simulation.workers.schedule import Schedule
+from sbi_active.simulation.workers import DaskPool, Schedule, pickled
+from sbi_active.simulation.workers.cluster import _answer_apart
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip(

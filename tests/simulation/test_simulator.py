@@ -7,7 +7,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, simulate
 from sbi_active.campaign.telling import outcome_told
-from sbi_active.inference.rounds.condition import outcome_rows
+from sbi_active.inference.rounds import outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
 from sbi_active.simulation.simulator import outcome_tensor

@@ -15,7 +15,7 @@ import torch
 from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
-from sbi_active.simulation.workers.idle import IDLE
+from sbi_active.simulation.workers import IDLE
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])

@@ -7,8 +7,8 @@ import torch
 
 from benchmarks.measured.servo_pendulum import main
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.data import Measurements
+from sbi_active.criticism.rivals import declared_noise
 from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.servo_pendulum import (  # pyright: ignore

@@ -1,1 +1,9 @@
-"""TODO."""
+"""What a simulator may lack: declared effects, and the simulator that has them.
+
+Here live effects, their checks and priors. How well one explains trials does not.
+"""
+
+from sbi_active.criticism.effects.declarations import require_nested
+from sbi_active.criticism.effects.effect import Context, Effect
+
+__all__ = ["Context", "Effect", "require_nested"]

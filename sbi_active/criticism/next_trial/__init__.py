@@ -1,1 +1,16 @@
-"""TODO."""
+"""What to measure next: the action that tells rivals apart, and the severest test.
+
+Here lives what proposes a trial. What concludes from trials lives in ``steps``.
+"""
+
+from sbi_active.criticism.next_trial.candidates import following
+from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
+from sbi_active.criticism.next_trial.outside import extrapolated, outside_candidates
+
+__all__ = [
+    "PredictedRival",
+    "choose_action",
+    "extrapolated",
+    "following",
+    "outside_candidates",
+]

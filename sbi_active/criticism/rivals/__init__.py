@@ -1,1 +1,28 @@
-"""TODO."""
+"""A rival: one simulator with some effects and an error, and its density of trials.
+
+Here live its coordinates, outcomes and errors. What compares rivals lives in
+``evidence``.
+"""
+
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid, log_sum_exp
+from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
+from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
+from sbi_active.criticism.rivals.validity import (
+    DISAGREEMENT,
+    UNKNOWN_RATES,
+    log_outcomes,
+)
+
+__all__ = [
+    "DISAGREEMENT",
+    "NUM_REPLICATES",
+    "NoiseCell",
+    "NoiseGrid",
+    "ResidualProcess",
+    "TrialSimulator",
+    "UNKNOWN_RATES",
+    "declared_noise",
+    "log_outcomes",
+    "log_sum_exp",
+]

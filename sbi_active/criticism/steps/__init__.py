@@ -1,1 +1,28 @@
-"""TODO."""
+"""The steps of the loop, one a module: detect, trace, combine, predict, evaluate.
+
+Here live functions of rivals and trials that return a result. Text about results lives
+in ``report``, proposals of trials in ``next_trial``.
+"""
+
+from sbi_active.criticism.steps.coarsening import power
+from sbi_active.criticism.steps.combinations import log_prior
+from sbi_active.criticism.steps.detection import LEVEL, num_determined
+from sbi_active.criticism.steps.influence import (
+    is_left_to_chance,
+    unless_refuted,
+    withdrawn,
+)
+from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
+from sbi_active.criticism.steps.predictive import predict
+
+__all__ = [
+    "LEVEL",
+    "LeaveOneOut",
+    "is_left_to_chance",
+    "log_prior",
+    "num_determined",
+    "power",
+    "predict",
+    "unless_refuted",
+    "withdrawn",
+]

@@ -1,1 +1,22 @@
-"""TODO."""
+"""Beliefs: distributions over parameters that trials have shaped.
+
+Here live those that are made of densities or particles alone. Those that simulate live
+in ``refinement``, those of learned factors in ``products``.
+"""
+
+from sbi_active.inference.beliefs.belief import (
+    Belief,
+    ChainedBelief,
+    information_gained,
+)
+from sbi_active.inference.beliefs.comparison import compare, compare_orders
+from sbi_active.inference.beliefs.kernel_belief import KernelBelief
+
+__all__ = [
+    "Belief",
+    "ChainedBelief",
+    "KernelBelief",
+    "compare",
+    "compare_orders",
+    "information_gained",
+]

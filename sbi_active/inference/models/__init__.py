@@ -1,1 +1,12 @@
-"""TODO."""
+"""What a trainer learned, as a function of parameters, outcome and action.
+
+Here live posteriors, likelihoods and ratios. Beliefs, which have seen a trial, live in
+``beliefs``.
+"""
+
+from sbi_active.inference.models.action_likelihood import ActionLikelihood
+from sbi_active.inference.models.action_ratio import ActionRatio
+from sbi_active.inference.models.lfire import LFIRE
+from sbi_active.inference.models.posterior import ActionPosterior
+
+__all__ = ["ActionLikelihood", "ActionPosterior", "ActionRatio", "LFIRE"]

@@ -1,1 +1,37 @@
-"""TODO."""
+"""Networks and what prepares their inputs.
+
+Here live densities and classifiers of plain tensors, and their training. What they mean
+for an action lives in ``models``.
+"""
+
+from sbi_active.inference.networks.action_scaling import (
+    ActionScaling,
+    Polynomials,
+    exponents_of,
+)
+from sbi_active.inference.networks.baseline import Baseline, local
+from sbi_active.inference.networks.conditioning import Conditioning
+from sbi_active.inference.networks.mixture_density import (
+    MixtureDensity,
+    MixtureDensityNetwork,
+)
+from sbi_active.inference.networks.mixture_network import PreparedLoss
+from sbi_active.inference.networks.ratio_network import RatioClassifier
+from sbi_active.inference.networks.response import Response
+from sbi_active.inference.networks.training import TrainingBudget, train_mixture_density
+
+__all__ = [
+    "ActionScaling",
+    "Baseline",
+    "Conditioning",
+    "MixtureDensity",
+    "MixtureDensityNetwork",
+    "Polynomials",
+    "PreparedLoss",
+    "RatioClassifier",
+    "Response",
+    "TrainingBudget",
+    "exponents_of",
+    "local",
+    "train_mixture_density",
+]

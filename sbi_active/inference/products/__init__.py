@@ -1,1 +1,10 @@
-"""TODO."""
+"""Beliefs that are the prior times learned factors of all trials.
+
+Here live the product and its samplers. What learns the factors lives in ``trainers``.
+"""
+
+from sbi_active.inference.products.belief import ProductBelief
+from sbi_active.inference.products.markov_chains import ChainBelief
+from sbi_active.inference.products.product import Product, TrainedRegion, widened
+
+__all__ = ["ChainBelief", "Product", "ProductBelief", "TrainedRegion", "widened"]

@@ -1,1 +1,35 @@
-"""TODO."""
+"""Refinement: the posterior of all trials, by simulations where it is.
+
+Here live its stages, its beliefs, and how far to trust them. No network is asked.
+"""
+
+from sbi_active.inference.refinement.importance import importance_sample
+from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.refinement.outcome_checks import BLURRED
+from sbi_active.inference.refinement.regression_error import (
+    LARGE,
+    expected_error,
+    widened,
+)
+from sbi_active.inference.refinement.simulated_belief import ExactBelief
+from sbi_active.inference.refinement.simulated_likelihood import (
+    MeanTable,
+    SimulatedLikelihood,
+    declares_noise,
+)
+from sbi_active.inference.refinement.stages import Refinement, refine
+
+__all__ = [
+    "BLURRED",
+    "ExactBelief",
+    "LARGE",
+    "MeanTable",
+    "RefinedBelief",
+    "Refinement",
+    "SimulatedLikelihood",
+    "declares_noise",
+    "expected_error",
+    "importance_sample",
+    "refine",
+    "widened",
+]

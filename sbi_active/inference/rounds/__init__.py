@@ -1,1 +1,23 @@
-"""TODO."""
+"""Rows of a round: simulations, what they are conditioned on, what sbi is given.
+
+Here live the shapes and checks that all trainers share. Nothing here learns.
+"""
+
+from sbi_active.inference.rounds.condition import (
+    action_rows,
+    outcome_rows,
+    pack,
+    unpack,
+)
+from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
+from sbi_active.inference.rounds.tracking import SilentTracker
+
+__all__ = [
+    "Observation",
+    "SilentTracker",
+    "UnexplainedOutcomeError",
+    "action_rows",
+    "outcome_rows",
+    "pack",
+    "unpack",
+]

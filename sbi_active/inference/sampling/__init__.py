@@ -1,1 +1,27 @@
-"""TODO."""
+"""Samplers and proposals over the parameters' unbounded coordinates.
+
+Here live tools that know a density and nothing of trials, networks or simulators.
+"""
+
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
+from sbi_active.inference.sampling.population import (
+    GaussianMixture,
+    Particles,
+    StudentProposal,
+    normalized,
+    population_monte_carlo,
+)
+from sbi_active.inference.sampling.unbounding import Unbounding
+
+__all__ = [
+    "EitherProposal",
+    "GaussianMixture",
+    "KernelProposal",
+    "Particles",
+    "PriorCoordinates",
+    "StudentProposal",
+    "Unbounding",
+    "normalized",
+    "population_monte_carlo",
+]

@@ -1,1 +1,25 @@
-"""TODO."""
+"""The engine: rows of simulations over processes or a cluster.
+
+Here lives how rows are run, lost and stored. What a row means does not.
+"""
+
+from sbi_active.simulation.workers.cluster import DaskPool
+from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.idle import IDLE
+from sbi_active.simulation.workers.pace import Pace, pace_of
+from sbi_active.simulation.workers.pools import pickled
+from sbi_active.simulation.workers.schedule import Schedule
+from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
+
+__all__ = [
+    "DaskPool",
+    "IDLE",
+    "Pace",
+    "Recorder",
+    "RowStore",
+    "Schedule",
+    "pace_of",
+    "pickled",
+    "run_digest",
+    "simulate",
+]
