@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from sbi_active.inference import (
         ALHI,
         ASBI,
-        ActionEmbedding,
         Belief,
         MixtureDensity,
         Refinement,
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
 __all__ = [
     "ALHI",
     "ASBI",
-    "ActionEmbedding",
     "AutocorrelatedNoise",
     "Bank",
     "Belief",
@@ -83,7 +81,6 @@ _HOMES = {
     "inference": (
         "ALHI",
         "ASBI",
-        "ActionEmbedding",
         "Belief",
         "MixtureDensity",
         "Refinement",
@@ -109,9 +106,10 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 _former = former_names(
     __name__,
     {
-        "ActionLikelihood": "sbi_active.inference:ActionLikelihood",
+        "ActionEmbedding": "sbi_active.inference:ActionEmbedding",
+        "ActionLikelihood": "sbi_active.inference.models:ActionLikelihood",
         "ActionPosterior": "sbi_active.inference:ActionPosterior",
-        "ActionRatio": "sbi_active.inference:ActionRatio",
+        "ActionRatio": "sbi_active.inference.models:ActionRatio",
         "ActionSpace": "sbi_active.actions:ActionSpace",
         "ActiveInference": "sbi_active.inference:ActiveInference",
         "Design": "sbi_active.design:Design",

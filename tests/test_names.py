@@ -42,6 +42,13 @@ def test_public_names_are_there(package):
     assert {*module.__all__} <= {*dir(module)}
 
 
+def test_public_names_are_few():
+    """A user reads them all in a minute; 80 or so, and the top level's again."""
+    assert len(sbi_active.__all__) <= 25
+    names = [importlib.import_module(package).__all__ for package in PACKAGES[1:]]
+    assert sum(map(len, names)) <= 70
+
+
 def test_the_top_level_s_three_lists_agree():
     """Pyright and editors read the imports under TYPE_CHECKING."""
     assert sbi_active.__file__ is not None

@@ -27,8 +27,8 @@ from benchmarks.measured.fall_least_squares import (
     second_drop_error,
 )
 from benchmarks.measured.forecast import Forecast, aligned_error, forecast
-from sbi_active.criticism import Criticism, Tracing
-from sbi_active.criticism.results import NONE
+from sbi_active.criticism import Criticism
+from sbi_active.criticism.results import NONE, Tracing
 from sbi_active.tasks.ball_drops import (  # pyright: ignore
     DRAG,
     Drop,

@@ -1,4 +1,7 @@
-"""Action spaces: what the robot may do in the next trial, one kind a file."""
+"""Action spaces: what the robot may do in the next trial, one kind a file.
+
+Here live the spaces alone. Which action is taken lives in ``design``.
+"""
 
 from sbi_active.actions.box import BoxActions
 from sbi_active.actions.discrete import DiscreteActions

@@ -1,40 +1,41 @@
-"""The closed loop: find the residual, trace it to an effect, add it, report."""
+"""The closed loop: find the residual, trace it to an effect, add it, report.
+
+Here lives what a user calls and declares; the parts of it live in the packages below.
+No campaign is known here.
+"""
 
 from sbi_active.criticism.criticism import Criticism, close_loop
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.generic import generic_effects
-from sbi_active.criticism.effects.joint_prior import JointPrior, joint_prior
+from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.report.report import Report
-from sbi_active.criticism.results import (
-    Detection,
-    Estimate,
-    Evaluation,
-    Evidence,
-    NextAction,
-    Residuals,
-    SevereTest,
-    Tracing,
-)
+from sbi_active.renamed import former_names
 
 __all__ = [
     "AugmentedSimulator",
     "Context",
     "Criticism",
-    "Detection",
     "Effect",
-    "Estimate",
-    "Evaluation",
-    "Evidence",
-    "JointPrior",
-    "NextAction",
     "Report",
-    "Residuals",
-    "SevereTest",
-    "Tracing",
     "Trials",
     "close_loop",
     "generic_effects",
     "joint_prior",
 ]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "Detection": "sbi_active.criticism.results:Detection",
+        "Estimate": "sbi_active.criticism.results:Estimate",
+        "Evaluation": "sbi_active.criticism.results:Evaluation",
+        "Evidence": "sbi_active.criticism.results:Evidence",
+        "JointPrior": "sbi_active.criticism.effects:JointPrior",
+        "NextAction": "sbi_active.criticism.results:NextAction",
+        "Residuals": "sbi_active.criticism.results:Residuals",
+        "SevereTest": "sbi_active.criticism.results:SevereTest",
+        "Tracing": "sbi_active.criticism.results:Tracing",
+    },
+)

@@ -13,11 +13,11 @@ from sbi_active.information_gain import (
     InformationGainEstimator,
     ModelIndexGain,
     ParameterGain,
-    RivalPredictive,
     RivalSampler,
 )
 from sbi_active.information_gain.candidates import CandidateSampler
 from sbi_active.information_gain.estimators.automatic import find_estimator
+from sbi_active.information_gain.estimators.model_index import RivalPredictive
 
 __all__ = ["Target"]
 

@@ -1,23 +1,16 @@
-"""Inference of parameters from trials with actions."""
+"""Inference of parameters from trials with actions.
 
-from sbi_active.inference.beliefs.belief import (
-    Belief,
-    ChainedBelief,
-    information_gained,
-)
-from sbi_active.inference.beliefs.kernel_belief import KernelBelief
-from sbi_active.inference.models.action_likelihood import ActionLikelihood
-from sbi_active.inference.models.action_ratio import ActionRatio
+Here lives what goes from simulations and trials to beliefs; each package below says
+which part. Which action comes next lives in ``design``.
+"""
+
+from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.posterior import ActionPosterior
-from sbi_active.inference.networks.mixture_density import (
-    MixtureDensity,
-    MixtureDensityNetwork,
-)
+from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.ratio_network import RatioClassifier
-from sbi_active.inference.products.belief import ProductBelief
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
-from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.refinement.stages import refine
 from sbi_active.inference.rounds.condition import ActionEmbedding
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.alhi import ALHI
@@ -25,29 +18,36 @@ from sbi_active.inference.trainers.asbi import ASBI
 from sbi_active.inference.trainers.protocol import ActiveInference
 from sbi_active.inference.trainers.ratio import SeqBED_B, SeqBED_C
 from sbi_active.inference.trainers.seqbed import SeqBED
+from sbi_active.renamed import former_names
 
 __all__ = [
     "ALHI",
     "ASBI",
     "ActionEmbedding",
-    "ActionLikelihood",
     "ActionPosterior",
-    "ActionRatio",
     "ActiveInference",
     "Belief",
-    "ChainedBelief",
-    "KernelBelief",
     "LFIRE",
     "MixtureDensity",
-    "MixtureDensityNetwork",
     "Observation",
-    "ProductBelief",
     "RatioClassifier",
-    "RefinedBelief",
     "Refinement",
     "SeqBED",
     "SeqBED_B",
     "SeqBED_C",
-    "information_gained",
     "refine",
 ]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "ActionLikelihood": "sbi_active.inference.models:ActionLikelihood",
+        "ActionRatio": "sbi_active.inference.models:ActionRatio",
+        "ChainedBelief": "sbi_active.inference.beliefs:ChainedBelief",
+        "KernelBelief": "sbi_active.inference.beliefs:KernelBelief",
+        "MixtureDensityNetwork": "sbi_active.inference.networks:MixtureDensityNetwork",
+        "ProductBelief": "sbi_active.inference.products:ProductBelief",
+        "RefinedBelief": "sbi_active.inference.refinement:RefinedBelief",
+        "information_gained": "sbi_active.inference.beliefs:information_gained",
+    },
+)

@@ -1,4 +1,8 @@
-"""Estimators of the expected information gain, one a file."""
+"""Estimators of the expected information gain, one a file.
+
+Here lives what a trial of an action is worth, in nats. Which actions are compared lives
+in ``search`` and ``design``.
+"""
 
 from sbi_active.information_gain.base import (
     CandidateSimulations,
@@ -10,7 +14,6 @@ from sbi_active.information_gain.estimators.info_nce import InfoNCEGain
 from sbi_active.information_gain.estimators.likelihood import LikelihoodGain
 from sbi_active.information_gain.estimators.model_index import (
     ModelIndexGain,
-    RivalPredictive,
     RivalSampler,
 )
 from sbi_active.information_gain.estimators.nested import NestedGain
@@ -20,6 +23,7 @@ from sbi_active.information_gain.estimators.ratio import RatioGain
 from sbi_active.information_gain.estimators.variational_nested import (
     VariationalNestedGain,
 )
+from sbi_active.renamed import former_names
 
 __all__ = [
     "CandidateSimulations",
@@ -33,7 +37,14 @@ __all__ = [
     "ParameterGain",
     "PosteriorGain",
     "RatioGain",
-    "RivalPredictive",
     "RivalSampler",
     "VariationalNestedGain",
 ]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "RivalPredictive": "sbi_active.information_gain.estimators.model_index"
+        ":RivalPredictive",
+    },
+)

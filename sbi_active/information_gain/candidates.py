@@ -19,9 +19,9 @@ from sbi_active.simulation import (
     Outcome,
     Simulations,
     SimulatorModel,
-    require_noise,
     simulate,
 )
+from sbi_active.simulation.model import require_noise
 
 __all__ = ["CandidateSampler"]
 

@@ -1,10 +1,14 @@
-"""Searches of an action space, one a file."""
+"""Searches of an action space, one a file.
 
+Here lives how candidates are proposed for any objective. What the objective is lives in
+``information_gain``, who calls both in ``design``.
+"""
+
+from sbi_active.renamed import former_names
 from sbi_active.search.base import Evaluations, Objective, Search
 from sbi_active.search.bayesopt import BayesianOptimization
 from sbi_active.search.exhaustive import ExhaustiveSearch
 from sbi_active.search.gradient import GradientSearch
-from sbi_active.search.surrogate import Surrogate
 
 __all__ = [
     "BayesianOptimization",
@@ -13,5 +17,8 @@ __all__ = [
     "GradientSearch",
     "Objective",
     "Search",
-    "Surrogate",
 ]
+
+__getattr__ = former_names(
+    __name__, {"Surrogate": "sbi_active.search.surrogate:Surrogate"}
+)

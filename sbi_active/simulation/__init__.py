@@ -1,11 +1,18 @@
-"""Simulators, their noise, and the engine that runs them."""
+"""Simulators, their noise, and the engine that runs them.
 
-from sbi_active.simulation.bank import Bank, ReusedRows, reuse
+Here lives what turns parameters and an action into outcomes. What is learned from
+outcomes does not.
+"""
+
+from sbi_active.renamed import former_names
+from sbi_active.simulation.bank.bank import Bank
+from sbi_active.simulation.bank.reuse import reuse
 from sbi_active.simulation.check import check_simulator
-from sbi_active.simulation.model import Simulator, SimulatorModel, require_noise
+from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise
+from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.estimation import estimate_noise
-from sbi_active.simulation.noise.gaussian import GaussianNoise, NoiseModel
+from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.noise.student import StudentTNoise
 from sbi_active.simulation.noise.unknown import unknown_noise
 from sbi_active.simulation.outcomes import (
@@ -15,9 +22,7 @@ from sbi_active.simulation.outcomes import (
     SimulationInterrupted,
     Simulations,
 )
-from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.workers.engine import simulate
-from sbi_active.simulation.workers.store import RowStore
 
 __all__ = [
     "AutocorrelatedNoise",
@@ -26,19 +31,25 @@ __all__ = [
     "MissingRowsWarning",
     "NoiseModel",
     "Outcome",
-    "ReusedRows",
-    "RowStore",
     "SimulationError",
     "SimulationInterrupted",
     "Simulations",
-    "Simulator",
     "SimulatorModel",
-    "SimulatorReport",
     "StudentTNoise",
     "check_simulator",
     "estimate_noise",
-    "require_noise",
     "reuse",
     "simulate",
     "unknown_noise",
 ]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
+        "RowStore": "sbi_active.simulation.workers:RowStore",
+        "Simulator": "sbi_active.simulation.model:Simulator",
+        "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
+        "require_noise": "sbi_active.simulation.model:require_noise",
+    },
+)

@@ -8,8 +8,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.criticism import SevereTest, Trials, joint_prior
+from sbi_active.criticism import Trials, joint_prior
 from sbi_active.criticism.report import find_warnings, with_error
+from sbi_active.criticism.results import SevereTest
 from tests.criticism.reports import (
     DRAG,
     evaluation,

@@ -10,7 +10,8 @@ from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, Refinement
-from sbi_active.inference import KernelBelief, Observation
+from sbi_active.inference import Observation
+from sbi_active.inference.beliefs import KernelBelief
 from sbi_active.inference.products import Product, TrainedRegion, widened
 from sbi_active.inference.sampling import PriorCoordinates
 from tests.linear_gaussian import DIM, PRIOR, simulator

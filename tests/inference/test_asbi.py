@@ -12,8 +12,9 @@ from sbi.neural_nets.estimators import MixtureDensityEstimator
 from sbi.utils import BoxUniform, RestrictedPrior, get_density_thresholder
 from torch.distributions import Distribution
 
-from sbi_active import ASBI, ActionEmbedding, Belief, MixtureDensity
-from sbi_active.inference import ActionPosterior, MixtureDensityNetwork
+from sbi_active import ASBI, Belief, MixtureDensity
+from sbi_active.inference import ActionEmbedding, ActionPosterior
+from sbi_active.inference.networks import MixtureDensityNetwork
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 SMALL = MixtureDensity(hidden_features=(32, 32), num_components=2, num_iterations=600)

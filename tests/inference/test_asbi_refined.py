@@ -8,8 +8,8 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, Refinement
-from sbi_active.inference import ChainedBelief, Observation, refine
-from sbi_active.inference.beliefs import compare, compare_orders
+from sbi_active.inference import Observation, refine
+from sbi_active.inference.beliefs import ChainedBelief, compare, compare_orders
 from sbi_active.inference.trainers import asbi
 from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator

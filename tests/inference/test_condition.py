@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sbi_active import ActionEmbedding
+from sbi_active.inference import ActionEmbedding
 from sbi_active.inference.rounds import action_rows, outcome_rows, pack, unpack
 
 

@@ -1,7 +1,7 @@
 import torch
 
 from sbi_active.design.cells import cells
-from sbi_active.search import Surrogate
+from sbi_active.search.surrogate import Surrogate
 
 
 def smooth(point):
