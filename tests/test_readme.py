@@ -1,54 +1,108 @@
-"""The snippets of the README and the docs run as printed, a page in one namespace."""
+"""The snippets of the README and the docs run as printed, each on its own.
+
+A snippet whose first line is ``# name.py`` is a file, from which others may import.
+"""
 
 import re
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 ROOT = Path(__file__).parents[1]
+FILE = re.compile(r"# (\w+)\.py\n")
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore"),
+    pytest.mark.filterwarnings("error:sbi_active.* goes in the next version"),
+]
 
 
-def run(page: Path) -> dict:
-    namespace: dict = {}
-    for snippet in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
-        exec(compile(snippet, str(page), "exec"), namespace)
-    return namespace
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Return a function that runs a page, and returns the names of each snippet."""
+    monkeypatch.syspath_prepend(tmp_path)
+    before = {*sys.modules}
+
+    def page(name: str) -> list[SimpleNamespace]:
+        ran = []
+        text = (ROOT / name).read_text()
+        for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+            file = FILE.match(snippet)
+            if file is not None:
+                (tmp_path / f"{file.group(1)}.py").write_text(snippet)
+                ran.append(__import__(file.group(1)))
+            else:
+                names: dict = {}
+                exec(compile(snippet, name, "exec"), names)
+                ran.append(SimpleNamespace(**names))
+        return ran
+
+    yield page
+    for name in {*sys.modules} - before:
+        if name.startswith("my_"):
+            del sys.modules[name]
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_readme(capsys):
-    namespace = run(ROOT / "README.md")
+def test_readme(run, capsys):
+    campaign, style, loop = run("README.md")
     printed = capsys.readouterr().out
     assert "Design(action [3], EIG" in printed
     assert "theta[theta_1]" in printed
-    assert len(namespace["campaign"].history) == 3
-    assert namespace["report"].verdict == "bias"
+    assert len(campaign.campaign.history) == 3
+    assert len(style.inference.trials) == 2
+    assert loop.report.verdict == "bias"
     assert "Verdict: bias (P" in printed
     assert "P holds among the\ndeclared effects alone" in printed
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_simulations(capsys):
-    namespace = run(ROOT / "docs" / "simulations.md")
+def test_simulations(run, capsys):
+    bank = run("docs/simulations.md")[-1]
     printed = capsys.readouterr().out
     assert "tensor([0.1274, 0.5097, 1.1468])" in printed
     assert "{'ok': 3, 'invalid': 0, 'missing': 0}" in printed
     # A quarter of the prior's rows lie in the narrower box, all with the same weight.
-    assert 80 < namespace["reused"].effective_sample_size < 170
+    assert 80 < bank.reused.effective_sample_size < 170
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_closing_the_loop(capsys):
-    namespace = run(ROOT / "docs" / "closing_the_loop.md")
+@pytest.mark.slow
+def test_methods(run, capsys):
+    alhi, corrections = run("docs/methods.md")
+    # One trial of action 1 with a noise of .1: x, and so the mean, is within .4 of .5.
+    assert (alhi.belief.mean - 0.5).abs() < 0.4
+    assert "trial 2" in capsys.readouterr().out
+    history = corrections.campaign.history
+    assert [trial.status for trial in history] == ["ok", "withdrawn", "ok"]
+    assert history[2].x == pytest.approx(0.42)
+
+
+def test_closing_the_loop(run, capsys):
+    _, bare, _, drag, campaign = run("docs/closing_the_loop.md")
     printed = capsys.readouterr().out
+    assert bare.report.verdict == "unexplained"
     assert printed.startswith("unexplained\nVerdict: drag (P ")
-    table = namespace["report"].before_after.set_index("metric")
+    table = drag.report.before_after.set_index("metric")
     # Four numbers with a noise of 5 mm: the standard error of their RMSE is 1.8 mm.
     assert table.loc["rmse", "after"] < 0.005 + 4 * 0.0018
     assert table.loc["rmse", "ratio"] < 0.5
-    assert namespace["page"].exists()
+    assert drag.page.exists()
     assert printed.splitlines()[-2:] == ["alarm", "('drag',)"]
     truth = torch.tensor([0.4, 0.3])
-    belief = namespace["campaign"].belief
+    belief = campaign.campaign.belief
     assert ((belief.mean - truth).abs() < 4 * belief.variance.sqrt()).all()
+
+
+def test_no_page_is_forgotten():
+    pages = {
+        page.name
+        for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+        if "```python" in page.read_text()
+    }
+    assert pages == {
+        "README.md",
+        "simulations.md",
+        "methods.md",
+        "closing_the_loop.md",
+    }
