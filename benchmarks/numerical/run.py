@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active import Campaign, CampaignOptions, Refinement
 from sbi_active.campaign import Trial
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task

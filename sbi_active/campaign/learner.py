@@ -24,12 +24,12 @@ from sbi_active.campaign.checks.unexplained import (
 from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
 from sbi_active.campaign.methods import find_method
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.belief import (
     information_gained,
     require_support,
     require_width,
 )
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed, forked_generators

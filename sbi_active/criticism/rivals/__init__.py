@@ -4,7 +4,7 @@ Here live its coordinates, outcomes and errors. What compares rivals lives in
 ``evidence``.
 """
 
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid, log_sum_exp
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
@@ -24,5 +24,4 @@ __all__ = [
     "UNKNOWN_RATES",
     "declared_noise",
     "log_outcomes",
-    "log_sum_exp",
 ]
