@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.inference.sampling.weights import log_sum_exp, systematic
+from sbi_active.inference.sampling.student_mixture import StudentMixture
+from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["ImportanceSample", "TMixture", "importance_sample", "lower_factors"]
+__all__ = ["ImportanceSample", "importance_sample", "lower_factors"]
 
 Array = NDArray[Any]
 
-DEGREES_OF_FREEDOM = 5
 #: Particles a round, rounds at most, and the effective number that ends them.
 ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 100.0
 #: Effective particles that suffice for an evidence far behind another.
@@ -32,51 +31,6 @@ DEFENSIVE, OVERALL = 0.5, 0.3
 INFLATION = 1.5
 #: Smallest variance of a covariance, as a share of the largest.
 SINGULAR = 1e-12
-
-
-@dataclass(frozen=True)
-class TMixture:
-    """Mixture of multivariate t distributions.
-
-    Attributes:
-        means: Shape (k, dim).
-        factors: Lower Cholesky factors of the scale matrices, shape (k, dim, dim).
-        weights: Sum to 1, shape (k,); None has equal ones.
-    """
-
-    means: Array
-    factors: Array
-    weights: Array | None = None
-
-    def sample(self, num: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (num, dim)."""
-        which = self.components(num)
-        normal = rng.normal(size=(num, self.means.shape[1]))
-        nu = DEGREES_OF_FREEDOM
-        t = normal / np.sqrt(rng.chisquare(nu, size=(num, 1)) / nu)
-        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], t)
-
-    def components(self, num: int) -> NDArray[np.int64]:
-        """Return the component of each draw, in proportion to the weights, (num,)."""
-        if self.weights is None:
-            return np.arange(num) % len(self.means)
-        return systematic(self.weights, num, 0.5)
-
-    def log_prob(self, u: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        return log_sum_exp(self.log_parts(u), axis=0)
-
-    def log_parts(self, u: Array) -> Array:
-        """Return log of weight times density of each component, shape (k, n)."""
-        nu, dim, k = DEGREES_OF_FREEDOM, u.shape[1], len(self.means)
-        norm = gammaln(0.5 * (nu + dim)) - gammaln(0.5 * nu)
-        norm -= 0.5 * dim * np.log(nu * np.pi)
-        weights = np.full(k, 1 / k) if self.weights is None else self.weights
-        apart = (u - self.means[:, None]).transpose(0, 2, 1)
-        y = np.linalg.solve(self.factors, apart)
-        log_det = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
-        tail = 0.5 * (nu + dim) * np.log1p((y**2).sum(1) / nu)
-        return norm + (np.log(weights) - log_det)[:, None] - tail
 
 
 @dataclass(frozen=True)
@@ -123,10 +77,10 @@ def lower_factors(cov: Array) -> Array:
 
 def importance_sample(
     rival: Rival,
-    proposal: TMixture,
+    proposal: StudentMixture,
     *,
     rng: np.random.Generator,
-    local: Callable[[ImportanceSample, int], TMixture] | None = None,
+    local: Callable[[ImportanceSample, int], StudentMixture] | None = None,
     looks: Container[int] = LOOKS,
     missed: float = MISSED,
     enough: float = ENOUGH,
@@ -155,7 +109,7 @@ def importance_sample(
         Cappe et al., Statistics and Computing 18 (2008); Cornuet et al., Scandinavian
         Journal of Statistics 39 (2012).
     """
-    proposals: list[TMixture] = []
+    proposals: list[StudentMixture] = []
     particles, targets = np.empty((0, proposal.means.shape[1])), np.empty(0)
     log_q = np.empty(0)  # of each particle, summed over the proposals so far
     basis = proposal
@@ -196,7 +150,7 @@ def _weighted(u: Array, target: Array, log_q: Array) -> ImportanceSample:
     return ImportanceSample(u, weights, float(total - np.log(n)), error, effective)
 
 
-def _adapted(sample: ImportanceSample, proposal: TMixture) -> TMixture:
+def _adapted(sample: ImportanceSample, proposal: StudentMixture) -> StudentMixture:
     """Return the proposal with the weights that its components' particles deserve."""
     parts = proposal.log_parts(sample.u)
     share = np.exp(parts - log_sum_exp(parts, axis=0))
@@ -213,4 +167,4 @@ def _adapted(sample: ImportanceSample, proposal: TMixture) -> TMixture:
         means = np.concatenate([means, mean[None]])
         factors = np.concatenate([factors, lower_factors(cov)[None]])
         weights = np.append((1 - OVERALL) * weights, OVERALL)
-    return TMixture(means, factors, weights)
+    return StudentMixture(means, factors, weights)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.importance import INFLATION, TMixture, lower_factors
+from sbi_active.criticism.evidence.importance import INFLATION, lower_factors
 from sbi_active.criticism.rivals.error_models import Whitener
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.seeding import derive_seed
 
 __all__ = [
@@ -90,7 +91,7 @@ class Modes:
     """
 
     u: Array
-    proposal: TMixture
+    proposal: StudentMixture
     whiten: Whitener
 
 
@@ -153,7 +154,7 @@ def find_modes(
         means.append(own)
         factors.append(_factors(rival, own, other, step, 1.0))
     wide = np.concatenate(factors) * np.sqrt(search.widened)
-    proposal = TMixture(np.concatenate(means), wide)
+    proposal = StudentMixture(np.concatenate(means), wide)
     return Modes(at, proposal, whiten)
 
 
@@ -164,7 +165,7 @@ def along_ridges(
     step: float,
     rng: np.random.Generator,
     points: Array | None = None,
-) -> TMixture:
+) -> StudentMixture:
     """Return narrow t distributions along what the data leave open.
 
     A parameter that an effect can imitate leaves a curved ridge, on which a t
@@ -193,12 +194,14 @@ def along_ridges(
     known = np.linalg.svd(jac[0] / np.sqrt(_floor(rival)), compute_uv=False) > 1
     num_open = max(int(rival.searched.sum() - known.sum()), 1)
     width = min(RANGE * NUM_POINTS ** (-1 / num_open), 1.0)
-    return TMixture(u, _factors(rival, u, modes.whiten, step, width))
+    return StudentMixture(u, _factors(rival, u, modes.whiten, step, width))
 
 
-def local_proposal(rival: Rival, u: Array, whiten: Whitener, step: float) -> TMixture:
+def local_proposal(
+    rival: Rival, u: Array, whiten: Whitener, step: float
+) -> StudentMixture:
     """Return t distributions at points, shape (k, dim), as narrow as the data say."""
-    return TMixture(u, _factors(rival, u, whiten, step, 1.0))
+    return StudentMixture(u, _factors(rival, u, whiten, step, 1.0))
 
 
 def _floor(rival: Rival) -> Array:

@@ -13,20 +13,20 @@ from sbi_active.criticism.evidence.importance import (
     LOOKS,
     MISSED,
     ImportanceSample,
-    TMixture,
     lower_factors,
 )
 from sbi_active.criticism.evidence.jumps import quadratic
 from sbi_active.criticism.evidence.least_squares import Modes, along_ridges
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.bandwidth import scott
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size, log_sum_exp
 
 __all__ = ["ridges", "regressions"]
 
 Array = NDArray[Any]
-Local = Callable[[ImportanceSample, int], TMixture]
+Local = Callable[[ImportanceSample, int], StudentMixture]
 
 #: Points of a sample near which the shape of a posterior is looked for again.
 NUM_AGAIN = 48
@@ -48,7 +48,7 @@ def ridges(rival: Rival, modes: Modes, step: float, rng: np.random.Generator) ->
         rng: Source of the points.
     """
 
-    def local(sample: ImportanceSample, number: int) -> TMixture:
+    def local(sample: ImportanceSample, number: int) -> StudentMixture:
         points = None
         if number > 0:
             points = np.unique(sample.draws(NUM_AGAIN, rng), axis=0)
@@ -67,7 +67,7 @@ def regressions(
     """
     along = ridges(rival, modes, step, rng)
 
-    def local(sample: ImportanceSample, number: int) -> TMixture:
+    def local(sample: ImportanceSample, number: int) -> StudentMixture:
         bends = number == LOOKS[-1] and sample.effective_sample_size < MISSED
         found = None if bends else _by_regression(rival, sample, rng)
         return along(sample, number) if found is None else found
@@ -77,7 +77,7 @@ def regressions(
 
 def _by_regression(
     rival: Rival, sample: ImportanceSample, rng: np.random.Generator
-) -> TMixture | None:
+) -> StudentMixture | None:
     """Return a proposal from a quadratic regression of the residuals.
 
     Derivatives of a simulator that jumps, of which a search makes its proposal, are
@@ -116,7 +116,7 @@ def _by_regression(
         log_p[has] += POWER * rival.error.log_likelihood(quadratic(z[has]) @ fit)
         return log_p
 
-    proposal = TMixture(mean[None], lower_factors(cov)[None])
+    proposal = StudentMixture(mean[None], lower_factors(cov)[None])
     for _ in range(NUM_ADAPTED):
         draws = proposal.sample(NUM_DRAWS, rng)
         log_w = log_posterior(draws) - proposal.log_prob(draws)
@@ -129,7 +129,7 @@ def _by_regression(
         width = scott(NUM_COMPONENTS, dim)
         kernel = lower_factors(width**2 * cov + 1e-12 * np.eye(dim))
         means = draws[rng.choice(len(draws), NUM_COMPONENTS, p=w)]
-        proposal = TMixture(means, np.repeat(kernel[None], NUM_COMPONENTS, 0))
+        proposal = StudentMixture(means, np.repeat(kernel[None], NUM_COMPONENTS, 0))
     return proposal
 
 

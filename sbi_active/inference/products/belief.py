@@ -13,10 +13,10 @@ from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import (
     GaussianMixture,
-    Proposal,
     StudentProposal,
     population_monte_carlo,
 )
+from sbi_active.inference.sampling.student_mixture import Proposal
 
 __all__ = ["ProductBelief", "sample_product"]
 

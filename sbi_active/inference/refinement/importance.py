@@ -34,7 +34,7 @@ from scipy.special import logsumexp
 from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
-from sbi_active.inference.sampling.population import Proposal
+from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 

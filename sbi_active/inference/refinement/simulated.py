@@ -25,7 +25,7 @@ from sbi_active.inference.refinement.trust import EDGE, RARE
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import Proposal
+from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 

@@ -45,10 +45,10 @@ from sbi_active.inference.regression.surrogate import Surrogate
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import (
-    Proposal,
     StudentProposal,
     population_monte_carlo,
 )
+from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning

@@ -7,15 +7,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
-from sbi_active.inference.sampling.population import Proposal
+from sbi_active.inference.sampling.student_mixture import (
+    Defended,
+    Proposal,
+    StudentMixture,
+    log_student,
+    student_steps,
+)
 
 __all__ = ["EitherProposal", "KernelProposal"]
 
 Array = NDArray[Any]
 
-FREEDOM = 5.0  # of the Student kernels
 NUM_KERNELS = 120
 NEIGHBORS = 0.1  # share of the draws that shape one kernel
 WIDTH = 1.2  # of a kernel, in deviations of its neighbors
@@ -23,26 +28,37 @@ SHARE_OF_BASE = 0.05
 BLOCK = 2_000
 
 
-@dataclass(frozen=True)
-class KernelProposal:
+class KernelMixture(StudentMixture):
+    """Many Student kernels of equal weight."""
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        which = rng.integers(len(self.means), size=num_samples)
+        steps = student_steps(num_samples, self.means.shape[1], rng)
+        return self.moved(which, steps)
+
+    def log_prob(self, z: Array) -> Array:
+        blocks = [self._log_kernels(z[i : i + BLOCK]) for i in range(0, len(z), BLOCK)]
+        return np.concatenate([np.zeros(0), *blocks])
+
+    def _log_kernels(self, z: Array) -> Array:
+        inverse = np.linalg.inv(self.factors)
+        center = (inverse @ self.means[..., None])[..., 0]
+        step = np.tensordot(z, inverse, (1, 2)) - center  # (n, k, d)
+        log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
+        each = log_student((step**2).sum(-1), log_volume, z.shape[1])
+        return np.asarray(logsumexp(each, axis=1)) - np.log(len(self.means))
+
+
+class KernelProposal(Defended):
     r"""Student kernels at draws, each shaped as the draws around it, and a base.
 
     .. math::
         g(z) = (1 - \epsilon) \frac1k \sum_j t_\nu(z; z_j, w^2 S_j)
         + \epsilon\, g_0(z)
 
-    Attributes:
-        location: :math:`z_j`, shape (k, d).
-        factor: Lower Cholesky factors of :math:`w^2 S_j`, shape (k, d, d).
-        base: :math:`g_0`.
-
     References:
         Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012.
     """
-
-    location: Array
-    factor: Array
-    base: Proposal
 
     @staticmethod
     def around(
@@ -63,39 +79,8 @@ class KernelProposal:
         # Draws that repeat may be too few for a covariance.
         covariance = local + 0.003 * overall
         factor = WIDTH * np.linalg.cholesky(covariance)
-        return KernelProposal(location, factor, base)
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        d = self.location.shape[1]
-        num_base = rng.binomial(num_samples, SHARE_OF_BASE)
-        num = num_samples - num_base
-        kernel = rng.integers(len(self.location), size=num)
-        scale = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (num, 1)))
-        step = scale * rng.standard_normal((num, d))
-        z = self.location[kernel] + np.einsum("nij,nj->ni", self.factor[kernel], step)
-        return np.concatenate([z, self.base.sample(num_base, rng)])
-
-    def log_prob(self, z: Array) -> Array:
-        blocks = [self._log_kernels(z[i : i + BLOCK]) for i in range(0, len(z), BLOCK)]
-        return np.logaddexp(
-            np.log1p(-SHARE_OF_BASE) + np.concatenate([np.zeros(0), *blocks]),
-            np.log(SHARE_OF_BASE) + self.base.log_prob(z),
-        )
-
-    def _log_kernels(self, z: Array) -> Array:
-        d = z.shape[1]
-        inverse = np.linalg.inv(self.factor)
-        center = (inverse @ self.location[..., None])[..., 0]
-        step = np.tensordot(z, inverse, (1, 2)) - center  # (n, k, d)
-        constant = (
-            gammaln(0.5 * (FREEDOM + d))
-            - gammaln(0.5 * FREEDOM)
-            - 0.5 * d * np.log(np.pi * FREEDOM)
-        )
-        log_volume = np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum(1)
-        tail = 0.5 * (FREEDOM + d) * np.log1p((step**2).sum(-1) / FREEDOM)
-        total = logsumexp(constant - log_volume - tail, axis=1)
-        return np.asarray(total) - np.log(len(self.location))
+        kernels = KernelMixture(location, factor)
+        return KernelProposal(kernels, base, SHARE_OF_BASE)
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
+from sbi_active.inference.sampling.student_mixture import (
+    Defended,
+    Proposal,
+    log_student,
+    student_steps,
+)
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.inference.sampling.weights import (
@@ -21,32 +27,18 @@ from sbi_active.inference.sampling.weights import (
 __all__ = [
     "GaussianMixture",
     "Particles",
-    "Proposal",
     "StudentProposal",
     "population_monte_carlo",
 ]
 
 Array = NDArray[Any]
 
-FREEDOM = 5.0  # of the Student components: tails above any Gaussian's
-INFLATION = 1.4  # of their covariance
+INFLATION = 1.4  # of the covariance of Student components
 SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
 SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
 FITTED = 8  # of them for each number in a covariance
-
-
-class Proposal(Protocol):
-    """A density that can be sampled."""
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, d)."""
-        ...
-
-    def log_prob(self, z: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -163,7 +155,48 @@ class GaussianMixture:
         return joint.argmax(1)
 
 
-class StudentProposal:
+@dataclass(frozen=True)
+class WidenedMixture:
+    """Student components over fitted Gaussian ones, none of them of little weight.
+
+    Attributes:
+        mixture: The Gaussian components.
+        unbounding: Where they were fitted; None is in z itself.
+    """
+
+    mixture: GaussianMixture
+    unbounding: Unbounding | None = None
+
+    @property
+    def weight(self) -> Array:
+        """Of the components, shape (k,)."""
+        k = len(self.mixture.log_weight)
+        return 0.8 * np.exp(self.mixture.log_weight) + 0.2 / k
+
+    @property
+    def factor(self) -> Array:
+        """Lower Cholesky factors, shape (k, d, d)."""
+        return INFLATION**0.5 * self.mixture.factor
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        mean = self.mixture.mean
+        count = rng.multinomial(num_samples, self.weight)
+        steps = student_steps(num_samples, mean.shape[1], rng)
+        parts = np.split(steps, np.cumsum(count)[:-1])
+        triples = zip(mean, self.factor, parts, strict=True)
+        drawn = np.concatenate([m + part @ factor.T for m, factor, part in triples])
+        return drawn if self.unbounding is None else self.unbounding.from_line(drawn)
+
+    def log_prob(self, z: Array) -> Array:
+        y = z if self.unbounding is None else self.unbounding.to_line(z)
+        square, log_volume = _mahalanobis(y, self.mixture.mean, self.factor)
+        each = log_student(square, log_volume, z.shape[1]) + np.log(self.weight)
+        density = np.asarray(logsumexp(each, axis=1))
+        slope = 0.0 if self.unbounding is None else self.unbounding.log_slope(y)
+        return density + slope
+
+
+class StudentProposal(Defended):
     """Student mixture over fitted Gaussian components, with a share of a base.
 
     Args:
@@ -178,11 +211,7 @@ class StudentProposal:
         base: Proposal,
         unbounding: Unbounding | None = None,
     ) -> None:
-        self.base, self._unbounding = base, unbounding
-        k = len(mixture.log_weight)
-        self._weight = 0.8 * np.exp(mixture.log_weight) + 0.2 / k
-        self._mean = mixture.mean
-        self._factor = INFLATION**0.5 * mixture.factor
+        super().__init__(WidenedMixture(mixture, unbounding), base, SHARE_OF_BASE)
 
     @staticmethod
     def fit(
@@ -196,45 +225,6 @@ class StudentProposal:
         places = points if unbounding is None else unbounding.to_line(points)
         mixture = GaussianMixture.fit(places, num_components, rng)
         return StudentProposal(mixture, base, unbounding)
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        d = self._mean.shape[1]
-        num_base = rng.binomial(num_samples, SHARE_OF_BASE)
-        count = rng.multinomial(num_samples - num_base, self._weight)
-        scale = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (num_samples - num_base, 1)))
-        normal = scale * rng.standard_normal((num_samples - num_base, d))
-        pieces = [
-            mean + part @ factor.T
-            for mean, factor, part in zip(
-                self._mean,
-                self._factor,
-                np.split(normal, np.cumsum(count)[:-1]),
-                strict=True,
-            )
-        ]
-        drawn = np.concatenate(pieces)
-        if self._unbounding is not None:
-            drawn = self._unbounding.from_line(drawn)
-        return np.concatenate([drawn, self.base.sample(num_base, rng)])
-
-    def log_prob(self, z: Array) -> Array:
-        d = z.shape[1]
-        y = z if self._unbounding is None else self._unbounding.to_line(z)
-        constant = (
-            gammaln(0.5 * (FREEDOM + d))
-            - gammaln(0.5 * FREEDOM)
-            - 0.5 * d * np.log(np.pi * FREEDOM)
-        )
-        square, log_volume = _mahalanobis(y, self._mean, self._factor)
-        student = constant - log_volume
-        student = student - 0.5 * (FREEDOM + d) * np.log1p(square / FREEDOM)
-        student = logsumexp(student + np.log(self._weight), axis=1)
-        if self._unbounding is not None:
-            student = student + self._unbounding.log_slope(y)
-        return np.logaddexp(
-            np.log1p(-SHARE_OF_BASE) + student,
-            np.log(SHARE_OF_BASE) + self.base.log_prob(z),
-        )
 
 
 def population_monte_carlo(

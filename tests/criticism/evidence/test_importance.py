@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from sbi_active.criticism.evidence.importance import (
-    TMixture,
     importance_sample,
     lower_factors,
 )
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 from tests.criticism.evidence.linear import exact, linear_rival
 
 
-def start(width: float) -> TMixture:
-    return TMixture(np.zeros((1, 2)), width * np.eye(2)[None])
+def start(width: float) -> StudentMixture:
+    return StudentMixture(np.zeros((1, 2)), width * np.eye(2)[None])
 
 
 @pytest.mark.parametrize("width", [0.3, 1.0])

@@ -1,0 +1,79 @@
+"""Student-t mixtures against SciPy's density and closed-form moments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_t
+
+from sbi_active.inference.sampling.kernels import KernelMixture
+from sbi_active.inference.sampling.population import GaussianMixture, WidenedMixture
+from sbi_active.inference.sampling.student_mixture import (
+    Defended,
+    StudentMixture,
+    student_steps,
+)
+
+MEANS = np.array([[-3.0, 0.0], [3.0, 1.0]])
+FACTORS = np.array([[[1.0, 0.0], [0.8, 0.5]], [[0.3, 0.0], [-0.1, 0.2]]])
+WEIGHTS = np.array([0.25, 0.75])
+Z = np.random.default_rng(0).normal(size=(2_500, 2)) * 3
+
+
+def density(weights: np.ndarray, inflation: float = 1.0) -> np.ndarray:
+    """Return SciPy's density at Z."""
+    triples = zip(weights, MEANS, FACTORS, strict=True)
+    return sum(
+        w * multivariate_t(m, inflation * f @ f.T, df=5).pdf(Z) for w, m, f in triples
+    )
+
+
+def test_the_density_is_scipy_s():
+    mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
+    assert mixture.log_prob(Z) == pytest.approx(np.log(density(WEIGHTS)))
+    even = StudentMixture(MEANS, FACTORS)
+    assert even.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
+
+
+def test_kernels_have_the_density_of_a_mixture_of_equal_weights():
+    kernels = KernelMixture(MEANS, FACTORS)
+    assert kernels.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
+    assert kernels.log_prob(Z[:0]).shape == (0,)
+
+
+def test_a_widened_mixture_keeps_a_weight_for_every_component():
+    gaussian = GaussianMixture(np.log([0.999, 0.001]), MEANS, FACTORS, 0.0)
+    expected = density(0.8 * np.array([0.999, 0.001]) + 0.1, inflation=1.4)
+    assert WidenedMixture(gaussian).log_prob(Z) == pytest.approx(np.log(expected))
+
+
+def test_steps_have_the_covariance_of_five_degrees_of_freedom():
+    steps = student_steps(400_000, 2, np.random.default_rng(0))
+    assert np.cov(steps.T) == pytest.approx(5 / 3 * np.eye(2), abs=0.03)
+
+
+@pytest.mark.parametrize("kind", [StudentMixture, KernelMixture])
+def test_draws_have_the_moments_of_the_mixture(kind):
+    draws = kind(MEANS, FACTORS).sample(400_000, np.random.default_rng(1))
+    assert draws.mean(0) == pytest.approx(MEANS.mean(0), abs=0.02)
+    within = 5 / 3 * (FACTORS @ np.swapaxes(FACTORS, 1, 2)).mean(0)
+    between = np.outer(*[(MEANS[1] - MEANS[0]) / 2] * 2)
+    assert np.cov(draws.T) == pytest.approx(within + between, abs=0.05)
+
+
+def test_components_are_drawn_as_often_as_their_weights_say():
+    mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
+    assert np.bincount(mixture.components(200)).tolist() == [50, 150]
+    even = StudentMixture(MEANS, FACTORS)
+    assert even.components(3).tolist() == [0, 1, 0]
+
+
+def test_a_defended_proposal_mixes_densities_and_draws():
+    near, far = StudentMixture(MEANS[:1], FACTORS[:1]), KernelMixture(MEANS, FACTORS)
+    defended = Defended(near, far, share=0.3)
+    expected = 0.7 * np.exp(near.log_prob(Z)) + 0.3 * np.exp(far.log_prob(Z))
+    assert defended.log_prob(Z) == pytest.approx(np.log(expected))
+    draws = defended.sample(20_000, np.random.default_rng(0))
+    assert len(draws) == 20_000
+    # Of the far kernels' draws half lie at the second mean.
+    assert (draws[:, 0] > 1.5).mean() == pytest.approx(0.15, abs=0.01)
