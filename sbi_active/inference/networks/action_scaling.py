@@ -141,7 +141,6 @@ def fit_location_and_scale(
     y: Tensor,
     test: Tensor,
     *,
-    log_scale: Tensor | None = None,
     num_iterations: int = NUM_ITERATIONS,
 ) -> tuple[Tensor, Tensor]:
     r"""Regress location and scale of y by iterated weighted least squares.
@@ -152,7 +151,8 @@ def fit_location_and_scale(
         \hat\gamma = \arg\min_\gamma \sum_n (\log |y_n - F_n \hat\beta| + c
         - G_n \gamma)^2,
 
-    the second of which gives the weights of the next first. Both use the leading
+    the second of which gives the weights of the next first; the distance of y from its
+    median gives the first ones. Both use the leading
     columns of their design that predict the held-out rows best.
 
     Args:
@@ -162,21 +162,17 @@ def fit_location_and_scale(
         noise_sizes: Alike for G.
         y: Shape (n, m).
         test: Mask of held-out rows, shape (n,).
-        log_scale: First guess of log sigma, shape (n, m); None regresses it on the
-            distance of y from its median.
         num_iterations: Of the pair.
 
     Returns:
         beta, shape (p, m), and gamma, shape (q, m).
     """
-    beta, gamma = y.new_zeros(0), y.new_zeros(0)
+    beta = y.new_zeros(0)
     floor = SMALLEST_SCALE * y.std(0, correction=0).clamp_min(1e-30)
     ones = torch.zeros_like(y)
-    if log_scale is None:
-        gamma = _fit_log_scale(
-            noise_design, noise_sizes, y - y.median(0).values, floor, test
-        )
-        log_scale = noise_design @ gamma
+    around_median = y - y.median(0).values
+    gamma = _fit_log_scale(noise_design, noise_sizes, around_median, floor, test)
+    log_scale = noise_design @ gamma
     for _ in range(num_iterations):
         beta = _least_squares(design, sizes, y, log_scale, test)
         residual = y - design @ beta

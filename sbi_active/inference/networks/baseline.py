@@ -70,9 +70,8 @@ class Baseline(Response):
         action: Tensor,
         *,
         kind: Literal["linear", "curved"],
-        log_scale: Tensor | None = None,
     ) -> None:
-        super().__init__(u, y, action, kind=kind, log_scale=log_scale)
+        super().__init__(u, y, action, kind=kind)
         test = held_out(len(u))
         self.register_buffer("centers", u[~test][:NUM_CENTERS].clone())
 

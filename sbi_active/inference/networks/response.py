@@ -42,8 +42,6 @@ class Response(nn.Module):
         y: Finite outcomes, of scale one over all actions, shape (n, m).
         action: Shape (n, action_dim).
         kind: Whether f is linear in u.
-        log_scale: First guess of the logarithm of the noise's scale, shape (n, m); None
-            regresses it.
     """
 
     beta: Tensor
@@ -59,7 +57,6 @@ class Response(nn.Module):
         action: Tensor,
         *,
         kind: Literal["linear", "curved"],
-        log_scale: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.kind = kind
@@ -86,7 +83,6 @@ class Response(nn.Module):
             sizes[:degrees],
             y,
             test,
-            log_scale=log_scale,
             num_iterations=3,
         )
         # Between rows that lie apart a polynomial may dive to any depth.
