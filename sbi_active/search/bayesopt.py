@@ -8,9 +8,14 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from sbi_active.search.base import Evaluations, Objective
+from sbi_active.search.base import Evaluations
 from sbi_active.search.cube import Coordinates
-from sbi_active.search.sequential import SequentialSearch, permitted_points, spaced
+from sbi_active.search.sequential import (
+    Progress,
+    SequentialSearch,
+    permitted_points,
+    spaced,
+)
 from sbi_active.seeding import derive_seed, forked_generators
 
 __all__ = ["BayesianOptimization"]
@@ -50,18 +55,12 @@ class BayesianOptimization(SequentialSearch):
                 "pip install sbi-active[botorch], or use search='gradient'"
             ) from error
 
-    def _propose(
-        self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
-        num: int,
-        index: int,
-    ) -> Tensor:
+    def _propose(self, progress: Progress, num: int, index: int) -> Tensor:
         from botorch.acquisition.logei import qLogNoisyExpectedImprovement
         from botorch.optim import optimize_acqf_mixed
         from botorch.sampling.normal import SobolQMCNormalSampler
 
+        objective, coordinates, found = progress
         seed = derive_seed(objective.seed, "bayesopt", index)
         model = _model(coordinates, found)
         sampler = SobolQMCNormalSampler(torch.Size([DRAWS]), seed=seed % 2**31)
@@ -86,13 +85,8 @@ class BayesianOptimization(SequentialSearch):
         action = coordinates.actions(point.detach())
         return action[objective.permitted(action)]
 
-    def _best(
-        self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
-        num: int,
-    ) -> Tensor:
+    def _best(self, progress: Progress, num: int) -> Tensor:
+        objective, coordinates, found = progress
         point = torch.cat(
             [
                 permitted_points(objective, coordinates, 2_048, "finalists"),

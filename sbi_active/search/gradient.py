@@ -7,9 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sbi_active.search.base import Evaluations, Objective
-from sbi_active.search.cube import Coordinates
 from sbi_active.search.sequential import (
+    Progress,
     SequentialSearch,
     permitted_points,
     spaced,
@@ -73,16 +72,10 @@ class GradientSearch(SequentialSearch):
             )
         self.num_starts = num_starts
 
-    def _propose(
-        self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
-        num: int,
-        index: int,
-    ) -> Tensor:
-        score, regression = _score(objective, coordinates, found, OPTIMISM)
-        point = self._ascend(objective, coordinates, found, score, f"round {index}")
+    def _propose(self, progress: Progress, num: int, index: int) -> Tensor:
+        coordinates = progress.coordinates
+        score, regression = _score(progress, OPTIMISM)
+        point = self._ascend(progress, score, f"round {index}")
         with torch.no_grad():
             covariance = regression.covariance(point)
             best = _batch(
@@ -90,15 +83,10 @@ class GradientSearch(SequentialSearch):
             )
         return coordinates.actions(point[best])
 
-    def _best(
-        self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
-        num: int,
-    ) -> Tensor:
-        score, _ = _score(objective, coordinates, found, 0.0)
-        point = self._ascend(objective, coordinates, found, score, "finalists")
+    def _best(self, progress: Progress, num: int) -> Tensor:
+        coordinates = progress.coordinates
+        score, _ = _score(progress, 0.0)
+        point = self._ascend(progress, score, "finalists")
         with torch.no_grad():
             height = score(point)
         c = coordinates.num_continuous
@@ -107,13 +95,12 @@ class GradientSearch(SequentialSearch):
 
     def _ascend(
         self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
+        progress: Progress,
         score: Callable[[Tensor], Tensor],
         key: str,
     ) -> Tensor:
         """Return permitted points, where ascents started and ended, (s, dim)."""
+        objective, coordinates, found = progress
         start = permitted_points(objective, coordinates, self.num_starts, key)
         known = coordinates.points(found.action)
         start = torch.cat([start, known[objective.permitted(found.action)]])
@@ -169,12 +156,10 @@ def ascend(
 
 
 def _score(
-    objective: Objective,
-    coordinates: Coordinates,
-    found: Evaluations,
-    optimism: float,
+    progress: Progress, optimism: float
 ) -> tuple[Callable[[Tensor], Tensor], Surrogate]:
     """Return what to ascend, and the regression of the utility in it."""
+    objective, coordinates, found = progress
     point = coordinates.points(found.action)
     c = coordinates.num_continuous
     utility = Surrogate(point, found.utility, found.standard_error, num_continuous=c)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,13 +13,27 @@ from sbi_active.search.base import Evaluations, Objective, Search
 from sbi_active.search.cube import Coordinates
 from sbi_active.seeding import derive_seed
 
-__all__ = ["SequentialSearch"]
+__all__ = ["Progress", "SequentialSearch"]
 
 FEWEST = 8  # evaluations
 #: Candidates' worth of simulations for each degree of freedom (an entry of a box, a
 #: category after the first), and for none.
 EACH = 4
 MANY = 32  # draws for a permitted point
+
+
+class Progress(NamedTuple):
+    """What a search knows so far.
+
+    Attributes:
+        objective: What it maximizes.
+        coordinates: Of the actions.
+        found: Evaluations that are numbers.
+    """
+
+    objective: Objective
+    coordinates: Coordinates
+    found: Evaluations
 
 
 class SequentialSearch(Search):
@@ -75,31 +90,20 @@ class SequentialSearch(Search):
             if num == 0:
                 continue
             left -= num
-            action = self._propose(objective, coordinates, found.known(), num, r)
+            progress = Progress(objective, coordinates, found.known())
+            action = self._propose(progress, num, r)
             if len(action) == 0:
                 break
             found = found.join(objective.evaluate(action))
-        return self._best(objective, coordinates, found.known(), self.num_finalists)
+        progress = Progress(objective, coordinates, found.known())
+        return self._best(progress, self.num_finalists)
 
     @abstractmethod
-    def _propose(
-        self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
-        num: int,
-        index: int,
-    ) -> Tensor:
+    def _propose(self, progress: Progress, num: int, index: int) -> Tensor:
         """Return the actions of a round, shape (num, action_dim)."""
 
     @abstractmethod
-    def _best(
-        self,
-        objective: Objective,
-        coordinates: Coordinates,
-        found: Evaluations,
-        num: int,
-    ) -> Tensor:
+    def _best(self, progress: Progress, num: int) -> Tensor:
         """Return the finalists, shape (at most num, action_dim)."""
 
 
