@@ -112,16 +112,26 @@ class MixtureDensity:
         Returns:
             A network on rows standardized number by number, as in sbi.
         """
-        return MixtureDensityNetwork(self, theta, x)
+        return self.build(theta, x, None)
 
     def build(
-        self, theta: Tensor, condition: Tensor, action_dim: int
+        self, theta: Tensor, condition: Tensor, action_dim: int | None
     ) -> MixtureDensityNetwork:
         """Build the network, knowing which numbers of the condition are the action.
 
         Args:
             theta: Shape (n, theta_dim).
             condition: Packed (x, action), shape (n, x_dim + action_dim).
-            action_dim: Numbers in an action.
+            action_dim: Numbers in an action; None leaves them unknown.
         """
-        return MixtureDensityNetwork(self, theta, condition, action_dim)
+        return MixtureDensityNetwork(
+            theta,
+            condition,
+            action_dim,
+            scaling=self.scaling,
+            whiten=self.whiten,
+            baseline=self.baseline,
+            hidden_features=self.hidden_features,
+            num_components=self.num_components,
+            embedding_net=self.embedding_net,
+        )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
@@ -11,9 +12,6 @@ from torch import Tensor, nn
 
 from sbi_active.inference.networks.baseline import Frames, local
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
-
-if TYPE_CHECKING:
-    from sbi_active.inference.networks.mixture_density import MixtureDensity
 
 __all__ = ["MixtureDensityNetwork", "PreparedLoss"]
 
@@ -47,11 +45,17 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         |U_{j(k)}(c)|\, \mathcal{N}(v_{j(k)}; \mu_k(c), (R_k^\top R_k)^{-1}).
 
     Args:
-        settings: Layers and components.
         theta: Training parameters, shape (n, theta_dim).
         condition: Training conditions, shape (n, condition_dim).
         action_dim: Numbers of the action at the end of a condition; None leaves them
-            unknown.
+            unknown, and the next three arguments without effect.
+        scaling: As in :class:`.MixtureDensity`, with all that follow.
+        whiten: Of theta.
+        baseline: Gaussian posterior that the network corrects.
+        hidden_features: Width of each hidden layer.
+        num_components: Gaussian components K.
+        embedding_net: Of the condition, which is then scaled over all rows, without a
+            baseline.
     """
 
     condition_mean: Tensor
@@ -62,12 +66,18 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
 
     def __init__(
         self,
-        settings: MixtureDensity,
         theta: Tensor,
         condition: Tensor,
         action_dim: int | None = None,
+        *,
+        scaling: Literal["action", "global"] = "action",
+        whiten: bool = True,
+        baseline: Literal["best", "none", "linear", "curved"] = "best",
+        hidden_features: Sequence[int] = (128, 128),
+        num_components: int = 5,
+        embedding_net: nn.Module | None = None,
     ) -> None:
-        dim, num = theta.shape[1], settings.num_components
+        dim, num = theta.shape[1], num_components
         missing = ~condition.isfinite()
         # Columns that go missing together need one mask between them.
         masks, columns = missing.unique(dim=1, return_inverse=True)
@@ -75,8 +85,20 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         masked = [column for column in masked if bool(missing[:, column].any())]
         ever_missing, largest_gap = missing.any(0), int(missing.sum(1).max())
 
-        conditioning = _conditioning(settings, theta, condition, action_dim)
-        embedding = settings.embedding_net or nn.Identity()
+        if embedding_net is not None:
+            scaling, baseline = "global", "none"
+        conditioning = None
+        plain = (scaling, whiten, baseline) == ("global", False, "none")
+        if action_dim is not None and not plain:
+            conditioning = Conditioning(
+                theta,
+                condition,
+                action_dim,
+                scaling=scaling,
+                whiten=whiten,
+                baseline=baseline,
+            )
+        embedding = embedding_net or nn.Identity()
         with torch.no_grad():
             if conditioning is None:
                 seen = torch.zeros(2, condition.shape[1])
@@ -84,7 +106,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
                 seen = conditioning(condition[:2])[0].float()
             width = embedding(seen).shape[1] + len(masked)
         layers: list[nn.Module] = []
-        for hidden in settings.hidden_features:
+        for hidden in hidden_features:
             layers += [nn.Linear(width, hidden), nn.ReLU()]
             width = hidden
         last = nn.Linear(width, num * (1 + 2 * dim + dim * dim))
@@ -289,25 +311,6 @@ class PreparedLoss(nn.Module):
         v, log_det = input[:, :-frames], input[:, -frames:]
         v = v.reshape(len(v), frames, -1)
         return -self.network._log_local_density(v, log_det, condition)
-
-
-def _conditioning(
-    settings: MixtureDensity, theta: Tensor, condition: Tensor, action_dim: int | None
-) -> Conditioning | None:
-    embeds = settings.embedding_net is not None
-    scaling = "global" if embeds else settings.scaling
-    baseline = "none" if embeds else settings.baseline
-    plain = (scaling, settings.whiten, baseline) == ("global", False, "none")
-    if action_dim is None or plain:
-        return None
-    return Conditioning(
-        theta,
-        condition,
-        action_dim,
-        scaling=scaling,
-        whiten=settings.whiten,
-        baseline=baseline,
-    )
 
 
 def _frame_of_components(num_components: int, num_frames: int) -> list[int]:
