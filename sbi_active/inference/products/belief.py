@@ -18,18 +18,10 @@ from sbi_active.inference.sampling.population import (
 )
 from sbi_active.inference.sampling.student_mixture import Proposal
 
-__all__ = ["ProductBelief", "sample_product"]
+__all__ = ["sample_product"]
 
-
-class ProductBelief(RefinedBelief):
-    r"""The posterior of all trials under a learned likelihood or ratio.
-
-    .. math::
-        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k q(x_k | \theta, \xi_k)
-        + \epsilon\, p(\theta)
-    """
-
-    label = "product over trials"
+#: Effective draws below which the normalizer is off by more than a tenth of a nat.
+ENOUGH = 100.0
 
 
 def sample_product(
@@ -40,8 +32,12 @@ def sample_product(
     *,
     num_particles: int,
     defensive: float,
-) -> ProductBelief:
-    """Return the belief of a product, by annealed importance sampling.
+) -> RefinedBelief:
+    r"""Return the belief of a product, by annealed importance sampling.
+
+    .. math::
+        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k q(x_k | \theta, \xi_k)
+        + \epsilon\, p(\theta)
 
     Args:
         prior: The original prior.
@@ -60,7 +56,8 @@ def sample_product(
     particles, num_steps = population_monte_carlo(
         product.log_joint, base, rng, num_particles=num_particles
     )
-    belief = ProductBelief(prior, product, particles, defensive=defensive)
+    belief = RefinedBelief(prior, product, particles, defensive=defensive)
+    belief.label = "product over trials"
     effective = particles.effective_sample_size
     belief.diagnostics = Diagnostics().extended(
         effective_sample_size=effective,
@@ -73,7 +70,3 @@ def sample_product(
             f"the belief rests on {effective:.0f} effective draws; raise num_particles"
         )
     return belief
-
-
-#: Effective draws below which the normalizer is off by more than a tenth of a nat.
-ENOUGH = 100.0

@@ -10,10 +10,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.products.belief import ProductBelief
 from sbi_active.inference.products.product import Product
 
-__all__ = ["MARKOV_CHAINS", "ChainBelief"]
+__all__ = ["MARKOV_CHAINS", "MarkovChainBelief"]
 
 #: sbi's names of its samplers; those that end on "_pymc" need sbi's extra "pymc".
 MARKOV_CHAINS = (
@@ -24,7 +23,7 @@ NUM_WARMUP = 50  # that begin in the posterior already; Pyro's adapt to it meanw
 NUM_CHAINS = 20  # of a vectorized sampler
 
 
-class ChainBelief(Belief):
+class MarkovChainBelief(Belief):
     r"""The product of a learned likelihood over trials, its draws by Markov chains.
 
     The chains start at draws of the importance sample that normalizes ``log_prob``, so
@@ -37,7 +36,7 @@ class ChainBelief(Belief):
         method: A name of sbi's, for example "nuts_pyro".
     """
 
-    def __init__(self, product: ProductBelief, factors: Product, method: str) -> None:
+    def __init__(self, product: Belief, factors: Product, method: str) -> None:
         super().__init__(product.prior)
         if method not in MARKOV_CHAINS:
             raise ValueError(

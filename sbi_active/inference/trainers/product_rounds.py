@@ -18,7 +18,7 @@ from sbi_active.inference.beliefs.belief import Belief, require_support
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
 from sbi_active.inference.models.action_factor import ActionFactor
 from sbi_active.inference.products.belief import sample_product
-from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, ChainBelief
+from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, MarkovChainBelief
 from sbi_active.inference.products.product import (
     Product,
     TrainedRegion,
@@ -310,7 +310,7 @@ class ProductRounds(ActionRounds):
                 draws = belief.sample(torch.Size([NUM_KERNELS]))
             sampled = KernelBelief(prior, draws, bandwidth=self._bandwidth)
         elif self._sampler in MARKOV_CHAINS:
-            sampled = ChainBelief(belief, product, self._sampler)
+            sampled = MarkovChainBelief(belief, product, self._sampler)
         num_lost = len(trials[-1:] if chained else trials) - len(counted)
         if num_lost:
             sampled.diagnostics = sampled.diagnostics.warned(
