@@ -15,7 +15,7 @@ from sbi_active.inference.rounds.condition import ActionEmbedding
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.alhi import ALHI
 from sbi_active.inference.trainers.asbi import ASBI
-from sbi_active.inference.trainers.protocol import ActiveInference
+from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.inference.trainers.ratio import SeqBED_B, SeqBED_C
 from sbi_active.inference.trainers.seqbed import SeqBED
 from sbi_active.renamed import former_names

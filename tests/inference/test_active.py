@@ -1,6 +1,8 @@
-"""One protocol for everything that learns."""
+"""What everything that learns has in common."""
 
 import inspect
+import pickle
+import warnings
 
 import pytest
 import torch
@@ -13,20 +15,29 @@ from sbi_active.inference.rounds import SilentTracker
 
 PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))
 TRAINERS = [ASBI, ALHI, SeqBED, SeqBED_B, SeqBED_C]
-METHODS = [
-    *["arrange", "append_simulations", "train", "build_posterior", "update"],
-    "update_all",
-]
+SHARED = ["arrange", "update", "update_all"]
+
+
+class Shape:
+    """What a campaign calls, which most trainers have from sbi."""
+
+    def append_simulations(self, theta, x, *, action=None, belief=None): ...
+
+    def train(self): ...
+
+    def build_posterior(self): ...
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_every_trainer_meets_the_protocol(trainer):
+def test_every_trainer_takes_what_a_campaign_passes(trainer):
     inference = trainer(PRIOR, show_progress_bars=False)
     assert isinstance(inference, ActiveInference)
     assert inference.belief is PRIOR
     assert inference.trials == []
-    for name in METHODS:
-        wanted = inspect.signature(getattr(ActiveInference, name)).parameters
+    for name in SHARED:
+        assert name == "arrange" or name not in vars(trainer)
+    for name in ("append_simulations", "train", "build_posterior"):
+        wanted = inspect.signature(getattr(Shape, name)).parameters
         given = inspect.signature(getattr(trainer, name)).parameters
         for parameter in wanted.values():
             assert given[parameter.name].kind is parameter.kind, (name, parameter)
@@ -35,13 +46,60 @@ def test_every_trainer_meets_the_protocol(trainer):
         assert all(p.default is not p.empty for p in others), name
 
 
-def test_an_object_without_update_does_not_meet_it():
-    class Half:
-        trials = []
-        belief = PRIOR
-        append_simulations = train = build_posterior = update_all = arrange = None
+def test_what_lacks_the_step_of_a_method_cannot_be_made():
+    class Half(ActiveInference):
+        pass
 
-    assert not isinstance(Half(), ActiveInference)
+    with pytest.raises(TypeError, match="_infer"):
+        Half()
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_belief_of_no_trials_is_an_error(trainer):
+    with pytest.raises(ValueError, match="expected at least one trial; got none"):
+        trainer(PRIOR).update_all([], simulator=torch.add)
+
+
+def simulator(theta, action):
+    return theta * action + 0.1 * torch.randn_like(theta)
+
+
+def round_of(inference):
+    """Return a trainer after a round, small as it is."""
+    torch.manual_seed(0)
+    theta, action = PRIOR.sample((400,)), torch.ones(400, 1)
+    theta, action = inference.arrange(theta, action)
+    inference.append_simulations(theta, simulator(theta, action), action=action)
+    if isinstance(inference, SeqBED):
+        inference.train(seed=0)
+    else:
+        inference.train(max_num_epochs=2)
+    return inference
+
+
+@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
+@pytest.mark.parametrize(
+    ("trainer", "estimator"),
+    [
+        *[(ASBI, None), (ASBI, "maf"), (ALHI, None), (ALHI, "maf")],
+        *[(SeqBED_C, None), (SeqBED_B, "mlp"), (SeqBED, None)],
+    ],
+)
+def test_a_pickled_trainer_goes_on(trainer, estimator):
+    whole = round_of(trainer(PRIOR, estimator, show_progress_bars=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # sbi's, of what its own trainers lose
+        copy = pickle.loads(pickle.dumps(whole))
+    x_o, action = torch.tensor([0.3]), torch.ones(1)
+    beliefs = []
+    for inference in (whole, copy):
+        torch.manual_seed(1)
+        inference.update(x_o, action=action, seed=0)
+        round_of(inference)  # a network built anew
+        beliefs.append(inference.update(x_o, action=action, seed=1))
+    theta = torch.linspace(-0.9, 0.9, 7)[:, None]
+    ours, theirs = (belief.log_prob(theta) for belief in beliefs)
+    assert torch.equal(ours, theirs)
 
 
 PARENTS = {ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED_C: NRE_C}
@@ -63,6 +121,7 @@ def test_hooks_of_sbi_have_the_signatures_we_override(trainer):
     for name in (
         *["_run_training_loop", "_initialize_neural_network", "_get_start_index"],
         *["_default_tracker", "_report_convergence_at_end", "_summarize"],
+        *["_create_posterior", "_resolve_estimator"],
     ):
         theirs = [*inspect.signature(getattr(parent, name)).parameters]
         assert [*inspect.signature(getattr(trainer, name)).parameters] == theirs

@@ -24,6 +24,12 @@ HOOKS = {
     "_summarize": ["self", "round_"],
     "_describe_round": ["round_", "summary"],
     "get_simulations": ["self", "starting_round"],
+    "_resolve_prior": ["self", "prior", "sample_with"],
+    "_resolve_estimator": ["self", "estimator"],
+    "_create_posterior": [
+        *["self", "estimator", "prior", "sample_with", "device"],
+        "posterior_parameters",
+    ],
 }
 STATE = [
     *["_theta_roundwise", "_x_roundwise", "_prior_masks", "_proposal_roundwise"],

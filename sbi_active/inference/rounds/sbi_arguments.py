@@ -1,64 +1,74 @@
-"""Arguments of sbi's ``train``, and what they mean in a round with actions."""
+"""Arguments of sbi's methods, and what they mean in a round with actions."""
 
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
 
-from sbi.inference import NPE_C
+__all__ = ["NEVER", "given_arguments", "require_likelihood_loss", "takes"]
 
-from sbi_active.inference.networks.mixture_density import MixtureDensity
+P = ParamSpec("P")
+R = TypeVar("R")
 
-__all__ = ["NPE_DEFAULTS", "action_arguments", "given_arguments"]
-
-NPE_DEFAULTS = {
-    name: parameter.default
-    for name, parameter in inspect.signature(NPE_C.train).parameters.items()
-    if parameter.default is not inspect.Parameter.empty
-}
-_NONE_IS_THE_DEFAULT = (
-    *("num_atoms", "training_batch_size", "learning_rate", "validation_fraction"),
-    *("stop_after_epochs", "max_num_epochs"),
-)
+#: As many epochs as sbi's own default allows.
+NEVER = 2**31 - 1
+#: Of NPE_C: they choose between losses of several rounds.
 _NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
 
 
-def given_arguments(values: dict[str, Any]) -> dict[str, Any]:
-    """Return those of a call's values that are arguments of sbi's and were given."""
+def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
+    """Give a method of ours the signature of sbi's, which is then written once.
+
+    Args:
+        theirs: A method of one of sbi's trainers.
+    """
+
+    def decorate(ours: Callable[..., Any]) -> Callable[P, R]:
+        ours.__signature__ = inspect.signature(theirs)  # pyright: ignore
+        return ours
+
+    return decorate
+
+
+def given_arguments(
+    method: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return by name the arguments that a call of sbi's ``train`` was given.
+
+    None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
+
+    Args:
+        method: sbi's, bound.
+        args: By position.
+        kwargs: By name.
+    """
+    given = inspect.signature(method).bind(*args, **kwargs).arguments
     return {
         name: value
-        for name, value in values.items()
-        if name in NPE_DEFAULTS and not (value is None and name in _NONE_IS_THE_DEFAULT)
+        for name, value in given.items()
+        if value is not None or name == "clip_max_norm"
     }
 
 
-def action_arguments(
-    given: dict[str, Any], settings: MixtureDensity | None
+def require_likelihood_loss(
+    method: Callable[..., Any], given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the arguments of a round with actions, for the parent of ``NPE_C``.
+    """Return the arguments without those of the losses of several rounds.
 
     Args:
+        method: ``NPE_C.train``.
         given: By the caller.
-        settings: Their defaults; None is sbi's.
 
     Raises:
-        ValueError: If an argument has no meaning in a round with actions.
+        ValueError: If one of these was given another value than its default.
     """
-    arguments = {**NPE_DEFAULTS, **given}
+    parameters = inspect.signature(method).parameters
     for name in _NO_MEANING_WITH_ACTION:
-        if arguments[name] != NPE_DEFAULTS[name]:
+        default = parameters[name].default
+        if given.get(name, default) != default:
             raise ValueError(
                 f"expected {name} to be left out in a round with actions, which is "
-                f"trained by maximum likelihood; got {arguments[name]}; do drop it"
+                f"trained by maximum likelihood; got {given[name]}; do drop it"
             )
-    if settings is not None:
-        defaults = {
-            "training_batch_size": settings.batch_size,
-            "learning_rate": settings.learning_rate,
-        }
-        arguments = {**arguments, **defaults, **given}
-    for name in ("num_atoms", "use_combined_loss"):
-        del arguments[name]
-    arguments["force_first_round_loss"] = True
-    arguments["retrain_from_scratch"] = not arguments["resume_training"]
-    return arguments
+    return {n: v for n, v in given.items() if n not in _NO_MEANING_WITH_ACTION}

@@ -9,10 +9,10 @@ from sbi_active.inference.sampling.population import (
     GaussianMixture,
     Particles,
     StudentProposal,
-    normalized,
     population_monte_carlo,
 )
 from sbi_active.inference.sampling.unbounding import Unbounding
+from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
 __all__ = [
     "EitherProposal",
@@ -22,6 +22,7 @@ __all__ = [
     "PriorCoordinates",
     "StudentProposal",
     "Unbounding",
+    "log_sum_exp",
     "normalized",
     "population_monte_carlo",
 ]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import Any, ClassVar
 
-import torch
-from sbi.inference.trainers._contracts import StartIndexContext, TrainConfig
+from sbi.inference.trainers._contracts import StartIndexContext
 from sbi.sbi_types import Tracker
 from sbi.utils.sbiutils import mask_sims_from_prior
 from torch import Tensor
@@ -13,83 +15,164 @@ from torch.distributions import Distribution
 from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import require_support
-from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.training import TrainingBudget, TrainingRecord
-from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
-from sbi_active.inference.rounds.rows import (
-    Observation,
-    RoundRows,
-    check_proposal,
-    round_rows,
-)
+from sbi_active.inference.rounds.condition import pack
+from sbi_active.inference.rounds.rows import RoundRows, check_proposal, round_rows
+from sbi_active.inference.rounds.sbi_arguments import given_arguments
 from sbi_active.inference.rounds.tracking import SilentTracker
+from sbi_active.inference.trainers.base import ActiveInference
+from sbi_active.threads import single_thread
 
 __all__ = ["ActionRounds"]
 
 
-class ActionRounds:
+class ActionRounds(ActiveInference):
     r"""Rows by round of the belief they were drawn from, and the trials in between.
 
-    To be mixed in before a trainer of sbi's. A round is that of Algorithm 1: this
-    round's rows, a network built anew, plain maximum likelihood.
+    To be mixed in before a trainer of sbi's, whose private hooks it overrides
+    (``tests/inference/test_sbi_hooks.py`` lists them). Without actions that trainer
+    does what it always does. A round with them is that of Algorithm 1: this round's
+    rows, a network built anew, plain maximum likelihood.
 
     Args:
-        kwargs: Of sbi's trainer.
-
-    Attributes:
-        trials: Real trials, each of which ended a round.
+        prior: The prior over parameters. Rounds with actions need one with a support.
+        estimator: What is trained: a name or a builder of sbi's, or this library's
+            settings. None is sbi's default without actions and the default settings
+            with them.
+        device: Of the network, for example "cpu" or "cuda".
+        logging_level: As in sbi.
+        summary_writer: As in sbi (deprecated there).
+        tracker: As in sbi; None tracks nothing, so that no folder appears.
+        show_progress_bars: Whether sbi's training loop shows its epochs.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331.
     """
 
+    #: This library's settings, the default where actions are given.
+    _settings: ClassVar[type]
+    #: sbi's default, and what makes a builder of a name of sbi's.
+    _sbi_default: ClassVar[str]
+    _sbi_builder: ClassVar[Callable[..., Any]]
+
     # Of sbi's trainers.
-    _prior: Distribution | None
     _device: str
     _round: int
+    _neural_net: Any
     _theta_roundwise: list[Tensor]
     _x_roundwise: list[Tensor]
     _prior_masks: list[Tensor]
     _data_round_index: list[int]
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self._belief: Distribution | None = None
-        self._round_belief: Distribution | None = None
-        self._action_dim: int | None = None
-        self._outcome_shape: torch.Size | None = None
+    def __init__(
+        self,
+        prior: Distribution | None,
+        estimator: Any,
+        device: str,
+        logging_level: int | str,
+        summary_writer: Any,
+        tracker: Tracker | None,
+        show_progress_bars: bool,
+    ) -> None:
+        ours = isinstance(estimator, self._settings)
+        sbi_takes = estimator is not None and (callable(estimator) or not ours)
+        sbi_trainer: Any = super()
+        sbi_trainer.__init__(
+            prior,
+            estimator if sbi_takes else self._sbi_default,
+            device,
+            logging_level,
+            summary_writer,
+            tracker,
+            show_progress_bars,
+        )
+        # A name stays one: the builder that sbi makes of it cannot be pickled.
+        self._action_estimator = self._settings() if estimator is None else estimator
         self._trained_round: int | None = None
-        self._epoch_limit: int | None = None
-        self._patience: int | None = None
-        self.trials: list[Observation] = []
-
-    @property
-    def belief(self) -> Distribution | None:
-        """The current belief over parameters; the prior before any trial."""
-        return self._prior if self._belief is None else self._belief
+        self.trials = []
 
     @property
     def has_actions(self) -> bool:
         """Whether the rounds so far have actions."""
         return self._action_dim is not None
 
-    def arrange(self, theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rows to simulate in a round: the draws as they are.
-
-        Args:
-            theta: Draws from the belief, shape (n, theta_dim).
-            action: Draws from the action space, shape (n, action_dim).
-        """
-        return theta, action
-
     @property
-    def _keeps_invalid(self) -> bool:
-        """Whether the estimator of a round takes outcomes without a measurement."""
-        return False
+    def _has_settings(self) -> bool:
+        """Whether rounds with actions train a network of this library."""
+        return isinstance(self._action_estimator, self._settings)
+
+    @abstractmethod
+    def _network(self, theta: Tensor, x: Tensor) -> Any:
+        """Return this library's network for rows as sbi's trainer sees them."""
+
+    @abstractmethod
+    def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return arguments of sbi's ``train`` by the settings, before those given."""
 
     def _stored(self, rows: RoundRows) -> tuple[Tensor, Tensor]:
         """Return the parameters and outcomes that sbi's trainer sees."""
         return rows.theta, pack(rows.x, rows.action)
+
+    def train(self, *args: Any, **kwargs: Any) -> Any:
+        """Train the estimator, with the arguments of sbi's own ``train``.
+
+        What is not given is sbi's default, with actions what the settings say. With
+        actions the network is built anew at each call, unless ``resume_training``.
+
+        Returns:
+            The trained estimator; with actions its condition is packed.
+
+        Raises:
+            RuntimeError: If there are no simulations.
+            ValueError: If training is to be resumed on other rows than it began with.
+        """
+        sbi_trainer: Any = super()
+        given = given_arguments(sbi_trainer.train, args, kwargs)
+        if not self.has_actions:
+            return sbi_trainer.train(**given)
+        resume = given.get("resume_training", False)
+        if resume and self._trained_round != max(self._data_round_index):
+            raise ValueError(
+                "expected resume_training after train() on the same rows; got rows "
+                "appended since; do train() without resume_training"
+            )
+        defaults = self._training_defaults(given) if self._has_settings else {}
+        arguments = {**defaults, **given, "retrain_from_scratch": not resume}
+        with single_thread() if self._has_settings else nullcontext():
+            network = self._train_round(**arguments)
+        self._trained_round = self._round
+        return network
+
+    def _train_round(self, **arguments: Any) -> Any:
+        """Train on a round with actions."""
+        sbi_trainer: Any = super()
+        return sbi_trainer.train(**arguments)
+
+    def _initialize_neural_network(
+        self, retrain_from_scratch: bool, start_idx: int
+    ) -> None:
+        if self.has_actions:
+            self._build_neural_net = self._build_action_network
+        sbi_trainer: Any = super()
+        sbi_trainer._initialize_neural_network(retrain_from_scratch, start_idx)
+
+    def _build_action_network(self, theta: Tensor, x: Tensor) -> Any:
+        if self._has_settings:
+            return self._network(theta, x)
+        build: Any = self._action_estimator
+        if isinstance(build, str):
+            build = type(self)._sbi_builder(model=build)
+        return build(theta, x)
+
+    def _resolve_estimator(self, estimator: Any) -> Any:
+        """Return the estimator of a posterior and its device, sbi's hook."""
+        if estimator is None and self.has_actions:
+            self._require_trained()
+        sbi_trainer: Any = super()
+        return sbi_trainer._resolve_estimator(estimator)
+
+    def forget_round(self) -> None:
+        """Have the next update do without this round's network."""
+        self._trained_round = None
 
     def _is_round(self, action: Tensor | None, belief: Distribution | None) -> bool:
         """Return whether rows have actions, or raise where they must and do not."""
@@ -135,7 +218,7 @@ class ActionRounds:
             x_shape=self._outcome_shape,
             action_dim=self._action_dim,
             exclude_invalid=(
-                not self._keeps_invalid
+                not self._has_settings
                 if exclude_invalid_x is None
                 else exclude_invalid_x
             ),
@@ -177,61 +260,6 @@ class ActionRounds:
                 "the last update() or append_simulations(); do append simulations of "
                 "the belief with action= and train() first"
             )
-
-    def _training_budget(
-        self, settings: MixtureDensity, train_config: TrainConfig, num_rows: int
-    ) -> TrainingBudget:
-        """Return the budget of this library's own training on so many rows."""
-        num_iterations = settings.num_iterations
-        if self._epoch_limit is not None:
-            steps = max(num_rows // train_config.training_batch_size, 1)
-            num_iterations = min(num_iterations, steps * self._epoch_limit)
-        return TrainingBudget(
-            num_iterations=num_iterations,
-            batch_size=train_config.training_batch_size,
-            clip_max_norm=train_config.clip_max_norm,
-            anneal=settings.anneal,
-            patience=self._patience,
-        )
-
-    def _summarize_training(
-        self, record: TrainingRecord, train_config: TrainConfig
-    ) -> None:
-        """Write what sbi's own training loop would write."""
-        trainer: Any = self
-        trainer._best_val_loss = best = min(record.validation_loss)
-        summary = trainer._summary
-        summary["training_loss"] += record.training_loss
-        summary["validation_loss"] += record.validation_loss
-        summary["epoch_durations_sec"] += record.seconds
-        summary["epochs_trained"].append(len(record.seconds))
-        summary["best_validation_loss"].append(best)
-        trainer._summarize(round_=self._round)
-        if train_config.show_train_summary:
-            print(trainer._describe_round(self._round, summary))
-
-    def _require_same_rows(self, resume_training: bool) -> None:
-        if resume_training and self._trained_round != max(self._data_round_index):
-            raise ValueError(
-                "expected resume_training after train() on the same rows; got rows "
-                "appended since; do train() without resume_training"
-            )
-
-    def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
-        """Return the checked trial."""
-        x = torch.as_tensor(x_o)
-        shape = self._outcome_shape
-        if shape is None:  # no simulations yet: the first trial says
-            shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
-        rows = outcome_rows(x, shape)
-        if len(rows) != 1:
-            raise ValueError(
-                f"expected one outcome; got {len(rows)} rows; do update with one trial "
-                "at a time"
-            )
-        return Observation(
-            action_rows(action, self._action_dim, num_rows=1)[0], rows[0]
-        )
 
     def _default_tracker(self) -> Tracker:
         return SilentTracker()

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from typing import Any
 
 import torch
-from sbi.neural_nets.estimators.base import (
-    ConditionalDensityEstimator,
-)
+from sbi.inference import NPE_C
+from sbi.inference.trainers._contracts import TrainConfig
+from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
+from sbi.neural_nets import posterior_nn
+from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
+from sbi.sbi_types import Tracker
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import (
     Belief,
@@ -22,12 +25,24 @@ from sbi_active.inference.beliefs.belief import (
     require_support,
 )
 from sbi_active.inference.beliefs.comparison import compare
-from sbi_active.inference.networks.mixture_density import MixtureDensityNetwork
+from sbi_active.inference.models.posterior import ActionPosterior
+from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
+from sbi_active.inference.networks.training import (
+    TrainingRecord,
+    train_mixture_density,
+)
 from sbi_active.inference.refinement.learned_belief import RefinedBelief
-from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference.refinement.stages import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_npe import ActionNPE
+from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
+from sbi_active.inference.trainers.base import Told
+from sbi_active.inference.trainers.mixture_rounds import (
+    DensityEstimator,
+    MixtureRounds,
+    training_budget,
+)
 from sbi_active.seeding import forked_generators, kept_generators
 
 __all__ = ["ASBI"]
@@ -35,7 +50,7 @@ __all__ = ["ASBI"]
 NUM_PROBES = 64  # draws of the prior, at one of which a network has a finite density
 
 
-class ASBI(ActionNPE):
+class ASBI(MixtureRounds, NPE_C):
     r"""Active simulation-based inference, Algorithm 1 of Kim & Matsubara (2025).
 
     Without ``action=`` it is sbi's :class:`~sbi.inference.NPE_C`, to the last bit at
@@ -45,9 +60,24 @@ class ASBI(ActionNPE):
     likelihood,
 
     .. math::
-        \min_\phi - \sum_n \log q_\phi(\theta_n | x_n, \xi_n) \qquad \text{(Eq. 9)},
+        \min_\phi - \sum_n \log q_\phi(\theta_n | x_n, \xi_n) \qquad \text{(Eq. 9)}.
 
-    whose value at the observed trial is the next belief.
+    ``build_posterior`` then gives an :class:`.ActionPosterior`, whose prior is the
+    belief of the round unless another is passed.
+
+    ``update`` without a simulator is Step 3 of the paper, the network's value at the
+    trial: :math:`b(\theta) = q(\theta | x_o, \xi^*)` within the prior's support, a
+    "chained approximation". With one, the belief is "refined": the posterior of all
+    trials so far given the original prior, from simulations where it is plausible
+    (:func:`.refine`). That needs no network; where one was trained in this round,
+    ``belief.diagnostics`` compares the two.
+
+    NaN in x_o is information, as it is in the simulations: "no measurement" where it is
+    NaN throughout, else a number that was not observed. Where no simulation of this
+    round lacked those numbers, the network has never seen such an outcome and what it
+    would say is arbitrary. Without a simulator the belief then stays "unchanged", with
+    a warning: that the outcome is rare all over the belief says nothing about where it
+    is less rare, so there is no reason to widen it either.
 
     Args:
         prior: The prior over parameters. Rounds with actions need one with a support.
@@ -78,82 +108,164 @@ class ASBI(ActionNPE):
         torch.Size([3, 1])
     """
 
-    def update(
+    _sbi_builder = staticmethod(posterior_nn)
+    _fused = True
+
+    def __init__(
         self,
-        x_o: Tensor,
+        prior: Distribution | None = None,
+        density_estimator: DensityEstimator | None = None,
+        device: str = "cpu",
+        logging_level: int | str = "WARNING",
+        summary_writer: Any = None,
+        tracker: Tracker | None = None,
+        show_progress_bars: bool = True,
+    ) -> None:
+        super().__init__(
+            *(prior, density_estimator, device, logging_level),
+            *(summary_writer, tracker, show_progress_bars),
+        )
+
+    def append_simulations(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        proposal: Any = None,
+        exclude_invalid_x: bool | None = None,
+        data_device: str | None = None,
         *,
-        action: Tensor,
-        simulator: Callable[..., Any] | None = None,
-        refinement: Refinement | None = None,
-        seed: int | None = None,
-    ) -> Belief:
-        r"""Return the belief after a real trial, and make it the current one.
+        action: Tensor | None = None,
+        belief: Distribution | None = None,
+    ) -> Self:
+        r"""Store simulations for training.
 
-        Without a simulator this is Step 3 of the paper, the network's value at the
-        trial: :math:`b(\theta) = q(\theta | x_o, \xi^*)` within the prior's support.
-        With one, the belief is refined: the posterior of all trials so far given the
-        original prior, from simulations where it is plausible
-        (:func:`.refine`). That needs no network; where one
-        was trained in this round, ``belief.diagnostics`` compares the two.
-
-        NaN in x_o is information, as it is in the simulations: "no measurement" where
-        it is NaN throughout, else a number that was not observed. Where no simulation
-        of this round lacked those numbers, the network has never seen such an outcome
-        and what it would say is arbitrary. Without a simulator the belief then stays
-        as it is, with a warning: that the outcome is rare all over the belief says
-        nothing about where it is less rare, so there is no reason to widen it either.
+        Without ``action`` this is sbi's method. With it, the rows belong to the round
+        of ``belief``; the same belief appended again continues that round.
 
         Args:
-            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN where there
-                was no measurement.
-            action: The executed action, shape (action_dim,) or (1, action_dim); it need
-                not be one of the actions that were asked for.
-            simulator: ``simulator(theta, action)`` to refine with.
-            refinement: Settings of the refinement; None is ``Refinement()``.
-            seed: Of the refinement; None draws one from torch's global generator.
+            theta: Parameters, shape (n, theta_dim), drawn from the belief.
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
+            proposal: Without actions as in sbi. With them, None, the belief itself or
+                sbi's ``RestrictedPrior`` of it.
+            exclude_invalid_x: With actions, None keeps rows with NaN as information
+                for :class:`MixtureDensity`, and drops them for sbi's networks, which
+                cannot take them, with a warning. True drops them: information gain is
+                then biased towards actions that fail, since what failures tell about
+                theta is lost and what is left is all success.
+            data_device: Where to keep the rows.
+            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            belief: The distribution of theta in this round; None is the current one.
 
         Returns:
-            The belief, labelled "refined", "chained approximation" or "unchanged".
+            The trainer, so that calls chain.
 
         Raises:
-            RuntimeError: If there is no simulator and no network was trained since the
-                belief last changed.
-            ValueError: If shapes do not fit.
+            ValueError: If rounds with and without action mix, shapes do not fit, theta
+                leaves the prior's support, or no row is valid.
         """
-        trial = self._observation(x_o, action)
-        with nullcontext() if seed is None else kept_generators():
-            chained = self._chained(trial, required=simulator is None)
-        if simulator is None:
-            assert chained is not None
-            belief: Belief = chained
-        else:
-            trials = [*self.trials, trial]
-            belief = self._refined(trials, simulator, chained, refinement, seed)
-        self.trials.append(trial)
-        self._belief, self._trained_round = belief, None
-        return belief
-
-    def update_all(
-        self,
-        trials: Sequence[Observation],
-        simulator: Callable[..., Any],
-        *,
-        refinement: Refinement | None = None,
-        seed: int | None = None,
-    ) -> Belief:
-        """Return the refined belief of these trials alone, computed from scratch.
-
-        Args:
-            trials: They replace the history.
-            simulator: As in :meth:`update`.
-            refinement: As in :meth:`update`.
-            seed: As in :meth:`update`.
-        """
-        belief = self._refined(
-            [*trials], simulator, None, refinement, seed, reuse=False
+        if not self._is_round(action, belief):
+            return super().append_simulations(
+                theta, x, proposal, exclude_invalid_x, data_device
+            )
+        assert action is not None
+        self._append_round(
+            theta, x, action, belief, exclude_invalid_x, data_device, proposal
         )
-        self.trials = [*trials]
-        self._belief, self._trained_round = belief, None
+        self._proposal_roundwise.append(None)
+        return self
+
+    @takes(NPE_C.train)
+    def train(self, *args: Any, **kwargs: Any) -> Any:
+        """Train the density estimator, see :meth:`.ActionRounds.train`.
+
+        Raises:
+            ValueError: If with actions ``num_atoms``, ``discard_prior_samples`` or
+                ``use_combined_loss`` are given, which have no meaning there.
+        """
+        return super().train(*args, **kwargs)
+
+    def _train_round(self, **arguments: Any) -> ConditionalDensityEstimator:
+        arguments = require_likelihood_loss(NPE_C.train, arguments)
+        # NPE_C.train would choose a multi-round loss here; its parent's train is plain
+        # maximum likelihood on the rows that _get_start_index names.
+        return PosteriorEstimatorTrainer.train(
+            self, **{**arguments, "force_first_round_loss": True}
+        )
+
+    def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
+        return super()._training_defaults(given) | {"calibration_kernel": _all_alike}
+
+    def _network(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:
+        # It does better where it knows which numbers are the action.
+        return self._action_estimator.build(theta, x, self._action_dim)
+
+    def _train_mixture(
+        self, settings: MixtureDensity, config: TrainConfig, loss_args: Any
+    ) -> TrainingRecord:
+        network, kernel = self._neural_net, loss_args.calibration_kernel
+        return train_mixture_density(
+            network,
+            self._adam(network.parameters(), config),
+            *self._round_rows(),
+            train_rows=self.train_indices,
+            held_out_rows=self.val_indices,
+            budget=training_budget(settings, config, len(self.train_indices)),
+            calibration_kernel=None if kernel is _all_alike else kernel,
+        )
+
+    def _resolve_prior(self, prior: Any, sample_with: Any) -> Any:
+        """Return the prior of a posterior: the belief of this round; sbi's hook."""
+        if not self.has_actions:
+            return super()._resolve_prior(prior, sample_with)
+        prior = self._round_belief if prior is None else prior
+        with kept_generators():  # sbi draws from the prior to look at it
+            return super()._resolve_prior(prior, sample_with)
+
+    def _create_posterior(
+        self,
+        estimator: Any,
+        prior: Any,
+        sample_with: Any,
+        device: Any,
+        posterior_parameters: Any,
+    ) -> Any:
+        """Return sbi's posterior, with actions an :class:`.ActionPosterior`."""
+        arguments = (estimator, prior, sample_with, device, posterior_parameters)
+        if not self.has_actions:
+            return super()._create_posterior(*arguments)
+        with kept_generators():
+            packed = super()._create_posterior(*arguments)
+        assert self._action_dim is not None
+        assert self._outcome_shape is not None
+        return ActionPosterior(packed, self._outcome_shape, self._action_dim)
+
+    def _infer(self, told: Told) -> Belief:
+        trials, chained = told.trials, None
+        if not told.afresh:
+            with nullcontext() if told.given_seed is None else kept_generators():
+                required = told.simulator is None
+                chained = self._chained(trials[-1], required=required)
+        if told.simulator is None:
+            assert chained is not None
+            return chained
+        previous = None if told.afresh else self._belief
+        # A chained belief can be wrong; the refined one before the trial holds the
+        # posterior, if only it is wide enough.
+        start = [] if chained is None else [chained]
+        if isinstance(previous, RefinedBelief):
+            start.append(previous)
+        belief = refine(
+            told.simulator,
+            require_support(self._prior),
+            torch.stack([t.action for t in trials]),
+            torch.stack([t.x for t in trials]),
+            start=start,
+            past=getattr(previous, "histories", None),
+            settings=told.settings,
+            seed=told.seed(),
+        )
+        if isinstance(chained, ChainedBelief):
+            compare(belief, chained)
         return belief
 
     def _chained(self, trial: Observation, *, required: bool) -> Belief | None:
@@ -178,7 +290,7 @@ class ASBI(ActionNPE):
                 f"{fault}, so the belief is left unchanged. Refine with the simulator, "
                 "simulate such outcomes as NaN, or leave the trial out where a fault "
                 "caused them.",
-                stacklevel=3,
+                stacklevel=5,
             )
             unchanged = UnchangedBelief(prior, previous)
             unchanged.diagnostics = unchanged.diagnostics.warned(fault)
@@ -188,35 +300,10 @@ class ASBI(ActionNPE):
                 warnings.simplefilter("ignore")
             return ChainedBelief(deepcopy(network), condition, prior, previous)
 
-    def _refined(
-        self,
-        trials: Sequence[Observation],
-        simulator: Callable[..., Any],
-        chained: Belief | None,
-        refinement: Refinement | None,
-        seed: int | None,
-        *,
-        reuse: bool = True,
-    ) -> Belief:
-        previous = self._belief if reuse else None
-        # A chained belief can be wrong; the refined one before the trial holds the
-        # posterior, if only it is wide enough.
-        start = [] if chained is None else [chained]
-        if isinstance(previous, RefinedBelief):
-            start.append(previous)
-        belief = refine(
-            simulator,
-            require_support(self._prior),
-            torch.stack([t.action for t in trials]),
-            torch.stack([t.x for t in trials]),
-            start=start,
-            past=getattr(previous, "histories", None),
-            settings=refinement,
-            seed=int(torch.randint(2**62, ())) if seed is None else seed,
-        )
-        if isinstance(chained, ChainedBelief):
-            compare(belief, chained)
-        return belief
+
+def _all_alike(condition: Tensor) -> Tensor:
+    """Return the weight of each row where none is given, shape (n,)."""
+    return torch.ones(len(condition), device=condition.device)
 
 
 def _fault(

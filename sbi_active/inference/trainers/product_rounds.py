@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,10 +24,11 @@ from sbi_active.inference.products.product import (
     TrainedRegion,
     widened,
 )
-from sbi_active.inference.refinement.stages import Refinement
+from sbi_active.inference.refinement.settings import Refinement
 from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
+from sbi_active.inference.trainers.base import Told
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 
@@ -53,13 +54,19 @@ class ProductRounds(ActionRounds):
         b_r(\theta) \propto p(\theta)\, 1[\theta \in R_r]
         \prod_{k \le r} q_r(x_k | \theta, \xi_k).
 
+    ``update`` without a simulator gives that product under this round's network. With
+    one, further parameters are drawn around it, more widely, and simulated at the
+    executed actions alone, and a network trained on those rows gives the product
+    again. Without a network of this round that begins at the belief before, and takes
+    two stages or, from the prior, four; ``Refinement.num_histories`` is their sum.
+
     Args:
+        arguments: Of :class:`.ActionRounds`.
         posterior: How the belief is sampled: "importance", annealed importance
             sampling; one of sbi's Markov chains, for example "slice_np_vectorized" or
             "nuts_pyro"; or "kde", the paper's: draws of the belief before times the
             last trial's factor, as a kernel density estimate.
         bandwidth: Of "kde", see :class:`.KernelBelief`.
-        kwargs: Of sbi's trainer.
 
     References:
         Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
@@ -67,131 +74,113 @@ class ProductRounds(ActionRounds):
         to where a network was trained).
     """
 
-    # Of the trainer that this is mixed into.
-    append_simulations: Callable[..., Any]
-    train: Callable[..., Any]
-    _neural_net: Any
-    #: What its network is, set by each method.
-    _factor: type[ActionFactor]
+    _factor: ClassVar[type[ActionFactor]]
 
     def __init__(
         self,
-        *,
-        posterior: str = "importance",
-        bandwidth: Bandwidth = "scott",
-        **kwargs: Any,
+        *arguments: Any,
+        posterior: str,
+        bandwidth: Bandwidth,
     ) -> None:
         if posterior not in SAMPLERS:
             raise ValueError(
                 f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
                 f"{posterior!r}; do choose one of these"
             )
-        super().__init__(**kwargs)
+        super().__init__(*arguments)
         self._sampler = posterior
         self._bandwidth: Bandwidth = bandwidth
 
-    def _append_round(
+    def append_simulations(
         self,
         theta: Tensor,
         x: Tensor,
-        action: Tensor,
-        belief: Distribution | None,
-        exclude_invalid_x: bool | None,
-        data_device: str | None,
-        proposal: Any = None,
+        exclude_invalid_x: bool | None = None,
+        from_round: int = 0,
+        algorithm: str | None = None,
+        data_device: str | None = None,
+        *,
+        action: Tensor | None = None,
+        belief: Distribution | None = None,
     ) -> Self:
-        if self._keeps_invalid and not exclude_invalid_x:
+        """Store simulations for training.
+
+        Without ``action`` this is sbi's method. With it, the rows belong to the round
+        of ``belief``; the same belief appended again continues that round.
+
+        Args:
+            theta: Parameters, shape (n, theta_dim), drawn from the belief.
+            x: Outcomes, shape (n, *x_shape); NaN throughout a row where there was no
+                measurement.
+            exclude_invalid_x: With actions, None keeps rows without a measurement for
+                this library's networks, which learn their probability, and drops them
+                for sbi's, with a warning.
+            from_round: As in sbi; without meaning where there are actions.
+            algorithm: As in sbi; None is sbi's.
+            data_device: Where to keep the rows.
+            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            belief: The distribution of theta in this round; None is the current one.
+
+        Raises:
+            ValueError: If rounds with and without action mix, shapes do not fit, theta
+                leaves the prior's support, or an outcome is observed in part.
+        """
+        if not self._is_round(action, belief):
+            named = {} if algorithm is None else {"algorithm": algorithm}
+            sbi_trainer: Any = super()
+            return sbi_trainer.append_simulations(
+                theta,
+                x,
+                exclude_invalid_x=bool(exclude_invalid_x),
+                from_round=from_round,
+                data_device=data_device,
+                **named,
+            )
+        assert action is not None
+        if self._has_settings and not exclude_invalid_x:
             require_whole(x)
-        return super()._append_round(
-            theta, x, action, belief, exclude_invalid_x, data_device, proposal
+        return self._append_round(
+            theta, x, action, belief, exclude_invalid_x, data_device
         )
 
-    def _learned(self, estimator: Any = None) -> ActionFactor:
-        """Return what was learned; None is this round's, apart from later training."""
-        if estimator is None:
-            self._require_trained()
-            estimator = deepcopy(self._neural_net)
+    def _create_posterior(
+        self,
+        estimator: Any,
+        prior: Any,
+        sample_with: Any,
+        device: Any,
+        posterior_parameters: Any,
+    ) -> Any:
+        """Return sbi's posterior, with actions what was learned of a trial."""
+        if self.has_actions:
+            return self._learned(estimator)
+        sbi_trainer: Any = super()
+        return sbi_trainer._create_posterior(
+            estimator, prior, sample_with, device, posterior_parameters
+        )
+
+    def _learned(self, estimator: Any) -> ActionFactor:
         assert self._outcome_shape is not None
         assert self._action_dim is not None
         return self._factor(
             estimator, self._round_belief, self._outcome_shape, self._action_dim
         )
 
-    def update(
-        self,
-        x_o: Tensor,
-        *,
-        action: Tensor,
-        simulator: Callable[..., Any] | None = None,
-        refinement: Refinement | None = None,
-        seed: int | None = None,
-    ) -> Belief:
-        """Return the belief after a real trial, and make it the current one.
-
-        Without a simulator it is the product over the history under this round's
-        network. With one, further parameters are drawn around that, more widely, and
-        simulated at the executed actions alone, and a network trained on those rows
-        gives the product again. Without a network of this round that begins at the
-        belief before, and takes two stages or, from the prior, four.
-
-        Args:
-            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN throughout
-                where there was no measurement.
-            action: The executed action, shape (action_dim,) or (1, action_dim).
-            simulator: ``simulator(theta, action)`` to refine with.
-            refinement: Its ``num_histories`` parameters are simulated at every executed
-                action; None is ``Refinement()``.
-            seed: Of everything random here; None draws one from torch's global
-                generator.
-
-        Returns:
-            The belief.
-
-        Raises:
-            RuntimeError: If there is neither a simulator nor a network of this round.
-            ValueError: If shapes do not fit.
-        """
-        trial = self._observation(x_o, action)
-        require_whole(trial.x[None])
-        settings = Refinement() if refinement is None else refinement
-        seed = int(torch.randint(2**62, ())) if seed is None else seed
-        trials = [*self.trials, trial]
-        if simulator is None:
+    def _infer(self, told: Told) -> Belief:
+        trials, settings = told.trials, told.settings
+        require_whole(torch.stack([trial.x for trial in trials]))
+        seed = told.seed()
+        if told.simulator is None:
             self._require_belief_network()
         belief: Belief | None = None
-        if self._trained_round is not None:
+        if not told.afresh and self._trained_round is not None:
             belief = self._product(trials, settings, seed)
-        if simulator is not None:
+        if told.simulator is not None:
             with self._aside():
-                belief = self._refined(trials, simulator, belief, settings, seed)
+                if told.afresh:
+                    self._belief = None
+                belief = self._refined(trials, told.simulator, belief, settings, seed)
         assert belief is not None
-        self.trials.append(trial)
-        self._belief, self._trained_round = belief, None
-        return belief
-
-    def update_all(
-        self,
-        trials: Sequence[Observation],
-        simulator: Callable[..., Any],
-        *,
-        refinement: Refinement | None = None,
-        seed: int | None = None,
-    ) -> Belief:
-        """Return the belief of these trials alone, computed from scratch.
-
-        Args:
-            trials: They replace the history.
-            simulator: As in :meth:`update`.
-            refinement: As in :meth:`update`; the budget is shared by four stages.
-            seed: As in :meth:`update`.
-        """
-        settings = Refinement() if refinement is None else refinement
-        seed = int(torch.randint(2**62, ())) if seed is None else seed
-        with self._aside():
-            self._belief = None
-            belief = self._refined([*trials], simulator, None, settings, seed)
-        self.trials = [*trials]
-        self._belief, self._trained_round = belief, None
         return belief
 
     @contextmanager
@@ -283,12 +272,10 @@ class ProductRounds(ActionRounds):
             region = TrainedRegion.of(coordinates.to_z(rows), rng)
             hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
         chained = self._sampler == "kde"
-        learned = self._learned()
-        counted = [
-            t
-            for t in (trials[-1:] if chained else trials)
-            if _says_something(learned, t, prior)
-        ]
+        self._require_trained()
+        learned = self._learned(deepcopy(self._neural_net))
+        used = trials[-1:] if chained else trials
+        counted = [t for t in used if _says_something(learned, t, prior)]
         product = Product(
             coordinates,
             learned,
@@ -311,7 +298,7 @@ class ProductRounds(ActionRounds):
             sampled = KernelBelief(prior, draws, bandwidth=self._bandwidth)
         elif self._sampler in MARKOV_CHAINS:
             sampled = MarkovChainBelief(belief, product, self._sampler)
-        num_lost = len(trials[-1:] if chained else trials) - len(counted)
+        num_lost = len(used) - len(counted)
         if num_lost:
             sampled.diagnostics = sampled.diagnostics.warned(
                 f"{num_lost} trials are left out, at which the network's density is "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -17,14 +17,14 @@ from sbi_active.inference.beliefs.belief import Belief, require_support
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.lfire_model import LFIREModel, fit_log_ratios
-from sbi_active.inference.refinement.stages import Refinement
-from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+from sbi_active.inference.refinement.settings import Refinement
 from sbi_active.inference.rounds.rows import (
     Observation,
     RoundRows,
     require_whole,
     round_rows,
 )
+from sbi_active.inference.trainers.base import ActiveInference, Told
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 from sbi_active.threads import single_thread
@@ -32,7 +32,7 @@ from sbi_active.threads import single_thread
 __all__ = ["SeqBED"]
 
 
-class SeqBED:
+class SeqBED(ActiveInference):
     r"""Sequential Bayesian experimental design for implicit models.
 
     A belief is a set of particles. For each of them and each candidate action, LFIRE
@@ -49,6 +49,11 @@ class SeqBED:
     size falls below half: one informative trial leaves far less. What distinguishes
     the method is its cost: every particle needs simulations of its own.
     :class:`.SeqBED_C` shares them.
+
+    With a simulator, ``update`` simulates new particles at the executed action alone,
+    which allows more of them: ``Refinement.num_histories`` simulations a trial. The
+    belief is kernels around the weighted particles; its diagnostics tell their
+    effective number.
 
     Args:
         prior: The prior over parameters, with a support.
@@ -74,6 +79,9 @@ class SeqBED:
         True
     """
 
+    amortized = False
+    _prior: Distribution
+
     def __init__(
         self,
         prior: Distribution,
@@ -92,18 +100,9 @@ class SeqBED:
             )
         self._num_particles = num_particles
         self._bandwidth: Bandwidth = bandwidth
-        self._belief: Distribution | None = None
-        self._round_belief: Distribution | None = None
         self._rows: list[RoundRows] = []
         self._model: LFIREModel | None = None
-        self._x_shape: torch.Size | None = None
-        self._action_dim: int | None = None
-        self.trials: list[Observation] = []
-
-    @property
-    def belief(self) -> Distribution:
-        """The current belief over parameters; the prior before any trial."""
-        return self._prior if self._belief is None else self._belief
+        self.trials = []
 
     def arrange(self, theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return every action with every particle, several times each.
@@ -167,12 +166,12 @@ class SeqBED:
             x,
             action,
             prior=self._prior,
-            x_shape=self._x_shape,
+            x_shape=self._outcome_shape,
             action_dim=self._action_dim,
             exclude_invalid=False,
             may_be_invalid=bool(self.trials),
         )
-        self._x_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
+        self._outcome_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
         if belief is not self._round_belief:
             self._round_belief, self._rows = belief, []
         self._rows.append(rows)
@@ -208,68 +207,19 @@ class SeqBED:
             )
         return self._model
 
-    def update(
-        self,
-        x_o: Tensor,
-        *,
-        action: Tensor,
-        simulator: Callable[..., Any] | None = None,
-        refinement: Refinement | None = None,
-        seed: int | None = None,
-    ) -> Belief:
-        """Return the belief after a real trial, and make it the current one.
+    def forget_round(self) -> None:
+        """Have the next update do without what was learned in this round."""
+        self._model, self._rows = None, []
 
-        Args:
-            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN throughout
-                where there was no measurement.
-            action: The executed action, shape (action_dim,) or (1, action_dim).
-            simulator: With one, new particles are simulated at the executed action
-                alone, which allows more of them.
-            refinement: Its ``num_histories`` is how many simulations; None is
-                ``Refinement()``.
-            seed: Of the particles; None draws one from torch's global generator.
-
-        Returns:
-            Kernels around the weighted particles; its diagnostics tell their effective
-            number.
-
-        Raises:
-            RuntimeError: If there is neither a simulator nor a model of this round.
-        """
-        trial = self._observation(x_o, action)
-        seed = int(torch.randint(2**62, ())) if seed is None else seed
-        settings = Refinement() if refinement is None else refinement
+    def _infer(self, told: Told) -> Belief:
+        trials, simulator, settings = told.trials, told.simulator, told.settings
+        require_whole(torch.stack([trial.x for trial in trials]))
+        seed = told.seed()
         if simulator is None:
-            belief = self._weighted(self.build_posterior(), trial, {})
-        else:
-            belief = self._simulated(self.belief, trial, simulator, settings, seed)
-        self.trials.append(trial)
-        self._belief, self._model, self._rows = belief, None, []
-        return belief
-
-    def update_all(
-        self,
-        trials: Sequence[Observation],
-        simulator: Callable[..., Any],
-        *,
-        refinement: Refinement | None = None,
-        seed: int | None = None,
-    ) -> Belief:
-        """Return the belief of these trials alone, computed from scratch.
-
-        Args:
-            trials: They replace the history; one counts after another.
-            simulator: As in :meth:`update`.
-            refinement: As in :meth:`update`, a trial.
-            seed: As in :meth:`update`.
-
-        Raises:
-            ValueError: If there is no trial.
-        """
-        seed = int(torch.randint(2**62, ())) if seed is None else seed
-        settings = Refinement() if refinement is None else refinement
-        if not trials:
-            raise ValueError("expected at least one trial; got none; do pass some")
+            return self._weighted(self.build_posterior(), trials[-1], {})
+        if not told.afresh:
+            assert self.belief is not None
+            return self._simulated(self.belief, trials[-1], simulator, settings, seed)
         spent = {"num_simulations": 0, "num_missing": 0}
         current: Distribution = self._prior
         for k, trial in enumerate(trials):
@@ -278,8 +228,6 @@ class SeqBED:
             found, current = belief.diagnostics, belief
             spent = {name: n + getattr(found, name) for name, n in spent.items()}
         belief.diagnostics = belief.diagnostics.extended(**spent)
-        self.trials = [*trials]
-        self._belief, self._model, self._rows = belief, None, []
         return belief
 
     def _simulated(
@@ -325,7 +273,7 @@ class SeqBED:
             warnings.warn(
                 f"the executed action {trial.action.tolist()} was not simulated; the "
                 f"ratios are those at {action.tolist()}. Pass a simulator to update().",
-                stacklevel=3,
+                stacklevel=5,
             )
         n = len(particles)
         rows = trial.x.expand(n, *trial.x.shape), action.expand(n, -1)
@@ -349,13 +297,3 @@ class SeqBED:
                 "wide as its kernels"
             )
         return belief
-
-    def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
-        x = torch.as_tensor(x_o)
-        shape = self._x_shape
-        if shape is None:
-            shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
-        row = action_rows(action, self._action_dim, num_rows=1)[0]
-        rows = outcome_rows(x, shape)
-        require_whole(rows)
-        return Observation(row, rows[0])

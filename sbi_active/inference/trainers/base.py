@@ -1,0 +1,186 @@
+"""What every active inference method offers, whatever it learns."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+from sbi_active.inference.rounds.rows import Observation
+
+__all__ = ["ActiveInference", "Told"]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a belief is to be inferred from.
+
+    Attributes:
+        trials: All of them, the new one last.
+        simulator: To refine the belief with; None takes the word of the network.
+        refinement: Budget of that; None is ``Refinement()``.
+        given_seed: By the caller; None for none.
+        afresh: Whether to begin at the prior, without the belief before the last trial
+            and without this round's network.
+    """
+
+    trials: Sequence[Observation]
+    simulator: Callable[..., Any] | None
+    refinement: Refinement | None
+    given_seed: int | None
+    afresh: bool = False
+
+    @property
+    def settings(self) -> Refinement:
+        """Of the refinement."""
+        return Refinement() if self.refinement is None else self.refinement
+
+    def seed(self) -> int:
+        """Return the seed given, or else one from torch's global generator."""
+        given = self.given_seed
+        return int(torch.randint(2**62, ())) if given is None else given
+
+
+class ActiveInference(ABC):
+    r"""A method that learns from simulations and updates a belief by real trials.
+
+    A round: rows drawn under the current belief go to ``append_simulations(theta, x,
+    action=, belief=)``, ``train()`` learns from them, ``build_posterior()`` gives the
+    model that actions are designed with, and :meth:`update` takes the real trial. The
+    model has ``log_posterior``, ``log_likelihood`` or ``log_ratio``, which is all that
+    a designer asks for.
+
+    A method implements these three and :meth:`_infer`, the one step in which methods
+    differ once a trial is told.
+
+    Attributes:
+        trials: Real trials so far, in order.
+        amortized: Whether the model knows all parameters; otherwise only those that
+            ``model.belief`` draws.
+    """
+
+    trials: list[Observation]
+    amortized: bool = True
+
+    append_simulations: Callable[..., Any]
+    train: Callable[..., Any]
+    build_posterior: Callable[..., Any]
+
+    _prior: Distribution | None
+    _belief: Distribution | None = None
+    _round_belief: Distribution | None = None
+    _action_dim: int | None = None
+    _outcome_shape: torch.Size | None = None
+
+    @property
+    def belief(self) -> Distribution | None:
+        """The current belief over parameters; the prior before any trial."""
+        return self._prior if self._belief is None else self._belief
+
+    def arrange(self, theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rows to simulate in a round, made of independent draws.
+
+        Args:
+            theta: Draws from the belief, shape (n, theta_dim).
+            action: Draws from the action space, shape (n, action_dim).
+
+        Returns:
+            At most n rows of both; most methods take the draws as they are.
+        """
+        return theta, action
+
+    def update(
+        self,
+        x_o: Tensor,
+        *,
+        action: Tensor,
+        simulator: Callable[..., Any] | None = None,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the belief after a real trial, and make it the current one.
+
+        Args:
+            x_o: The observed outcome, shape x_shape or (1, *x_shape); NaN where there
+                was no measurement.
+            action: The executed action, shape (action_dim,) or (1, action_dim); it need
+                not be one of the actions that were asked for.
+            simulator: ``simulator(theta, action)`` to refine the belief with; None
+                takes the word of this round's network.
+            refinement: Budget of the refinement; None is ``Refinement()``.
+            seed: Of everything random in the refinement; None draws one from torch's
+                global generator.
+
+        Returns:
+            The belief; ``belief.label`` says how it was made.
+
+        Raises:
+            RuntimeError: If there is no simulator and nothing was learned since the
+                belief last changed.
+            ValueError: If shapes do not fit.
+        """
+        trial = self._observation(x_o, action)
+        trials = (*self.trials, trial)
+        return self._conclude(Told(trials, simulator, refinement, seed))
+
+    def update_all(
+        self,
+        trials: Sequence[Observation],
+        simulator: Callable[..., Any],
+        *,
+        refinement: Refinement | None = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the refined belief of these trials alone, computed from scratch.
+
+        Args:
+            trials: They replace the history.
+            simulator: As in :meth:`update`, with what follows.
+            refinement: Budget of the refinement.
+            seed: Of everything random here.
+
+        Raises:
+            ValueError: If there is no trial.
+        """
+        if not trials:
+            raise ValueError("expected at least one trial; got none; pass trials")
+        return self._conclude(Told((*trials,), simulator, refinement, seed, True))
+
+    @abstractmethod
+    def _infer(self, told: Told) -> Belief:
+        """Return the belief after trials, and change nothing."""
+
+    def _conclude(self, told: Told) -> Belief:
+        """End the round with a belief: its network belongs to the one before."""
+        self._belief = belief = self._infer(told)
+        self.trials = [*told.trials]
+        self.forget_round()
+        return belief
+
+    @abstractmethod
+    def forget_round(self) -> None:
+        """Have the next update do without what was learned in this round."""
+
+    def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
+        """Return the checked trial."""
+        x = torch.as_tensor(x_o)
+        shape = self._outcome_shape
+        if shape is None:  # no simulations yet: the first trial says
+            shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
+        rows = outcome_rows(x, shape)
+        if len(rows) != 1:
+            raise ValueError(
+                f"expected one outcome; got {len(rows)} rows; do update with one trial "
+                "at a time"
+            )
+        return Observation(
+            action_rows(action, self._action_dim, num_rows=1)[0], rows[0]
+        )
