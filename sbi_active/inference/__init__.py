@@ -46,7 +46,6 @@ __getattr__ = former_names(
         "ChainedBelief": "sbi_active.inference.beliefs:ChainedBelief",
         "KernelBelief": "sbi_active.inference.beliefs:KernelBelief",
         "MixtureDensityNetwork": "sbi_active.inference.networks:MixtureDensityNetwork",
-        "ProductBelief": "sbi_active.inference.products:ProductBelief",
         "RefinedBelief": "sbi_active.inference.refinement:RefinedBelief",
         "information_gained": "sbi_active.inference.beliefs:information_gained",
     },

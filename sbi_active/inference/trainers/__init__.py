@@ -6,7 +6,7 @@ Here lives what users call to append, train and update. What is trained lives in
 
 from sbi_active.inference.trainers.alhi import ALHI
 from sbi_active.inference.trainers.asbi import ASBI
-from sbi_active.inference.trainers.protocol import ActiveInference
+from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.inference.trainers.ratio import SeqBED_B, SeqBED_C
 from sbi_active.inference.trainers.seqbed import SeqBED
 
