@@ -45,7 +45,7 @@ from sbi_active import (
     GaussianNoise,
     InformationGainDesigner,
     MixtureDensity,
-    Refinement,
+    RefinementOptions,
     SeqBED_C,
     SimulatorModel,
     simulate,
@@ -182,7 +182,7 @@ def many(num_parameters: int) -> list[Any]:
         trials,
         simulator=simulator,
         seed=7,
-        refinement=Refinement(num_histories=600, num_particles=2_000),
+        refinement=RefinementOptions(num_histories=600, num_particles=2_000),
     )
     with forked_generators(0):
         draws = belief.sample(torch.Size([64]))
@@ -192,7 +192,7 @@ def many(num_parameters: int) -> list[Any]:
 def adoption() -> list[Any]:
     """Return a campaign before and after it adopts an effect."""
     problem = draw_case(get_world("A"), "library", 1, num_trials=8).problem
-    options = replace(SMALL, refinement=Refinement(num_histories=400))
+    options = replace(SMALL, refinement=RefinementOptions(num_histories=400))
     run = Campaign(
         problem.model,
         problem.prior,

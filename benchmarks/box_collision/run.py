@@ -41,7 +41,7 @@ from benchmarks.box_collision.summary import (
     read,
     summarize,
 )
-from sbi_active import Campaign, CampaignOptions, MixtureDensity, Refinement
+from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.campaign.methods import METHODS, find_method
 from sbi_active.seeding import derive_seed, forked_generators
@@ -75,7 +75,7 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
             num_simulations=41 * 500,
             num_scored=500,
             design_on="training",
-            refinement=Refinement(num_effective=100, num_draws=100),
+            refinement=RefinementOptions(num_effective=100, num_draws=100),
         ),
         {},
     ),

@@ -46,7 +46,7 @@ from benchmarks.numerical.run import (
     round_row,
     short,
 )
-from sbi_active import Campaign, CampaignOptions, Refinement
+from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.methods import METHODS, faithful_options
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -58,7 +58,7 @@ NUM_COMPARED = 1_000  # draws of each in the classifier test
 NUM_FAITHFUL, NUM_DESIGN = 52_000, 15_700
 #: Parameters in a refinement, so that methods that spend all of them, at each executed
 #: action, spend what ASBI's, which stops by itself, does on average.
-HISTORIES = Refinement(num_histories=600)
+HISTORIES = RefinementOptions(num_histories=600)
 PAPER = {
     "paper, ALHI": ("", "940 +- 556", "46.7", "4.35"),
     "paper, SeqBED": ("", "895 +- 264", "44.4", "2.92"),

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active import Campaign, CampaignOptions, Refinement
+from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.plots import as_table
@@ -36,7 +36,9 @@ REPORTED = (-3.0, 0.0, 3.0)  # actions of the paper's Table 1
 SETTINGS: dict[str, CampaignOptions] = {
     "faithful": CampaignOptions.faithful(),
     "default": CampaignOptions(),
-    "default_500": replace(CampaignOptions(), refinement=Refinement(num_histories=500)),
+    "default_500": replace(
+        CampaignOptions(), refinement=RefinementOptions(num_histories=500)
+    ),
 }
 NUMERICAL = ("linear", "sinh", "square")
 #: Table 1 (mean and standard deviation of 10 trials) and figure 5 of the paper, and the

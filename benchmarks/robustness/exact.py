@@ -45,7 +45,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
-from sbi_active import ASBI, Refinement
+from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -126,7 +126,7 @@ class Problem:
 
     def infer(self, seed: int, num_histories: int | None = None) -> Belief:
         """Return the belief after the trials, one update each."""
-        settings = Refinement()
+        settings = RefinementOptions()
         if num_histories is not None:
             settings = replace(settings, num_histories=num_histories)
         inference = ASBI(self.prior, show_progress_bars=False)

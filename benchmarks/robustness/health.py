@@ -35,7 +35,7 @@ from sbi_active import (
     Campaign,
     CampaignOptions,
     MixtureDensity,
-    Refinement,
+    RefinementOptions,
 )
 from sbi_active.inference.refinement import LARGE
 from sbi_active.seeding import derive_seed, forked_generators
@@ -60,13 +60,13 @@ NETWORK = MixtureDensity(
 CHEAP = CampaignOptions(
     num_simulations=100,
     density_estimator=NETWORK,
-    refinement=Refinement(num_histories=1_000),
+    refinement=RefinementOptions(num_histories=1_000),
 )
 #: For campaigns of many numbers, which cost more.
 CHEAPER = replace(
     CHEAP,
     num_scored=1_000,
-    refinement=Refinement(num_histories=400, first_share=0.5),
+    refinement=RefinementOptions(num_histories=400, first_share=0.5),
 )
 
 

@@ -24,7 +24,7 @@ from torch.distributions import (
 
 from benchmarks.robustness.attacks import Attacks
 from benchmarks.robustness.exact import Problem
-from sbi_active import ASBI, Refinement
+from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import forked_generators
 
@@ -43,7 +43,7 @@ def inferred(
     prior: Distribution, simulator: Simulator, x: Tensor, **settings: Any
 ) -> Belief:
     """Return the belief after one trial, by the path of a user."""
-    refinement = Refinement(**settings) if settings else None
+    refinement = RefinementOptions(**settings) if settings else None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return ASBI(prior, show_progress_bars=False).update(

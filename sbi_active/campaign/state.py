@@ -15,7 +15,7 @@ from sbi_active.campaign.stopping import StopRules
 from sbi_active.design.designer import Design
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.refinement.stages import Refinement
+from sbi_active.inference.refinement.stages import RefinementOptions
 
 __all__ = [
     "FAR",
@@ -88,7 +88,7 @@ class CampaignOptions:
     min_probability_valid: float = 0.0
     repeat: bool = True
     refine: bool = True
-    refinement: Refinement = Refinement()
+    refinement: RefinementOptions = RefinementOptions()
     num_scored: int = 2_000
     check_every: int | None = None
     stop: StopRules = StopRules()

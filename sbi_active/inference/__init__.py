@@ -9,7 +9,7 @@ from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.ratio_network import RatioClassifier
-from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.refinement.stages import refine
 from sbi_active.inference.rounds.condition import ActionEmbedding
 from sbi_active.inference.rounds.rows import Observation
@@ -31,7 +31,7 @@ __all__ = [
     "MixtureDensity",
     "Observation",
     "RatioClassifier",
-    "Refinement",
+    "RefinementOptions",
     "SeqBED",
     "SeqBED_B",
     "SeqBED_C",
@@ -46,7 +46,8 @@ __getattr__ = former_names(
         "ChainedBelief": "sbi_active.inference.beliefs:ChainedBelief",
         "KernelBelief": "sbi_active.inference.beliefs:KernelBelief",
         "MixtureDensityNetwork": "sbi_active.inference.networks:MixtureDensityNetwork",
-        "RefinedBelief": "sbi_active.inference.refinement:RefinedBelief",
+        "RefinedBelief": "sbi_active.inference.refinement:LearnedBelief",
+        "Refinement": "sbi_active:RefinementOptions",
         "information_gained": "sbi_active.inference.beliefs:information_gained",
     },
 )

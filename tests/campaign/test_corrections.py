@@ -15,7 +15,7 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
-    Refinement,
+    RefinementOptions,
     SimulatorModel,
 )
 from sbi_active.campaign.checks import outlyingness
@@ -30,7 +30,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=200,
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=Refinement(num_histories=300, num_particles=1_000),
+    refinement=RefinementOptions(num_histories=300, num_particles=1_000),
 )
 RATIOS = RatioClassifier(hidden_features=(16,), num_iterations=50)
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6

@@ -13,7 +13,7 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
-    Refinement,
+    RefinementOptions,
     SimulatorModel,
 )
 from tests.campaign.test_revision import ACTIONS as SIDES
@@ -30,7 +30,7 @@ SMALL = CampaignOptions(
     density_estimator=MixtureDensity(
         hidden_features=(16,), num_components=2, num_iterations=100
     ),
-    refinement=Refinement(num_histories=300, num_particles=2_000),
+    refinement=RefinementOptions(num_histories=300, num_particles=2_000),
 )
 MODEL = SimulatorModel(lambda t, a: a * t, noise=GaussianNoise(0.1))
 

@@ -14,7 +14,7 @@ from sbi_active import (
     CampaignOptions,
     DiscreteActions,
     MixtureDensity,
-    Refinement,
+    RefinementOptions,
 )
 from sbi_active.campaign.methods import METHODS, faithful_options
 from sbi_active.inference import LFIRE, RatioClassifier
@@ -27,7 +27,7 @@ SMALL = CampaignOptions(
     num_simulations=600,
     num_samples=100,
     num_scored=200,
-    refinement=Refinement(num_histories=300, num_particles=2_000),
+    refinement=RefinementOptions(num_histories=300, num_particles=2_000),
 )
 TRAINED = {
     **dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY),

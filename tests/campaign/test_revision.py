@@ -13,7 +13,7 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
-    Refinement,
+    RefinementOptions,
     SimulatorModel,
 )
 from sbi_active.campaign.checks import most_unlike
@@ -31,7 +31,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=400,
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=Refinement(num_histories=300),
+    refinement=RefinementOptions(num_histories=300),
 )
 SHIFT = 0.8
 

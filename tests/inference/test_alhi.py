@@ -9,7 +9,7 @@ import torch
 from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
-from sbi_active import ALHI, MixtureDensity, Refinement
+from sbi_active import ALHI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation
 from sbi_active.inference.beliefs import KernelBelief
 from sbi_active.inference.products import Product, TrainedRegion, widened
@@ -79,7 +79,7 @@ def test_the_belief_is_the_product_over_the_history():
 def test_a_simulator_refines_and_is_counted():
     torch.manual_seed(0)
     inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
-    settings = Refinement(num_histories=1_000)
+    settings = RefinementOptions(num_histories=1_000)
     belief = observe(inference, simulator=simulator, refinement=settings)
     # 500 rows an action or more in the last stage: .08 noise deviations of f, twice.
     assert abs(divergence(belief)) < 0.1
@@ -281,7 +281,7 @@ def test_the_numerical_task_after_four_rounds(variant):
                     outcomes[-1],
                     action=action,
                     simulator=task.simulator if refined else None,
-                    refinement=Refinement(num_histories=600),
+                    refinement=RefinementOptions(num_histories=600),
                     seed=index,
                 )
             exact = task.reference(actions, torch.stack(outcomes))

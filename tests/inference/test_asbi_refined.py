@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from sbi_active import ASBI, MixtureDensity, Refinement
+from sbi_active import ASBI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation, refine
 from sbi_active.inference.beliefs import ChainedBelief, compare, compare_orders
 from sbi_active.inference.trainers import asbi
@@ -19,7 +19,7 @@ TRIALS = [
     Observation(torch.tensor([1.0]), torch.tensor([0.2, 0.1])),
     Observation(torch.tensor([3.0]), torch.tensor([1.2, -2.0])),
 ]
-SETTINGS = Refinement(num_histories=600)
+SETTINGS = RefinementOptions(num_histories=600)
 
 
 def exact(trials):
@@ -192,7 +192,7 @@ def test_the_first_trial_may_come_before_any_simulation():
     )
     assert belief.sample((3,)).shape == (3, 2)
     with pytest.raises(ValueError, match="expected num_histories in"):
-        Refinement(num_histories=10)
+        RefinementOptions(num_histories=10)
 
 
 def test_the_faithful_network_is_flagged_as_blunt():
@@ -214,7 +214,7 @@ def test_the_faithful_network_is_flagged_as_blunt():
 
 
 def test_a_second_refinement_in_reverse_order_agrees():
-    settings = Refinement(num_histories=600, check_order=True)
+    settings = RefinementOptions(num_histories=600, check_order=True)
     belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=settings, seed=0)
     assert -0.02 < belief.diagnostics.order_swap_kl < 0.1
     single = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)

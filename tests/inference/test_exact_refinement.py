@@ -12,11 +12,11 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.inference import Refinement, refine
+from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.refinement import (
-    ExactBelief,
+    LearnedBelief,
     MeanTable,
-    RefinedBelief,
+    SimulatedBelief,
     SimulatedLikelihood,
     declares_noise,
     importance_sample,
@@ -34,7 +34,7 @@ BOX = BoxUniform(-torch.ones(2), torch.ones(2))
 SD, CELL = 0.02, 0.02
 ACTION = torch.tensor([[0.3], [1.0], [0.6]])
 TRUTH = torch.tensor([[0.31, -0.42]])
-FEW = Refinement(num_histories=1_200)
+FEW = RefinementOptions(num_histories=1_200)
 
 
 def jumping(theta: Tensor, action: Tensor) -> Tensor:
@@ -178,10 +178,10 @@ def test_a_jumping_response_is_refined_exactly(model: SimulatorModel):
         score = model.log_prob(x, TRUTH.expand(3, -1), ACTION).sum() - exact
         score = float(score) - math.log(4)  # the prior's density
         belief = refine(model, BOX, ACTION, x, settings=FEW, seed=seed)
-        assert isinstance(belief, ExactBelief)
+        assert isinstance(belief, SimulatedBelief)
         gaps.append(score - float(belief.log_prob(TRUTH)))
         hidden = refine(model.__call__, BOX, ACTION, x, settings=FEW, seed=seed)
-        assert isinstance(hidden, RefinedBelief)
+        assert isinstance(hidden, LearnedBelief)
         learned.append(score - float(hidden.log_prob(TRUTH)))
     # 60 effective draws leave a standard error of .13.
     assert max(map(abs, gaps)) < 0.5
@@ -193,7 +193,7 @@ def test_a_smooth_response_is_refined_as_without_a_declaration():
     x = observe(model, 0)
     belief = refine(model, BOX, ACTION, x, settings=FEW, seed=0)
     hidden = refine(model.__call__, BOX, ACTION, x, settings=FEW, seed=0)
-    assert isinstance(belief, RefinedBelief)
+    assert isinstance(belief, LearnedBelief)
     theta = BOX.sample((100,))
     assert torch.equal(belief.log_prob(theta), hidden.log_prob(theta))
 
@@ -202,9 +202,9 @@ def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):
     x = observe(model, 2)
     first = refine(model, BOX, ACTION[:2], x[:2], settings=FEW, seed=0)
     second = refine(model, BOX, ACTION, x, past=first.histories, settings=FEW, seed=1)
-    assert isinstance(second, ExactBelief)
+    assert isinstance(second, SimulatedBelief)
     assert second.diagnostics.trustworthy, second.diagnostics.warnings
-    assert isinstance(first, ExactBelief)
+    assert isinstance(first, SimulatedBelief)
     kept = first.histories.pool.proposals  # pyright: ignore
     every = second.histories.pool.proposals  # pyright: ignore
     assert all(a[1] is b[1] for a, b in zip(kept, every, strict=False))
@@ -233,7 +233,7 @@ def test_it_ends_at_the_effective_draws_that_are_asked_for(model: SimulatorModel
     for num_effective in (50, 400):
         settings = replace(settings, num_effective=num_effective, num_draws=150)
         belief = refine(model, BOX, ACTION[:1], x, settings=settings, seed=0)
-        assert isinstance(belief, ExactBelief)
+        assert isinstance(belief, SimulatedBelief)
         assert belief.diagnostics.effective_sample_size >= num_effective
         spent.append(belief.diagnostics.num_simulations)
         numbers = [num for num, _ in belief.histories.pool.proposals]  # pyright: ignore
@@ -244,7 +244,7 @@ def test_it_ends_at_the_effective_draws_that_are_asked_for(model: SimulatorModel
 def test_a_smooth_density_costs_no_simulations(model: SimulatorModel):
     x = observe(model, 0)
     belief = refine(model, BOX, ACTION, x, settings=FEW, seed=0)
-    assert isinstance(belief, ExactBelief)
+    assert isinstance(belief, SimulatedBelief)
     table = belief.histories.table  # pyright: ignore
     count = table.num_simulations
     theta = BOX.sample((4_000,))
@@ -280,7 +280,7 @@ def test_a_fault_loses_its_draw_alone(model: SimulatorModel):
     x = observe(model, 0)
     with pytest.warns(MissingRowsWarning):
         belief = refine(faulty, BOX, ACTION, x, settings=FEW, seed=0)
-    assert isinstance(belief, ExactBelief)
+    assert isinstance(belief, SimulatedBelief)
     assert belief.diagnostics.num_missing > 0
     assert belief.diagnostics.log_evidence == pytest.approx(
         grid_evidence(model, ACTION, x), abs=0.5

@@ -7,7 +7,14 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import ALHI, ASBI, GaussianNoise, Refinement, SeqBED, SimulatorModel
+from sbi_active import (
+    ALHI,
+    ASBI,
+    GaussianNoise,
+    RefinementOptions,
+    SeqBED,
+    SimulatorModel,
+)
 from sbi_active.inference import SeqBED_C, refine
 from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.inference.sampling import normalized
@@ -15,7 +22,7 @@ from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
-SETTINGS = Refinement(num_histories=300, num_particles=1_000)
+SETTINGS = RefinementOptions(num_histories=300, num_particles=1_000)
 SIZES = (1e15, 1e30, -3e38)
 
 

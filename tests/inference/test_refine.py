@@ -13,8 +13,8 @@ from torch.distributions import (
     MultivariateNormal,
 )
 
-from sbi_active.inference import Refinement, refine
-from sbi_active.inference.refinement import RefinedBelief
+from sbi_active.inference import RefinementOptions, refine
+from sbi_active.inference.refinement import LearnedBelief
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from tests.inference.refined_worlds import BOX, draws, numerical, observe
@@ -27,7 +27,7 @@ def scored(variant: str, actions: list[float], num_histories: int, seed: int):
     simulator = numerical(variant)
     action = torch.tensor(actions)[:, None]
     x = observe(simulator, theta, action, seed)
-    settings = Refinement(num_histories=num_histories)
+    settings = RefinementOptions(num_histories=num_histories)
     belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
     exact = ExactPosterior(action.double(), x, variant=variant)
     gap = float(exact.log_prob(theta)[0] - belief.log_prob(theta)[0])
@@ -37,12 +37,12 @@ def scored(variant: str, actions: list[float], num_histories: int, seed: int):
 
 
 @pytest.fixture(scope="module")
-def linear() -> tuple[RefinedBelief, Tensor, Tensor]:
+def linear() -> tuple[LearnedBelief, Tensor, Tensor]:
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
     simulator = numerical()
     x = observe(simulator, torch.tensor([[-3.0, 1.0]]), action, 0)
     belief = refine(simulator, BOX, action, x, seed=0)
-    assert isinstance(belief, RefinedBelief)
+    assert isinstance(belief, LearnedBelief)
     return belief, action, x
 
 
@@ -151,7 +151,7 @@ def test_draws_follow_the_density(linear):
 def test_defensive_share_of_the_prior(linear):
     belief, _, _ = linear
     far = torch.tensor([[4.0, -4.0]])
-    expected = math.log(Refinement().defensive) + float(BOX.log_prob(far))
+    expected = math.log(RefinementOptions().defensive) + float(BOX.log_prob(far))
     assert float(belief.log_prob(far)) == pytest.approx(expected, abs=1e-4)
     assert float(belief.log_prob(torch.tensor([[6.0, 0.0]]))) == -math.inf
 
@@ -169,7 +169,14 @@ def test_same_seed_same_belief(linear):
 def test_global_generator_is_left_alone():
     action, x = torch.tensor([[1.0]]), torch.tensor([[2.0]])
     state = torch.get_rng_state()
-    refine(numerical(), BOX, action, x, settings=Refinement(num_histories=200), seed=0)
+    refine(
+        numerical(),
+        BOX,
+        action,
+        x,
+        settings=RefinementOptions(num_histories=200),
+        seed=0,
+    )
     assert torch.equal(state, torch.get_rng_state())
 
 
@@ -203,7 +210,7 @@ def test_budget_is_respected(num_histories: int):
         return numerical("sinh")(theta, action)
 
     action, x = torch.tensor([[-5.0], [5.0]]), torch.tensor([[1_000.0], [3.0]])
-    settings = Refinement(num_histories=num_histories)
+    settings = RefinementOptions(num_histories=num_histories)
     belief = refine(simulator, BOX, action, x, settings=settings, seed=0)
     assert rows <= 2 * num_histories
     assert belief.diagnostics.num_simulations == rows
@@ -223,7 +230,7 @@ def test_start_is_a_hint_without_weight(linear):
 @pytest.mark.parametrize("noise", ["gaussian", "uniform"])
 def test_hard_edged_noise_is_flagged(noise: str, num_seeds: int, num_histories: int):
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-    settings = Refinement(num_histories=num_histories)
+    settings = RefinementOptions(num_histories=num_histories)
     simulator = numerical(noise=noise)
     for seed in range(num_seeds):
         x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, seed)
@@ -239,7 +246,7 @@ def test_hard_edged_noise_is_flagged(noise: str, num_seeds: int, num_histories: 
 def test_four_sharp_modes_are_flagged(num_seeds: int, num_histories: int):
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
     simulator = numerical("sine")
-    settings = Refinement(num_histories=num_histories)
+    settings = RefinementOptions(num_histories=num_histories)
     for seed in range(num_seeds):
         with forked_generators(seed, "truth"):
             theta = BOX.sample((1,))

@@ -16,7 +16,7 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference import Refinement, refine
+from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior
@@ -113,7 +113,7 @@ def test_deterministic_simulator_is_refused():
 )
 def test_settings_validate_themselves(option: dict):
     with pytest.raises(ValueError, match=f"expected {next(iter(option))} in"):
-        Refinement(**option)
+        RefinementOptions(**option)
 
 
 def counted(simulator):

@@ -8,7 +8,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference import Refinement, refine
+from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.seeding import forked_generators
 
@@ -23,7 +23,7 @@ def refined(dim: int, num: int, seed: int, num_histories: int):
         return theta @ weight.T + 0.5 * torch.randn(len(theta), num)
 
     prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
-    settings = Refinement(num_histories=num_histories, num_particles=3_000)
+    settings = RefinementOptions(num_histories=num_histories, num_particles=3_000)
     belief = refine(
         simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=seed
     )
@@ -58,7 +58,7 @@ def refine_two_of(dim: int):
     def simulator(theta: Tensor, action: Tensor) -> Tensor:
         return theta[:, :2] + 0.5 * torch.randn(len(theta), 2)
 
-    settings = Refinement(num_histories=200, num_particles=1_000)
+    settings = RefinementOptions(num_histories=200, num_particles=1_000)
     x = torch.full((1, 2), 0.5)
     return refine(simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=0)
 

@@ -11,7 +11,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.inference import Refinement, refine
+from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import forked_generators
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
@@ -209,6 +209,6 @@ def test_settings_reach_the_engine():
             PRIOR,
             torch.ones(1, 1),
             torch.ones(1, 1),
-            settings=Refinement(num_workers=0),
+            settings=RefinementOptions(num_workers=0),
             seed=0,
         )

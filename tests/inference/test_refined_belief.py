@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.inference.refinement import RefinedBelief
+from sbi_active.inference.refinement import LearnedBelief
 from sbi_active.inference.regression import PriorProposal
 from sbi_active.inference.sampling import Particles, PriorCoordinates
 
@@ -29,7 +29,7 @@ def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():
     log_weight = Normal().log_joint(z) - base.log_prob(z)
     log_weight[0] += 30.0  # one draw that no other resembles
     particles = Particles(z, log_weight, base)
-    belief = RefinedBelief(prior, Normal(), particles, defensive=0.01)
+    belief = LearnedBelief(prior, Normal(), particles, defensive=0.01)
     draws = belief.sample((2_000,))[:, 0]
     assert len(draws) == 2_000
     # 1 % are of the prior, whose standard deviation is 2.3.

@@ -8,7 +8,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Refinement, SeqBED, SeqBED_B, SeqBED_C
+from sbi_active import RefinementOptions, SeqBED, SeqBED_B, SeqBED_C
 from sbi_active.inference import LFIRE, RatioClassifier
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
@@ -87,7 +87,7 @@ def test_seqbed_weighs_particles():
 @pytest.mark.slow
 def test_seqbed_with_a_simulator():
     inference = SeqBED(NORMAL)
-    x_o, settings = torch.tensor([1.6]), Refinement(num_histories=1_600)
+    x_o, settings = torch.tensor([1.6]), RefinementOptions(num_histories=1_600)
     torch.manual_seed(0)
     belief = inference.update(
         x_o, action=ACTIONS[1], simulator=simulator, refinement=settings, seed=0
@@ -133,7 +133,7 @@ def test_amortized_ratios_meet_the_closed_form(trainer):
     sd = float(variance[0].sqrt())
     assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.25 * sd)
     assert belief.variance.sqrt().tolist() == pytest.approx([sd] * DIM, rel=0.2)
-    settings = Refinement(num_histories=1_000)
+    settings = RefinementOptions(num_histories=1_000)
     belief = inference.update(
         torch.tensor(trials[1][1]),
         action=torch.tensor(trials[1][0]),

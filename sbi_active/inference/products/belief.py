@@ -8,7 +8,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.products.product import NUM_COMPONENTS, Product
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import (
@@ -32,7 +32,7 @@ def sample_product(
     *,
     num_particles: int,
     defensive: float,
-) -> RefinedBelief:
+) -> LearnedBelief:
     r"""Return the belief of a product, by annealed importance sampling.
 
     .. math::
@@ -56,7 +56,7 @@ def sample_product(
     particles, num_steps = population_monte_carlo(
         product.log_joint, base, rng, num_particles=num_particles
     )
-    belief = RefinedBelief(prior, product, particles, defensive=defensive)
+    belief = LearnedBelief(prior, product, particles, defensive=defensive)
     belief.label = "product over trials"
     effective = particles.effective_sample_size
     belief.diagnostics = Diagnostics().extended(

@@ -4,28 +4,28 @@ Here live its stages, its beliefs, and how far to trust them. No network is aske
 """
 
 from sbi_active.inference.refinement.importance import importance_sample
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import BLURRED
 from sbi_active.inference.refinement.regression_error import (
     LARGE,
     expected_error,
     widened,
 )
-from sbi_active.inference.refinement.simulated_belief import ExactBelief
+from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
 from sbi_active.inference.refinement.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
 )
-from sbi_active.inference.refinement.stages import Refinement, refine
+from sbi_active.inference.refinement.stages import RefinementOptions, refine
 
 __all__ = [
     "BLURRED",
-    "ExactBelief",
+    "SimulatedBelief",
     "LARGE",
     "MeanTable",
-    "RefinedBelief",
-    "Refinement",
+    "LearnedBelief",
+    "RefinementOptions",
     "SimulatedLikelihood",
     "declares_noise",
     "expected_error",

@@ -16,7 +16,7 @@ from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import Particles
 from sbi_active.seeding import forked_generators
 
-__all__ = ["LearnedLikelihood", "RefinedBelief"]
+__all__ = ["LearnedLikelihood", "LearnedBelief"]
 
 Array = NDArray[Any]
 
@@ -44,7 +44,7 @@ class LearnedLikelihood(Protocol):
         ...
 
 
-class RefinedBelief(Belief):
+class LearnedBelief(Belief):
     r"""The posterior of all trials given the original prior.
 
     .. math::

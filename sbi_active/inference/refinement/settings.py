@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Refinement"]
+__all__ = ["RefinementOptions"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refinement:
+class RefinementOptions:
     """Settings of the refinement.
 
     Attributes:

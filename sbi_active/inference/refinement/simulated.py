@@ -15,8 +15,8 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.importance import WeightedPool, importance_sample
-from sbi_active.inference.refinement.settings import Refinement
-from sbi_active.inference.refinement.simulated_belief import ExactBelief
+from sbi_active.inference.refinement.settings import RefinementOptions
+from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
 from sbi_active.inference.refinement.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
@@ -93,9 +93,9 @@ def refine_exactly(
     first: Sequence[tuple[int, Proposal]],
     histories: HistoryRecord,
     pool: WeightedPool | None,
-    settings: Refinement,
+    settings: RefinementOptions,
     seed: int,
-) -> ExactBelief | None:
+) -> SimulatedBelief | None:
     """Return the posterior by importance sampling; None where too few draws count.
 
     Args:
@@ -123,7 +123,7 @@ def refine_exactly(
     )
     if pool.effective_sample_size < USABLE:
         return None
-    belief = ExactBelief(
+    belief = SimulatedBelief(
         prior, coordinates, likelihood, pool, defensive=settings.defensive
     )
     num_simulations = table.num_simulations - before[0]

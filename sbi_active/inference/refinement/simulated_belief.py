@@ -16,12 +16,12 @@ from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import KernelProposal
 from sbi_active.seeding import forked_generators
 
-__all__ = ["ExactBelief"]
+__all__ = ["SimulatedBelief"]
 
 BEYOND = 20.0  # nats below the defensive share at which a density is given up
 
 
-class ExactBelief(Belief):
+class SimulatedBelief(Belief):
     r"""The posterior of all trials, with the likelihood simulated and not learned.
 
     .. math::

@@ -15,12 +15,12 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import require_support
 from sbi_active.inference.beliefs.comparison import compare_orders
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
 from sbi_active.inference.refinement.regression_error import SMALL, widened
-from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.refinement.simulated import ExactRecord, refine_exactly
-from sbi_active.inference.refinement.simulated_belief import ExactBelief
+from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
 from sbi_active.inference.refinement.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
@@ -54,7 +54,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 from sbi_active.threads import single_thread
 
-__all__ = ["Refinement", "refine"]
+__all__ = ["RefinementOptions", "refine"]
 
 Array = NDArray[Any]
 
@@ -71,9 +71,9 @@ def refine(
     *,
     start: Distribution | Sequence[Distribution] | None = None,
     past: HistoryRecord | None = None,
-    settings: Refinement | None = None,
+    settings: RefinementOptions | None = None,
     seed: int,
-) -> RefinedBelief | ExactBelief:
+) -> LearnedBelief | SimulatedBelief:
     r"""Return the posterior of all trials given the original prior.
 
     Stage by stage, over the whole prior and then in ellipsoids around what is still
@@ -102,7 +102,7 @@ def refine(
             before the last trial. It adds simulations and no weight, so it cannot bias.
         past: ``belief.histories`` of an earlier call whose trials are the first of
             these: what still lies in a region is simulated at the new actions only.
-        settings: Budget and shares; None is ``Refinement()``.
+        settings: Budget and shares; None is ``RefinementOptions()``.
         seed: Of everything random here.
 
     Returns:
@@ -128,7 +128,7 @@ def refine(
         True
     """
     prior = require_support(prior)
-    settings = Refinement() if settings is None else settings
+    settings = RefinementOptions() if settings is None else settings
     action, outcome = _trials(action, x)
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
@@ -150,7 +150,7 @@ def refine(
             belief = _refine(
                 simulator, prior, action, outcome, hints, past, settings, seed
             )
-        if settings.check_order and isinstance(belief, RefinedBelief):
+        if settings.check_order and isinstance(belief, LearnedBelief):
             other_seed = derive_seed(seed, "reversed")
             other = _refine(
                 simulator,
@@ -173,9 +173,9 @@ def _refine(
     outcome: Tensor,
     hints: Sequence[Distribution],
     past: HistoryRecord | None,
-    settings: Refinement,
+    settings: RefinementOptions,
     seed: int,
-) -> RefinedBelief | ExactBelief:
+) -> LearnedBelief | SimulatedBelief:
     rng = np.random.default_rng(derive_seed(seed, "refine"))
     coordinates = PriorCoordinates(prior, rng)
     observed, engine = outcome.numpy().reshape(len(outcome), -1), settings.engine
@@ -275,7 +275,7 @@ def _refine(
     empty = np.zeros((0, observed.size))
     slim = [replace(r, residual=empty, standardized=empty) for r in regressions]
     surrogate = Surrogate(coordinates, slim)
-    belief = RefinedBelief(prior, surrogate, particles, defensive=settings.defensive)
+    belief = LearnedBelief(prior, surrogate, particles, defensive=settings.defensive)
     belief.diagnostics = diagnostics
     belief.histories = histories.record()
     if histories.num_missing:
@@ -289,7 +289,7 @@ def _refine(
     return belief
 
 
-def _stage_size(settings: Refinement, used: int, least: int) -> int:
+def _stage_size(settings: RefinementOptions, used: int, least: int) -> int:
     share = settings.first_share if used == 0 else settings.stage_share
     size = max(int(share * settings.num_histories), least)
     left = settings.num_histories - used
@@ -301,7 +301,7 @@ def _sampled(
     surrogate: Surrogate,
     base: Proposal,
     first: Proposal | None,
-    settings: Refinement,
+    settings: RefinementOptions,
     rng: np.random.Generator,
 ) -> Stage:
     """Return the stage of a surrogate, its density sampled.
@@ -338,7 +338,7 @@ def _with_more(
     stage: Stage,
     histories: Histories,
     base: Proposal,
-    settings: Refinement,
+    settings: RefinementOptions,
     rng: np.random.Generator,
 ) -> Stage:
     """Return the stage with simulations from further off, where they are of use."""
@@ -353,7 +353,7 @@ def _simulate_stage(
     histories: Histories,
     regions: list[Region],
     size: int,
-    settings: Refinement,
+    settings: RefinementOptions,
     rng: np.random.Generator,
 ) -> None:
     """Bring a stage's regions to their numbers, past histories first."""

@@ -32,7 +32,7 @@ from sbi_active.inference.networks.training import (
     TrainingRecord,
     train_mixture_density,
 )
-from sbi_active.inference.refinement.learned_belief import RefinedBelief
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.stages import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
@@ -252,7 +252,7 @@ class ASBI(MixtureRounds, NPE_C):
         # A chained belief can be wrong; the refined one before the trial holds the
         # posterior, if only it is wide enough.
         start = [] if chained is None else [chained]
-        if isinstance(previous, RefinedBelief):
+        if isinstance(previous, LearnedBelief):
             start.append(previous)
         belief = refine(
             told.simulator,

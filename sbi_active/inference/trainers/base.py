@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.inference.rounds.rows import Observation
 
@@ -26,7 +26,7 @@ class Told:
     Attributes:
         trials: All of them, the new one last.
         simulator: To refine the belief with; None takes the word of the network.
-        refinement: Budget of that; None is ``Refinement()``.
+        refinement: Budget of that; None is ``RefinementOptions()``.
         given_seed: By the caller; None for none.
         afresh: Whether to begin at the prior, without the belief before the last trial
             and without this round's network.
@@ -34,14 +34,14 @@ class Told:
 
     trials: Sequence[Observation]
     simulator: Callable[..., Any] | None
-    refinement: Refinement | None
+    refinement: RefinementOptions | None
     given_seed: int | None
     afresh: bool = False
 
     @property
-    def settings(self) -> Refinement:
+    def settings(self) -> RefinementOptions:
         """Of the refinement."""
-        return Refinement() if self.refinement is None else self.refinement
+        return RefinementOptions() if self.refinement is None else self.refinement
 
     def seed(self) -> int:
         """Return the seed given, or else one from torch's global generator."""
@@ -103,7 +103,7 @@ class ActiveInference(ABC):
         *,
         action: Tensor,
         simulator: Callable[..., Any] | None = None,
-        refinement: Refinement | None = None,
+        refinement: RefinementOptions | None = None,
         seed: int | None = None,
     ) -> Belief:
         """Return the belief after a real trial, and make it the current one.
@@ -115,7 +115,7 @@ class ActiveInference(ABC):
                 not be one of the actions that were asked for.
             simulator: ``simulator(theta, action)`` to refine the belief with; None
                 takes the word of this round's network.
-            refinement: Budget of the refinement; None is ``Refinement()``.
+            refinement: Budget of the refinement; None is ``RefinementOptions()``.
             seed: Of everything random in the refinement; None draws one from torch's
                 global generator.
 
@@ -136,7 +136,7 @@ class ActiveInference(ABC):
         trials: Sequence[Observation],
         simulator: Callable[..., Any],
         *,
-        refinement: Refinement | None = None,
+        refinement: RefinementOptions | None = None,
         seed: int | None = None,
     ) -> Belief:
         """Return the refined belief of these trials alone, computed from scratch.

@@ -24,7 +24,7 @@ from sbi_active.inference.products.product import (
     TrainedRegion,
     widened,
 )
-from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
@@ -58,7 +58,7 @@ class ProductRounds(ActionRounds):
     one, further parameters are drawn around it, more widely, and simulated at the
     executed actions alone, and a network trained on those rows gives the product
     again. Without a network of this round that begins at the belief before, and takes
-    two stages or, from the prior, four; ``Refinement.num_histories`` is their sum.
+    two stages or, from the prior, four; the options' ``num_histories`` is their sum.
 
     Args:
         arguments: Of :class:`.ActionRounds`.
@@ -206,7 +206,7 @@ class ProductRounds(ActionRounds):
         trials: Sequence[Observation],
         simulator: Callable[..., Any],
         start: Belief | None,
-        settings: Refinement,
+        settings: RefinementOptions,
         seed: int,
     ) -> Belief:
         """Simulate the executed actions where the belief is, and learn that."""
@@ -259,7 +259,7 @@ class ProductRounds(ActionRounds):
         return coordinates.to_theta(z)
 
     def _product(
-        self, trials: Sequence[Observation], settings: Refinement, seed: int
+        self, trials: Sequence[Observation], settings: RefinementOptions, seed: int
     ) -> Belief:
         """Return the belief under this round's network."""
         prior, previous = require_support(self._prior), self._round_belief

@@ -17,7 +17,7 @@ from sbi_active.inference.beliefs.belief import Belief, require_support
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.lfire_model import LFIREModel, fit_log_ratios
-from sbi_active.inference.refinement.settings import Refinement
+from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.rows import (
     Observation,
     RoundRows,
@@ -51,7 +51,7 @@ class SeqBED(ActiveInference):
     :class:`.SeqBED_C` shares them.
 
     With a simulator, ``update`` simulates new particles at the executed action alone,
-    which allows more of them: ``Refinement.num_histories`` simulations a trial. The
+    which allows more of them: ``refinement.num_histories`` simulations a trial. The
     belief is kernels around the weighted particles; its diagnostics tell their
     effective number.
 
@@ -235,7 +235,7 @@ class SeqBED(ActiveInference):
         belief: Distribution,
         trial: Observation,
         simulator: Callable[..., Any],
-        settings: Refinement,
+        settings: RefinementOptions,
         seed: int,
     ) -> Belief:
         """Weigh new particles of a belief, simulated at the executed action."""
