@@ -38,7 +38,6 @@ if TYPE_CHECKING:
         StudentTNoise,
         estimate_noise,
         simulate,
-        unknown_noise,
     )
 
     __version__: str
@@ -68,7 +67,6 @@ __all__ = [
     "estimate_noise",
     "simulate",
     "to_inference_data",
-    "unknown_noise",
 ]
 
 #: Where the names above are defined or re-exported.
@@ -98,7 +96,6 @@ _HOMES = {
         "StudentTNoise",
         "estimate_noise",
         "simulate",
-        "unknown_noise",
     ),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
@@ -116,6 +113,7 @@ _former = former_names(
         "Refinement": "sbi_active:RefinementOptions",
         "Simulations": "sbi_active.simulation:Simulations",
         "Trial": "sbi_active.campaign:Trial",
+        "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
     },
     stacklevel=3,
 )

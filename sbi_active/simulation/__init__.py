@@ -14,7 +14,6 @@ from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.estimation import estimate_noise
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.noise.student import StudentTNoise
-from sbi_active.simulation.noise.unknown import unknown_noise
 from sbi_active.simulation.outcomes import (
     MissingRowsWarning,
     Outcome,
@@ -40,7 +39,6 @@ __all__ = [
     "estimate_noise",
     "reuse",
     "simulate",
-    "unknown_noise",
 ]
 
 __getattr__ = former_names(
@@ -51,5 +49,6 @@ __getattr__ = former_names(
         "Simulator": "sbi_active.simulation.model:Simulator",
         "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
         "require_noise": "sbi_active.simulation.model:require_noise",
+        "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
     },
 )

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
-from sbi_active.simulation import SimulatorModel, unknown_noise
+from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
 
 __all__ = [
     "GRAVITY",
@@ -155,7 +155,7 @@ def make_simulator(**bound: Any) -> SimulatorModel:
         bound: Keyword arguments of :class:`SimulatorModel` in place of these.
     """
     options: dict[str, Any] = {
-        "noise": unknown_noise(
+        "noise": AutocorrelatedNoise.unknown(
             sd=SD, correlation_time=CORRELATION_TIME, num_sds=16, num_times=10
         ),
         "parameter_names": ["picture scale", "picture bend"],

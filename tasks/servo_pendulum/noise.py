@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sbi_active.simulation import AutocorrelatedNoise, unknown_noise
+from sbi_active.simulation import AutocorrelatedNoise
 
 __all__ = ["servo_noise"]
 
@@ -23,7 +23,7 @@ def servo_noise(*, correlated: bool = True) -> AutocorrelatedNoise:
     Args:
         correlated: False forces errors that are independent, of unknown size.
     """
-    return unknown_noise(
+    return AutocorrelatedNoise.unknown(
         sd=SD,
         correlation_time=CORRELATION_TIME if correlated else NO_TIME,
         measurement_sd=ENCODER_SD,

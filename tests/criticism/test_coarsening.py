@@ -8,7 +8,7 @@ from torch.distributions import Normal
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps import power
-from sbi_active.simulation import AutocorrelatedNoise, unknown_noise
+from sbi_active.simulation import AutocorrelatedNoise
 
 SENSOR = 0.01
 TIMES = torch.linspace(0.05, 2.0, 40)
@@ -35,7 +35,7 @@ EFFECTS = [drag(1.5), drag(3.0)]
 
 def trace(shape, *, measurement_sd=SENSOR):
     """Trials with an undeclared effect of some shape in time."""
-    noise = unknown_noise(
+    noise = AutocorrelatedNoise.unknown(
         sd=(0.5 * SENSOR, 1.0),
         correlation_time=(0.01, 5.0),
         num_sds=20,

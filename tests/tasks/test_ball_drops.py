@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from benchmarks.measured import ball_drops as benchmark
 from benchmarks.measured.ball_tables import tables
 from benchmarks.measured.fall_least_squares import forecast_error, second_drop_error
-from sbi_active import unknown_noise
+from sbi_active import AutocorrelatedNoise
 from sbi_active.criticism import AugmentedSimulator, Criticism
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.ball_drops import (  # pyright: ignore
@@ -99,7 +99,7 @@ def test_the_task_is_a_real_system():
 
 def test_the_noise_is_log_uniform_in_size_and_correlation_time():
     bounds = torch.tensor([[0.02, 0.2], [0.015, 7.5]]).double()
-    noise = unknown_noise(
+    noise = AutocorrelatedNoise.unknown(
         sd=(0.02, 0.2), correlation_time=(0.015, 7.5), num_sds=16, num_times=10
     )
     assert noise.posterior is not None

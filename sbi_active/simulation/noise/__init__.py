@@ -7,7 +7,6 @@ from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise
 from sbi_active.simulation.noise.estimation import estimate_noise
 from sbi_active.simulation.noise.gaussian import GaussianNoise, NoiseModel
 from sbi_active.simulation.noise.student import StudentTNoise
-from sbi_active.simulation.noise.unknown import unknown_noise
 
 __all__ = [
     "AutocorrelatedNoise",
@@ -15,5 +14,4 @@ __all__ = [
     "NoiseModel",
     "StudentTNoise",
     "estimate_noise",
-    "unknown_noise",
 ]
