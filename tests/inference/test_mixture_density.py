@@ -93,7 +93,8 @@ def test_missing_outcomes_are_something_to_condition_on():
     net = MixtureDensity(hidden_features=(32,))(theta, condition)
     assert net.knows(torch.tensor([[torch.nan, torch.nan, 0.0]]))
     assert not net.knows(torch.tensor([[0.0, 0.0, torch.nan]]))
-    assert net._masked_columns == [0]  # the columns go missing together: one mask
+    # The columns go missing together: the layers see three numbers and one mask.
+    assert next(net.net.parameters()).shape[1] == 3 + 1
     train_mixture_density(
         net,
         torch.optim.Adam(net.parameters(), lr=5e-3),
