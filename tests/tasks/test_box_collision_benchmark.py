@@ -15,7 +15,9 @@ from benchmarks.box_collision.summary import (  # noqa: E402
     coverage_table,
     draw,
     read,
+    save,
     summarize,
+    time_parts,
 )
 from sbi_active.tasks.box_collision import exact_posterior  # pyright: ignore  # noqa: E402
 
@@ -96,11 +98,39 @@ def test_coverage_has_a_binomial_interval():
     assert "0.975 within [0.800, 0.975]" in text
 
 
-def test_figures(tmp_path):
+def test_figures_draw_medians_speeds_and_times(tmp_path, monkeypatch):
+    figures = {}
+
+    def keep(figure, path):
+        figures[path.name] = figure
+        return save(figure, path)
+
+    monkeypatch.setattr("benchmarks.box_collision.summary.save", keep)
     cells = {("asbi", "1"): rows(5.0, 3.0), ("nsbi", "1"): rows(9.0, 1.0)}
+    for row in (row for part in cells.values() for row in part):
+        row |= {f"wall_{stage}": str(k + 2) for k, stage in enumerate(STAGES)}
     paths = draw(cells, tmp_path / "figures")
     assert [path.name for path in paths] == ["log_prob.png", "speeds.png", "time.png"]
-    assert all(path.stat().st_size > 5_000 for path in paths)
+    assert [*figures] == [path.name for path in paths]
+    (ax,) = figures["log_prob.png"].axes
+    # Seeds k are k / 10 nats better than seed 0; six rounds, ASBI left of NSBI.
+    medians = ax.lines[4::6][:12]  # beside whiskers, caps and outliers
+    heights = [float(line.get_ydata().mean()) for line in medians]
+    assert heights == pytest.approx(6 * [3.15] + 6 * [1.15])
+    places = [float(line.get_xdata().mean()) for line in medians]
+    expected = [r + shift for shift in (-0.125, 0.125) for r in range(1, 7)]
+    assert places == pytest.approx(expected)
+    for ax, speed in zip(figures["speeds.png"].axes, (5.25, 9.25), strict=True):
+        (line,) = ax.lines  # one seed of four is 1 m/s faster
+        assert line.get_xydata().tolist() == [[r, speed] for r in range(1, 7)]
+        band = ax.collections[0].get_paths()[0].get_extents()
+        assert (band.y0, band.y1) == pytest.approx((speed - 0.433, speed + 0.433), 1e-3)
+    (ax,) = figures["time.png"].axes
+    heights = [*time_parts(cells["asbi", "1"], "wall").values()]
+    assert [bar.get_height() for bar in ax.patches] == 2 * heights
+    bottoms = [sum(heights[:k]) for k in range(len(heights))]
+    assert [bar.get_y() for bar in ax.patches] == 2 * bottoms
+    assert sum(heights) == sum(range(2, 2 + len(STAGES)))
 
 
 def test_a_bank_gives_what_it_was_given(tmp_path):

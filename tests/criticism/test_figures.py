@@ -1,0 +1,126 @@
+"""What the figures of a report draw, number by number."""
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from sbi_active.criticism.report.figures import (
+    AFTER,
+    BEFORE,
+    plot_before_after,
+    plot_probabilities,
+    plot_residuals,
+)
+from tests.criticism.reports import evaluation, residuals, tracing
+
+
+def points(ax):
+    """Return what is drawn as points, shape (n, 2), a row each, in one order."""
+    drawn = [line.get_xydata() for line in ax.lines if line.get_marker() == "."]
+    return rows_in_order(np.concatenate(drawn))
+
+
+def rows_in_order(rows):
+    return rows[np.lexsort(rows.T)]
+
+
+@pytest.mark.parametrize("shape", [(1,), (6,)])
+def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(shape):
+    before, after = residuals(shape, size=4.0), residuals(shape)
+    figure = plot_residuals(before, after, added="a gain")
+    columns = 2 if shape == (1,) else 3
+    assert len(figure.axes) == 2 * columns
+    for row, (made, color, title) in enumerate(
+        [(before, BEFORE, "bare model"), (after, AFTER, "with a gain")]
+    ):
+        panels = figure.axes[row * columns : (row + 1) * columns]
+        num = shape[0]
+        channel = np.tile(np.arange(num), len(made.index))
+        places = [np.repeat(made.action[:, 0], num), np.repeat(made.index, num)]
+        for ax, place in zip(panels, [*places, channel], strict=False):
+            expected = np.column_stack([place, made.refitted.ravel()])
+            np.testing.assert_allclose(points(ax), rows_in_order(expected))
+            assert {line.get_color() for line in ax.lines[:num]} == {color}
+        assert panels[0].get_ylabel().startswith(title)
+
+
+def test_a_trajectory_is_a_line_a_trial_and_channel_over_its_own_times():
+    times = np.linspace(0, 1, 20) * np.arange(1, 9)[:, None]
+    made = residuals((20, 2), times=times)
+    ax = plot_residuals(made).axes[-1]
+    drawn = [line.get_xydata() for line in ax.lines[:16]]
+    for k, trajectory in enumerate(drawn):
+        np.testing.assert_allclose(trajectory[:, 0], times[k // 2])
+        np.testing.assert_allclose(trajectory[:, 1], made.refitted[k // 2, :, k % 2])
+
+
+@pytest.mark.parametrize(("size", "scale"), [(1.0, "linear"), (40.0, "symlog")])
+def test_the_band_is_two_deviations_and_all_points_are_in_view(size, scale):
+    made = residuals(size=size)
+    for ax in plot_residuals(made).axes:
+        (band,) = ax.patches
+        assert band.get_extents().height > 0
+        low, high = band.get_y(), band.get_y() + band.get_height()
+        assert (low, high) == (-2, 2)
+        assert ax.get_yscale() == scale
+        low, high = ax.get_ylim()
+        assert low == -high
+        largest = np.abs(made.refitted).max()
+        assert largest < high < 2 * max(largest, 3.5)
+
+
+def test_labels_are_those_of_actions_and_channels():
+    figure = plot_residuals(
+        residuals(), action_labels=["speed [m/s]"], channel_names=list("abcdef")
+    )
+    first, trial, channel = figure.axes
+    assert first.get_xlabel() == "speed [m/s]"
+    assert trial.get_xlabel() == "trial"
+    assert [t.get_text() for t in channel.get_xticklabels()] == list("abcdef")
+
+
+def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
+    shares = {"drag": 0.6, "tilt": 0.33, "drag + tilt": 0.015, "none": 0.001}
+    shares |= {"drag + bias": 0.004, "scatter": 0.05}
+    found = tracing(probabilities=shares, credible_set=("drag", "tilt"))
+    (ax,) = plot_probabilities(found).axes
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    assert names == ["none", "drag + tilt", "scatter", "tilt", "drag"]  # upwards
+    assert [bar.get_width() for bar in ax.patches] == [shares[n] for n in names]
+    filled = {n for n, b in zip(names, ax.patches, strict=True) if is_filled(b)}
+    assert filled == {"drag", "tilt"}
+    texts = [text.get_text() for text in ax.texts]
+    assert texts == ["< 0.01", "0.01", "0.05", "0.33", "0.60"]
+    (ax,) = plot_probabilities(found, at_most=2).axes
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["tilt", "drag"]
+
+
+def is_filled(bar):
+    return to_hex(bar.get_facecolor()) == AFTER
+
+
+def test_every_score_is_drawn_before_and_after_with_its_total():
+    made = evaluation()
+    figure = plot_before_after(made)
+    assert len(figure.axes) == len(made.before)
+    for ax, name in zip(figure.axes, made.before, strict=True):
+        pairs = np.stack([made.before[name], made.after[name]], 1)
+        drawn = [line.get_ydata() for line in ax.lines[: len(pairs)]]
+        np.testing.assert_allclose(drawn, pairs)
+        (row,) = made.table[made.table["metric"] == name].to_dict("records")
+        totals = [line for line in ax.lines if line.get_marker() == "_"]
+        assert [float(line.get_ydata()[0]) for line in totals] == [
+            row["before"],
+            row["after"],
+        ]
+        ticks = [label.get_text() for label in ax.get_xticklabels()]
+        assert ticks == ["before", "after"]
+
+
+def test_scores_that_span_decades_have_a_logarithmic_axis():
+    made = evaluation()
+    assert plot_before_after(made).axes[0].get_yscale() == "linear"
+    made.after["rmse"][:] /= 10
+    ax = plot_before_after(made).axes[0]
+    assert ax.get_yscale() == "log"
+    assert ax.get_ylim()[0] < made.after["rmse"].min()
