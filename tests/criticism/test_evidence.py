@@ -1,7 +1,5 @@
 """Evidence against closed forms: linear models with Gaussian priors and noise."""
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 import torch
@@ -11,15 +9,8 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.evidence import SCALES, RivalSet, log_evidence
-from sbi_active.criticism.rivals import (
-    NoiseCell,
-    NoiseGrid,
-    ResidualProcess,
-    declared_noise,
-)
-from sbi_active.criticism.steps import log_prior
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.unknown_scale import SCALES, log_evidence
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 ACTION = torch.linspace(-2, 2, 8)[:, None]
@@ -159,95 +150,6 @@ def test_scatter_sums_out_the_inflation():
     assert evidence.log_evidence == pytest.approx(expected, abs=0.1)
 
 
-def test_the_residual_process_is_a_gaussian_of_the_stated_covariance():
-    trials = Trials(ACTION, X)
-    m = Measurements.of(trials)
-    noise = declared_noise(GaussianNoise(0.5), m)
-    action = ACTION.double().numpy() / 4
-    process = ResidualProcess(noise, m, action=action, largest=20.0, lengths=(0.3,))
-    r = X[:, 0].double().numpy()
-    kernel = np.exp(-0.5 * ((action - action.T) / 0.3) ** 2)
-    each = [
-        multivariate_normal(np.zeros(8), 0.25 * (a**2 * kernel + np.eye(8))).logpdf(r)
-        for a in np.geomspace(1, 20, 10)
-    ]
-    expected = np.logaddexp.reduce(each) - np.log(10)
-    # Directions below 1e-5 of the variance are left out.
-    assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)
-
-
-def test_the_process_interpolates_what_it_was_conditioned_on():
-    trials = Trials(ACTION, X)
-    m = Measurements.of(trials)
-    noise = declared_noise(GaussianNoise(0.05), m)
-    action = ACTION.double().numpy() / 4
-    process = ResidualProcess(noise, m, action=action, largest=100.0)
-    wave = np.sin(3 * action[:, 0])
-    mean, sd = process.condition(wave[None], m, np.concatenate([action, action]))
-    np.testing.assert_allclose(mean[0], wave, atol=0.1)
-    assert np.all(sd < 0.1)
-
-
-def test_one_process_follows_the_order_of_the_trials():
-    m = Measurements.of(Trials(ACTION, X))
-    noise = declared_noise(GaussianNoise(0.5), m)
-    order = np.arange(8) / 7
-    action = np.random.default_rng(0).permutation(ACTION.double().numpy() / 4)
-    r = X[:, 0].double().numpy()
-    parts = [
-        ResidualProcess(noise, m, action=place, largest=20.0, lengths=(0.3,))
-        for place in (action, order[:, None])
-    ]
-    both = ResidualProcess(
-        noise, m, action=action, order=order, largest=20.0, lengths=(0.3,)
-    )
-    each = [process.log_likelihood(r[None])[0] for process in parts]
-    expected = np.logaddexp(*each) - np.log(2)
-    assert both.log_likelihood(r[None])[0] == pytest.approx(expected)
-    # A slow drift is carried on for a while.
-    drift = 4 * np.sin(2 * order)
-    later = np.concatenate([order, order[-1:] + 0.05])
-    there = np.concatenate([action, action[:1]])
-    one = Measurements.of(Trials(ACTION[:1], X[:1]))
-    mean, _ = both.condition(drift[None], one, there, order=later)
-    assert mean[0, 0] == pytest.approx(4 * np.sin(2 * later[-1]), abs=0.5)
-
-
-TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
-
-
-def test_correlated_noise_is_a_gaussian_of_exponential_covariance():
-    x = torch.tensor([[0.1, 0.4, torch.nan, 0.2, -0.3], [1.0, 0.9, 0.5, 0.4, 0.2]])
-    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
-    sd = np.full(len(m), 0.7)
-    cell = NoiseCell.of(m, sd=sd, correlation_time=0.4)
-    expected = 0.0
-    for t in range(2):
-        at = m.trial == t
-        gap = np.abs(m.time[at][:, None] - m.time[at])
-        cov = 0.49 * np.exp(-gap / 0.4)
-        expected += multivariate_normal(np.zeros(at.sum()), cov).logpdf(m.x[at])
-    got = NoiseGrid([cell]).log_likelihood(m.x[None])[0]
-    assert got == pytest.approx(expected, rel=1e-9)
-
-
-def test_a_time_axis_leaves_the_correlation_open():
-    x = torch.zeros(2, 5)
-    without = Measurements.of(Trials([0.0, 1.0], x))
-    with_times = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
-    noise = GaussianNoise(1.0)
-    assert len(declared_noise(noise, without).cells) == 1
-    grid = declared_noise(noise, with_times)
-    assert len(grid.cells) > 10
-    assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
-
-
-def test_noise_without_size_is_refused():
-    m = Measurements.of(Trials([0.0, 1.0], [0.0, 1.0]))
-    with pytest.raises(ValueError, match="expected measurement noise with a standard"):
-        declared_noise(GaussianNoise(0.0), m)
-
-
 def test_a_curved_ridge_has_the_right_evidence():
     # theta (1 + phi) is all that the data see: the ridge is a hyperbola.
     gain = Effect(
@@ -279,38 +181,6 @@ def test_a_curved_ridge_has_the_right_evidence():
     assert evidence.log_evidence == pytest.approx(
         max(each) + np.log(area), abs=4 * evidence.standard_error
     )
-
-
-def test_the_residual_process_may_grow_with_the_prediction():
-    m = Measurements.of(Trials(ACTION, X))
-    noise = declared_noise(GaussianNoise(0.5), m)
-    action = ACTION.double().numpy() / 4
-    spread = np.exp(3 * XI)
-    process = ResidualProcess(
-        noise, m, action=action, largest=20.0, lengths=(0.3,), spread=spread
-    )
-    r = X[:, 0].double().numpy()
-    kernel = np.exp(-0.5 * ((action - action.T) / 0.3) ** 2)
-    relative = spread * np.median(0.5 / spread)
-    each = [
-        multivariate_normal(
-            np.zeros(8), a**2 * kernel * np.outer(b, b) + 0.25 * np.eye(8)
-        ).logpdf(r)
-        for a in np.geomspace(1, 20, 10)
-        for b in (np.full(8, 0.5), relative)
-    ]
-    expected = np.logaddexp.reduce(each) - np.log(20)
-    # Directions below 1e-5 of the variance are left out.
-    assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
-    prior = {"none": 0.5, "unexplained": 0.1, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
-    log_p = {name: float(np.log(p)) for name, p in prior.items()}
-    sets = combinations("abcd", size)
-    total = sum(np.exp(log_prior(names, log_p)) for names in sets)
-    assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
 
 
 def test_the_order_of_a_few_trials_is_no_structure():

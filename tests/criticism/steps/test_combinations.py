@@ -1,0 +1,82 @@
+"""Sets of several effects, against all sets of a linear world."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.steps.combinations import grow, log_prior
+from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.tracing import log_priors
+from tests.criticism.steps import linear_world
+from tests.criticism.steps.linear_world import SHAPES, measured, rivals
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
+    prior = {"none": 0.5, "unexplained": 0.1, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
+    log_p = {name: float(np.log(p)) for name, p in prior.items()}
+    sets = combinations("abcd", size)
+    total = sum(np.exp(log_prior(names, log_p)) for names in sets)
+    assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
+
+
+def test_a_set_has_the_mean_probability_of_its_effects():
+    log_p = {name: float(np.log(p)) for name, p in {"a": 0.1, "b": 0.3}.items()}
+    log_p["c"] = float(np.log(0.05))
+    few, many = log_prior(("a", "c"), log_p), log_prior(("a", "b"), log_p)
+    assert many - few == pytest.approx(np.log(0.4 / 0.15))
+
+
+def grown(x):
+    """Return what is grown, the models, and the log priors of single effects."""
+    some = rivals(x)
+    prior = log_priors([*some.effects.values()])
+    singles = {n: prior[n] + log_evidence(some, (n,))[0] for n in some.effects}
+    return grow(some, singles, prior), some, prior
+
+
+def worthy_sets(x):
+    """Return sets with a Bayes factor above 20 against each of their parts."""
+    found = []
+    for size in (2, 3):
+        for names in combinations(SHAPES, size):
+            parts = combinations(names, size - 1)
+            best = max(linear_world.log_evidence(x, part) for part in parts)
+            if linear_world.log_evidence(x, names) - best > THRESHOLD:
+                found.append(names)
+    return found
+
+
+@pytest.mark.parametrize(
+    "phi",
+    [
+        {"curve": 0.5, "wave": 0.5},
+        {"wave": 0.6, "kink": -0.6},
+        {"curve": 0.5, "wave": 0.5, "kink": 0.6},
+    ],
+    ids=" ".join,
+)
+def test_what_grows_are_the_sets_that_pay_for_each_of_their_effects(phi):
+    x = measured(**phi)
+    found, some, prior = grown(x)
+    worthy = worthy_sets(x)
+    assert tuple(phi) in worthy
+    # Once a set fits, no set far behind it is added to.
+    assert {*found} <= {" + ".join(names) for names in worthy}
+    assert " + ".join(phi) in found
+    assert max(found, key=found.__getitem__) == " + ".join(phi)
+    for joined, value in found.items():
+        names = (*joined.split(" + "),)
+        exact = linear_world.log_evidence(x, names) + log_prior(names, prior)
+        error = log_evidence(some, names)[1]
+        assert error < 0.2
+        assert value == pytest.approx(exact, abs=4 * error)
+
+
+@pytest.mark.parametrize("phi", [{}, {"curve": 0.5}, {"kink": 1.0}], ids=" ".join)
+def test_where_nothing_is_left_over_no_set_is_fitted(phi):
+    found, some, _ = grown(measured(**phi))
+    assert found == {}
+    assert not [name for name in some.evidences if " + " in name]
