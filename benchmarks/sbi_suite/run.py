@@ -48,7 +48,8 @@ def run_tests(root: Path, files: list[str], *, swap: bool) -> dict[str, str]:
     command = [sys.executable, "-m", "pytest", "-q", *files, f"--junitxml={report}"]
     command += ["-m", "not slow and not gpu and not mcmc", "-p", "no:cacheprovider"]
     command += ["-p", "swap"] if swap else []
-    env = os.environ | {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
+    paths = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
+    env = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     subprocess.run(command, cwd=root, env=env)
     outcomes = {}
     for case in ET.parse(report).iter("testcase"):
