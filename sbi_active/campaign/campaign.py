@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -32,6 +31,7 @@ from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
+    from sbi_active.inference.models.posterior import ActionPosterior
 
 __all__ = ["METHODS", "Campaign"]
 
@@ -41,6 +41,12 @@ class Campaign:
 
     A round: :meth:`ask` for an action, execute it, :meth:`tell` the outcome.
     ``tell`` only records; inference runs in the next ``ask`` or in :meth:`update`.
+
+    Each round trains a network, :attr:`posterior`; what asked it is in
+    ``Trial.network_used_by``. With declared noise neither action nor refined belief
+    rest on it: notes and diagnostics compare it with them, and refinement also looks
+    where it points. With the option ``network="on demand"`` it is trained only when
+    something asks.
 
     Args:
         simulator: ``simulator(theta, action)``, shapes (n, theta_dim) and
@@ -124,6 +130,19 @@ class Campaign:
         return self._learner.stated_belief
 
     @property
+    @isolated
+    def posterior(self) -> ActionPosterior:
+        r"""The amortized posterior :math:`q(\theta | x, \xi)` under the current belief.
+
+        For any outcome at any action in milliseconds: what a trial would tell, before
+        it is run. It is this round's network, trained here where it was not yet; ahead
+        of :meth:`ask` that is on no trial's account. The methods "asbi" and "nsbi" have
+        one; for others this is a ValueError.
+        """
+        index = len(self.state.trials) if self.pending is None else self.pending.index
+        return self._learner.posterior(index)
+
+    @property
     def simulator(self) -> Callable[..., Any]:
         """The current simulator, with the effects that were adopted."""
         return self._learner.simulator
@@ -204,14 +223,9 @@ class Campaign:
             design, purpose = self._planner.design(
                 index, target, self._learner, alarmed=self.health == "alarm"
             )
-            trial = self.state.trials[index]
-            self.state.change(
-                index,
-                action=design.action,
-                design=design,
-                target=purpose,
-                num_simulations=trial.num_simulations + design.num_simulations,
-                num_missing=trial.num_missing + design.num_missing,
+            what = {"action": design.action, "design": design, "target": purpose}
+            self.state.account(
+                index, design.num_simulations, design.num_missing, **what
             )
         except BaseException:
             self.state.trials.pop()
@@ -260,14 +274,8 @@ class Campaign:
             action=action,
             status=status,
             x_shape=self._learner.x_shape,
-            action_dim=self.actions.action_dim,
+            actions=self.actions,
         )
-        if not bool(self.actions.contains(told.action)):
-            warnings.warn(
-                f"the executed action {told.action.tolist()} is not in {self.actions}; "
-                "it is simulated where it was executed",
-                stacklevel=3,
-            )
         if any(told is known for known in self.state.trials):
             return told
         return self.state.record(told)

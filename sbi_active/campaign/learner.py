@@ -23,6 +23,7 @@ from sbi_active.campaign.checks.unexplained import (
 )
 from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
 from sbi_active.campaign.methods import find_method
+from sbi_active.campaign.round_model import RoundModel
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import (
     information_gained,
@@ -30,6 +31,7 @@ from sbi_active.inference.beliefs.belief import (
     require_width,
 )
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed, forked_generators
@@ -79,9 +81,14 @@ class Learner:
         self._inference = find_method(self._state.method).build(
             self.prior, self._state.options
         )
-        self._round_ready = False
+        # Asking for the network must not change the beliefs of a campaign.
+        self._inference.starts_at_network = self._state.options.network == "each round"
+        self._end_round()
         self._stated: tuple[Distribution, list[str], Distribution] | None = None
         self.simulations: Simulations | None = None
+
+    def _end_round(self) -> None:
+        self._round_ready, self._asked = False, ()
 
     @property
     def belief(self) -> Distribution:
@@ -118,7 +125,7 @@ class Learner:
                 seed=derive_seed(state.seed, "score", trial.index),
                 engine=state.options.engine,
             )
-        self._account(
+        self._state.account(
             trial.index,
             score.num_simulations,
             score.num_missing,
@@ -146,7 +153,7 @@ class Learner:
             )
         far = outlyingness(trial.x, rows.without_missing().x)
         lost = rows.counts["missing"]
-        self._account(trial.index, len(rows), lost, outlyingness=far)
+        self._state.account(trial.index, len(rows), lost, outlyingness=far)
         return self._warned(trial.index)
 
     def _warned(self, index: int) -> Trial:
@@ -165,18 +172,21 @@ class Learner:
                 self._learn(trial)
                 return
             except UnexplainedOutcomeError:
-                self._account(trial.index, 0, 0, outlyingness=math.inf)
+                self._state.account(trial.index, 0, 0, outlyingness=math.inf)
                 self._warned(trial.index)
         # Its tail probability is below what any number of simulations resolves.
-        self._account(trial.index, 0, 0, information_gained=0.0, misfit=0.0)
+        self._state.account(trial.index, 0, 0, information_gained=0.0, misfit=0.0)
 
     def _learn(self, trial: Trial) -> None:
         assert trial.x is not None
-        if not self._has_index:
-            self.trained(trial.index)
-        before = self.belief
         state = self._state
         seed, options = state.seed, state.options
+        every_round = options.network == "each round"
+        if not self._has_index and (every_round or not options.refine):
+            self.trained(trial.index)
+            serves = self._inference.network_serves if options.refine else ("belief",)
+            self.note(trial.index, *serves)
+        before = self.belief
         with state.stage(trial.index, "update"):
             if self._has_index:
                 earlier = [t for t in state.explained if t.index != trial.index]
@@ -193,9 +203,9 @@ class Learner:
             gained = information_gained(
                 belief, before, seed=derive_seed(seed, "gain", trial.index)
             )
-        self._round_ready = False
+        self._end_round()
         figures = belief.diagnostics
-        self._account(
+        self._state.account(
             trial.index,
             figures.num_simulations,
             figures.num_missing,
@@ -235,6 +245,45 @@ class Learner:
             seed=derive_seed(state.seed, "infer", state.version.number, key),
         )
 
+    def note(self, index: int, *by: str) -> None:
+        """Write down what asked this round's network, see :class:`.Trial`."""
+        self._asked = (*self._asked, *by)
+        if index < len(self._state.trials):
+            earlier = self._state.trials[index].network_used_by
+            asked = tuple(dict.fromkeys((*earlier, *self._asked)))
+            self._state.change(index, network_used_by=asked)
+
+    def model(self, index: int) -> RoundModel:
+        """Return what a design asks, trained now or on demand.
+
+        Args:
+            index: Of the trial that is designed.
+        """
+        options = self._state.options
+        can_wait = self._inference.amortized and options.design_on == "fresh"
+        is_due = options.network == "each round" or not can_wait
+        return RoundModel(
+            lambda: self.trained(index), self.trained(index) if is_due else None
+        )
+
+    def posterior(self, index: int) -> ActionPosterior:
+        """Return the model of this round where it is a posterior.
+
+        Args:
+            index: Of the trial that the round is for.
+
+        Raises:
+            ValueError: If it is another one.
+        """
+        model = self.trained(index)
+        if not isinstance(model, ActionPosterior):
+            raise ValueError(
+                "expected the method 'asbi' or 'nsbi', whose network is a posterior; "
+                f"got {self._state.method!r}; use the belief"
+            )
+        self.note(index, "posterior")
+        return model
+
     def trained(self, index: int) -> Any:
         """Return the posterior trained under the current belief, training if needed.
 
@@ -269,20 +318,9 @@ class Learner:
                 )
                 with forked_generators(seed, "train", key):
                     self._inference.train()
-            self._account(index, len(rows), rows.counts["missing"])
+            self._state.account(index, len(rows), rows.counts["missing"])
             self._round_ready = True
         return self._inference.build_posterior()
-
-    def _account(
-        self, index: int, num_simulations: int, num_missing: int, **changes: Any
-    ) -> None:
-        trial = self._state.trials[index]
-        self._state.change(
-            index,
-            num_simulations=trial.num_simulations + num_simulations,
-            num_missing=trial.num_missing + num_missing,
-            **changes,
-        )
 
     def _probe(self) -> torch.Size:
         """Return x_shape from a few simulations, which must differ by seed."""

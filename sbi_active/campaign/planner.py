@@ -16,6 +16,7 @@ from sbi_active.campaign.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, action_name
 from sbi_active.design.designer import InformationGainDesigner, RandomDesigner
+from sbi_active.information_gain.estimators.automatic import ESTIMATORS
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -146,7 +147,7 @@ class Planner:
         if about_model is not None and (target == "model" or alarmed):
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
-        model = learner.trained(index)
+        model = learner.model(index)
         design = self._select(
             index,
             learner,
@@ -157,6 +158,8 @@ class Planner:
             simulations=learner.simulations,
             **limits,
         )
+        if model.was_asked:
+            learner.note(index, "design" if _rests_on_model(design) else "notes")
         if about_model is not None and _utility(about_model) > _utility(design):
             return about_model, "model"
         return design, own if isinstance(own, str) else ", ".join(own)
@@ -227,6 +230,12 @@ def _model_design(
         notes=(f"about which is right: {', '.join(found.separates)}",),
         cost=cost,
     )
+
+
+def _rests_on_model(design: Design) -> bool:
+    """Return whether an estimator uses something learned; unknown ones do."""
+    needs = {kind.__name__: kind.needs_model for kind in ESTIMATORS.values()}
+    return needs.get(design.estimator, True)
 
 
 def _utility(design: Design) -> float:

@@ -60,6 +60,13 @@ class CampaignOptions:
         repeat: Whether an action may be chosen again.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
+        network: When a round's network is trained: "each round", so that the amortized
+            posterior is at hand and refined beliefs are compared with it; or "on
+            demand", when something asks: :attr:`.Campaign.posterior`, an estimator of
+            the information gain that rests on it, a belief that is not refined. With
+            declared noise nothing in a round does, which then takes a fraction of the
+            time (``benchmarks/cost/network.json``). Beliefs are refined without the
+            network whoever asked for it, so that asking changes nothing.
         refinement: Settings of the refinement; those of its simulations are taken from
             here.
         num_scored: Simulations of each executed action, from the belief before the
@@ -88,6 +95,7 @@ class CampaignOptions:
     min_probability_valid: float = 0.0
     repeat: bool = True
     refine: bool = True
+    network: Literal["each round", "on demand"] = "each round"
     refinement: RefinementOptions = RefinementOptions()
     num_scored: int = 2_000
     check_every: int | None = None
@@ -133,6 +141,11 @@ class CampaignOptions:
                 "expected design_on 'fresh' or 'training'; got "
                 f"{self.design_on!r}; do choose one of these"
             )
+        if self.network not in ("each round", "on demand"):
+            raise ValueError(
+                "expected network 'each round' or 'on demand'; got "
+                f"{self.network!r}; pass one of these"
+            )
         if self.num_scored < 100:
             raise ValueError(
                 f"expected num_scored >= 100; got {self.num_scored}; do use about "
@@ -174,6 +187,12 @@ class Trial:
             action, in their range, by its farthest number; inf where none of them had
             such a number, None where it is as others from the belief before are. Above
             5 nothing in the prior explains the trial, and the belief leaves it out.
+        network_used_by: What asked the network of this round: the "design", whose
+            estimate rests on it, or the design's "notes", which compare the estimate
+            with it; the "belief", where it is the network's word; where the belief is
+            refined, its "start", which adds simulations there and no weight, and its
+            "diagnostics", which compare the two; and :attr:`.Campaign.posterior`, as
+            "posterior".
         reason: Why it was withdrawn.
         version: Number of the model that scored the trial.
         seconds: Wall time by stage; this and what follows add up where the campaign is
@@ -195,6 +214,7 @@ class Trial:
     log_score: float | None = None
     misfit: float | None = None
     outlyingness: float | None = None
+    network_used_by: tuple[str, ...] = ()
     reason: str = ""
     version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -301,13 +321,37 @@ class CampaignState:
         """Replace entries of a trial."""
         self.trials[index] = replace(self.trials[index], **changes)
 
+    def account(
+        self, index: int, num_simulations: int, num_missing: int, **changes: Any
+    ) -> None:
+        """Add simulations to a trial's account, and replace entries of it."""
+        if index == len(self.trials):  # ahead of a trial, on no account
+            return
+        trial = self.trials[index]
+        self.change(
+            index,
+            num_simulations=trial.num_simulations + num_simulations,
+            num_missing=trial.num_missing + num_missing,
+            **changes,
+        )
+
     @contextmanager
     def stage(self, index: int, name: str) -> Iterator[None]:
-        """Add the time spent in the block to a trial's account."""
+        """Add the time spent in the block to a trial's account, less stages within.
+
+        Work ahead of a trial that was not asked for yet is on no account.
+        """
+        if index == len(self.trials):
+            yield
+            return
+        before = self.trials[index]
         wall, cpu = time.perf_counter(), time.process_time()
         yield
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         trial = self.trials[index]
+        wall -= sum(trial.seconds.values()) - sum(before.seconds.values())
+        cpu -= sum(trial.cpu_seconds.values()) - sum(before.cpu_seconds.values())
         seconds, cpu_seconds = dict(trial.seconds), dict(trial.cpu_seconds)
-        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - wall
-        cpu_seconds[name] = cpu_seconds.get(name, 0.0) + time.process_time() - cpu
+        seconds[name] = seconds.get(name, 0.0) + wall
+        cpu_seconds[name] = cpu_seconds.get(name, 0.0) + cpu
         self.change(index, seconds=seconds, cpu_seconds=cpu_seconds)

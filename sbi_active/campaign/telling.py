@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.actions import ActionSpace
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 
@@ -27,7 +28,7 @@ def told_trial(
     action: Any,
     status: Status,
     x_shape: torch.Size,
-    action_dim: int,
+    actions: ActionSpace,
 ) -> Trial:
     """Return the record of a trial as told; the recorded one where nothing is new.
 
@@ -38,7 +39,7 @@ def told_trial(
         action: The executed one; None is the one asked for.
         status: As told.
         x_shape: Of an outcome.
-        action_dim: Numbers in an action.
+        actions: Of the campaign; one executed outside of it is warned of.
 
     Raises:
         ValueError: If there is no such trial, or numbers or shapes do not fit.
@@ -54,7 +55,15 @@ def told_trial(
     target = _trial_to_tell(
         state, trial, outcome, status, has_action=action is not None
     )
-    executed = target.action if action is None else _action_told(action, action_dim)
+    executed = (
+        target.action if action is None else _action_told(action, actions.action_dim)
+    )
+    if not bool(actions.contains(executed)):
+        warnings.warn(
+            f"the executed action {executed.tolist()} is not in {actions}; it is "
+            "simulated where it was executed",
+            stacklevel=4,
+        )
     told = replace(target, action=executed, x=outcome, status=status)
     if target.status != "pending":
         told = replace(told, reason="", **UNSCORED)

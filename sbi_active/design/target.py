@@ -134,8 +134,8 @@ class Target:
         assert self.belief is not None
         assert self.simulator is not None
         estimator = self.gain()
-        single = not hasattr(self.model, "log_likelihood")
-        if len(others) and estimator is not None and estimator.needs_model and single:
+        learns = estimator is not None and estimator.needs_model
+        if len(others) and learns and not hasattr(self.model, "log_likelihood"):
             raise ValueError(
                 "expected an estimator of the joint information of several actions, "
                 "by the noise or by a model with log_likelihood; got "

@@ -170,7 +170,7 @@ class ActionRounds(ActiveInference):
         sbi_trainer: Any = super()
         return sbi_trainer._resolve_estimator(estimator)
 
-    def forget_round(self) -> None:
+    def _forget_round(self) -> None:
         """Have the next update do without this round's network."""
         self._trained_round = None
 

@@ -110,6 +110,7 @@ class ASBI(MixtureRounds, NPE_C):
 
     _sbi_builder = staticmethod(posterior_nn)
     _fused = True
+    network_serves = ("start", "diagnostics")
 
     def __init__(
         self,
@@ -241,7 +242,7 @@ class ASBI(MixtureRounds, NPE_C):
 
     def _infer(self, told: Told) -> Belief:
         trials, chained = told.trials, None
-        if not told.afresh:
+        if self._may_ask_network(told):
             with nullcontext() if told.given_seed is None else kept_generators():
                 required = told.simulator is None
                 chained = self._chained(trials[-1], required=required)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -65,10 +65,16 @@ class ActiveInference(ABC):
         trials: Real trials so far, in order.
         amortized: Whether the model knows all parameters; otherwise only those that
             ``model.belief`` draws.
+        starts_at_network: Whether a refinement begins at this round's network, where
+            there is one.
+        network_serves: A refinement that does: as its "start", or also for the
+            "diagnostics", which compare it with the refined belief.
     """
 
     trials: list[Observation]
-    amortized: bool = True
+    amortized: ClassVar[bool] = True
+    starts_at_network: bool = True
+    network_serves: ClassVar[tuple[str, ...]] = ()
 
     append_simulations: Callable[..., Any]
     train: Callable[..., Any]
@@ -162,11 +168,15 @@ class ActiveInference(ABC):
         """End the round with a belief: its network belongs to the one before."""
         self._belief = belief = self._infer(told)
         self.trials = [*told.trials]
-        self.forget_round()
+        self._forget_round()
         return belief
 
+    def _may_ask_network(self, told: Told) -> bool:
+        """Return whether the belief may use this round's network, if there is one."""
+        return told.simulator is None or (self.starts_at_network and not told.afresh)
+
     @abstractmethod
-    def forget_round(self) -> None:
+    def _forget_round(self) -> None:
         """Have the next update do without what was learned in this round."""
 
     def _observation(self, x_o: Tensor, action: Tensor) -> Observation:

@@ -74,6 +74,7 @@ class ProductRounds(ActionRounds):
         to where a network was trained).
     """
 
+    network_serves = ("start",)
     _factor: ClassVar[type[ActionFactor]]
 
     def __init__(
@@ -173,7 +174,7 @@ class ProductRounds(ActionRounds):
         if told.simulator is None:
             self._require_belief_network()
         belief: Belief | None = None
-        if not told.afresh and self._trained_round is not None:
+        if self._may_ask_network(told) and self._trained_round is not None:
             belief = self._product(trials, settings, seed)
         if told.simulator is not None:
             with self._aside():

@@ -207,7 +207,7 @@ class SeqBED(ActiveInference):
             )
         return self._model
 
-    def forget_round(self) -> None:
+    def _forget_round(self) -> None:
         """Have the next update do without what was learned in this round."""
         self._model, self._rows = None, []
 

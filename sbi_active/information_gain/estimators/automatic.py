@@ -136,7 +136,9 @@ def disagreements(
     num_outcomes = simulations.x[0, 0].numel()
     if isinstance(estimator, NestedGain) and num_outcomes <= MAX_NEIGHBOR_OUTCOMES:
         others.append(EntropyGain())
-    if hasattr(model, "log_posterior") and estimator.bound == "none":
+    # A model that is trained on demand is not trained for a note.
+    at_hand = estimator.bound == "none" and getattr(model, "is_trained", True)
+    if at_hand and hasattr(model, "log_posterior"):
         others.append(PosteriorGain())
     if isinstance(estimator, RatioGain):
         others.append(InfoNCEGain())

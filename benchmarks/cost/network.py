@@ -1,0 +1,102 @@
+"""CPU time of a round that trains its network each time, and of one on demand.
+
+    python -m benchmarks.cost.network
+
+Campaigns of the numerical task, whose noise is declared, with the defaults and with
+``CampaignOptions(network="on demand")``; the two take turns, seed by seed, in one
+process on one thread. The first campaign pays what torch does once a process, so that
+one of each runs before the clock. Writes network.json beside this file: CPU seconds a
+round by stage, simulations a round, and what the campaigns ended with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+import warnings
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sbi_active import Campaign, CampaignOptions
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import get_task  # pyright: ignore
+
+MODES = ("each round", "on demand")
+
+
+def rounds(
+    mode: Any, seed: int, num_rounds: int
+) -> tuple[list[dict[str, Any]], list[float]]:
+    """Return what each round cost, and the standard deviations after the last."""
+    task = get_task("numerical")
+    options = CampaignOptions(network=mode)
+    campaign = Campaign(
+        task.simulator, task.prior, task.actions, seed=seed, options=options
+    )
+    rows = []
+    for index in range(num_rounds):
+        start = time.process_time()
+        trial = campaign.ask()
+        real = derive_seed(seed, "real", index)
+        campaign.tell(task.real_system(trial.action, seed=real))
+        campaign.update()
+        spent, trial = time.process_time() - start, campaign.history[-1]
+        rows.append(
+            {
+                "cpu_s": spent,
+                **trial.cpu_seconds,
+                "num_simulations": trial.num_simulations,
+            }
+        )
+    with forked_generators(0):
+        return rows, campaign.belief.sample((4_000,)).std(0).tolist()
+
+
+def main() -> None:
+    """Run both modes in turn, print and write their cost."""
+    parser = argparse.ArgumentParser(description="Cost of a round's network.")
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--rounds", type=int, default=3)
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    made: dict[str, list[Any]] = {mode: [] for mode in MODES}
+    for mode in MODES:
+        rounds(mode, 10_000, 1)
+    for seed in range(arguments.seeds):
+        for mode in MODES:
+            made[mode].append(rounds(mode, seed, arguments.rounds))
+    result: dict[str, Any] = {
+        "command": "python -m benchmarks.cost.network "
+        f"--seeds {arguments.seeds} --rounds {arguments.rounds}",
+        "date": date.today().isoformat(),
+        "machine": f"{os.cpu_count()} cores, no GPU",
+        "task": "numerical, declared noise",
+    }
+    for mode, campaigns in made.items():
+        rows = [row for campaign, _ in campaigns for row in campaign]
+        each = np.array([row["cpu_s"] for row in rows])
+        names = sorted({name for row in rows for name in row} - {"cpu_s"})
+        result[mode] = {
+            "cpu_s_a_round": each.mean(),
+            "standard_error": each.std(ddof=1) / len(each) ** 0.5,
+            **{n: float(np.mean([r.get(n, 0.0) for r in rows])) for n in names},
+            "median_sd": np.median([sd for _, sd in campaigns], axis=0).tolist(),
+        }
+    both = [result[mode]["cpu_s_a_round"] for mode in MODES]
+    result["ratio"] = both[0] / both[1]
+    path = Path(__file__).with_name("network.json")
+    path.write_text(json.dumps(result, indent=2) + "\n")
+    for mode in MODES:
+        print(f"{mode}: {json.dumps(result[mode])}")
+    print(f"ratio: {result['ratio']:.1f}")
+
+
+if __name__ == "__main__":
+    main()
