@@ -36,9 +36,8 @@ class RoundModel:
     def __getattr__(self, name: str) -> Any:
         is_density = name in DENSITIES
         if is_density and self._model is None:
-            self._model = isolated(
-                self._train
-            )()  # estimates are made without gradients
+            # Estimates are made without gradients, training is not.
+            self._model = isolated(self._train)()
         found = getattr(self._model, name)
         self.was_asked |= is_density
         return found
