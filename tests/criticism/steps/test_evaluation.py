@@ -1,0 +1,121 @@
+"""Residuals and scores on further trials, in closed form."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from sbi_active.criticism import Trials
+from sbi_active.criticism.steps.detection import detect
+from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
+from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.tracing import trace
+from tests.criticism.steps.linear_world import (
+    ACTION,
+    NOISE,
+    columns,
+    measured,
+    posterior,
+    rivals,
+)
+
+X = measured(curve=0.5)
+OTHERS = measured(curve=0.5, seed=1)
+
+
+def predictive(x, names):
+    """Return mean and deviation of a measurement at each of the twelve actions."""
+    mean, covariance = posterior(x, names)
+    design = columns(names)
+    variance = np.einsum("ni,ij,nj->n", design, covariance, design)
+    return design @ mean, np.sqrt(variance + NOISE**2)
+
+
+def crps(x, mean, sd):
+    """Return the energy score of a normal prediction of one number."""
+    z = (x - mean) / sd
+    return sd * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    some = rivals(X)
+    return some, trace(some, detect(some), compare=False)
+
+
+def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):
+    some, tracing = fitted
+    made = evaluate_held_out(some, tracing, Trials(ACTION, OTHERS))
+    own = OTHERS[:, 0].double().numpy()
+    for scores, names in ((made.before, ()), (made.after, ("curve",))):
+        mean, sd = predictive(X, names)
+        inside = np.abs(own - mean) < 1.645 * sd
+        np.testing.assert_allclose(scores["rmse"], np.abs(own - mean), atol=0.02)
+        np.testing.assert_allclose(
+            scores["energy score"], crps(own, mean, sd), atol=0.02
+        )
+        np.testing.assert_allclose(
+            scores["log predictive density"], norm(mean, sd).logpdf(own), rtol=0.2
+        )
+        assert (scores["coverage"] != inside).sum() <= 1
+    assert made.scheme == "held out"
+    assert made.selected == 12 * ("curve",)
+
+
+def test_totals_are_roots_of_mean_squares_ratios_and_differences(fitted):
+    made = evaluate_held_out(*fitted, Trials(ACTION, OTHERS))
+    table = made.table.set_index("metric")
+    before, after = (
+        np.sqrt((scores["rmse"] ** 2).mean()) for scores in (made.before, made.after)
+    )
+    found = table.loc["rmse", ["before", "after", "ratio"]].tolist()
+    assert found == pytest.approx([before, after, after / before])
+    for metric in ("log predictive density", "coverage"):
+        first, second = (s[metric].mean() for s in (made.before, made.after))
+        found = table.loc[metric, ["before", "after", "ratio"]].tolist()
+        assert found == pytest.approx([first, second, second - first])
+    assert (table["low"] <= table["ratio"]).all()
+    assert (table["ratio"] <= table["high"]).all()
+    few = evaluate_held_out(*fitted, Trials(ACTION[:7], OTHERS[:7]))
+    assert few.table[["low", "high"]].isna().all(axis=None)
+
+
+def test_each_trial_is_left_out_of_its_own_fit(fitted):
+    some, tracing = fitted
+    trials = Trials(ACTION[:3], X[:3])
+    seen = []
+
+    def fold(rest):
+        seen.append(rest.index.tolist())
+        return some, tracing
+
+    made = evaluate_left_out(trials, fold)
+    assert seen == [[1, 2], [0, 2], [0, 1]]
+    assert made.selected == 3 * ("curve",)
+    direct = evaluate_held_out(some, tracing, trials)
+    np.testing.assert_allclose(made.after["rmse"], direct.after["rmse"], rtol=1e-6)
+
+
+@pytest.mark.parametrize("names", [(), ("curve",)])
+def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
+    made = find_residuals(fitted[0], names=names)
+    mean, sd = predictive(X, names)
+    own = X[:, 0].double().numpy()
+    np.testing.assert_allclose(made.mean[:, 0], mean, atol=0.02)
+    np.testing.assert_allclose(made.sd[:, 0], sd, rtol=0.1)
+    np.testing.assert_allclose(
+        made.refitted[:, 0], (own - made.mean[:, 0]) / made.sd[:, 0], rtol=1e-6
+    )
+    assert made.noise == "declared"
+    assert made.correlation == 0
+
+
+def test_each_trial_is_predicted_from_those_before_it():
+    x = measured()
+    made = find_residuals(rivals(x))
+    design, own = columns(()), x[:, 0].double().numpy()
+    for t in range(12):
+        precision = design[:t].T @ design[:t] / NOISE**2 + np.eye(2)
+        covariance = np.linalg.inv(precision)
+        mean = design[t] @ covariance @ design[:t].T @ own[:t] / NOISE**2
+        sd = np.sqrt(design[t] @ covariance @ design[t] + NOISE**2)
+        assert made.prequential[t, 0] == pytest.approx((own[t] - mean) / sd, abs=0.25)
