@@ -21,7 +21,7 @@ from sbi_active.criticism.report.suspects import (
 )
 from sbi_active.criticism.rivals import NoiseCell, NoiseGrid
 from sbi_active.criticism.steps import is_left_to_chance, unless_refuted, withdrawn
-from tests.criticism.reports import evaluation, flat, report, tracing
+from tests.criticism.report.reports import evaluation, flat, report, tracing
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.arange(-5, 5.5, 0.5))

@@ -15,7 +15,7 @@ from sbi_active.information_gain.fits import MeanEmulator, declare
 from sbi_active.simulation import GaussianNoise, NoiseModel
 from sbi_active.tasks.oscillator import model
 from sbi_active.tasks.oscillator.reference import OscillatorReference
-from tests.information_gain.test_entropy import ACTIONS, declared
+from tests.information_gain.estimators.test_entropy import ACTIONS, declared
 from tests.linear_gaussian import PRIOR, information
 
 BIAS = 0.05  # of 16 local draws, l

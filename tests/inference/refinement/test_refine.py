@@ -17,7 +17,7 @@ from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.refinement import LearnedBelief
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks.numerical.exact import ExactPosterior
-from tests.inference.refined_worlds import BOX, draws, numerical, observe
+from tests.inference.refinement.refined_worlds import BOX, draws, numerical, observe
 
 
 def scored(variant: str, actions: list[float], num_histories: int, seed: int):

@@ -13,8 +13,8 @@ from sbi_active import (
 )
 from sbi_active.search import ExhaustiveSearch, GradientSearch, Search
 from sbi_active.tasks.numerical.task import NumericalTask
+from tests.design.test_designer import Exact
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
-from tests.test_designer import Exact
 
 BOX = BoxActions(-5.0, 5.0, names=["xi"])
 

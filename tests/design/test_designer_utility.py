@@ -17,8 +17,8 @@ from sbi_active import (
 from sbi_active.design.choice import choose
 from sbi_active.design.elimination import Estimates
 from sbi_active.simulation import Simulations
+from tests.design.test_designer import ACTIONS, VALUES
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
-from tests.test_designer import ACTIONS, VALUES
 
 MODEL = SimulatorModel(lambda theta, action: action * theta, noise=GaussianNoise(1.0))
 BOX = BoxActions(0.0, 2.0, names=["push"], units=["m/s"])

@@ -11,7 +11,7 @@ from sbi_active.criticism.report.figures import (
     plot_probabilities,
     plot_residuals,
 )
-from tests.criticism.reports import evaluation, residuals, tracing
+from tests.criticism.report.reports import evaluation, residuals, tracing
 
 
 def points(ax):

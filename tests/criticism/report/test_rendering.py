@@ -14,7 +14,7 @@ from sbi_active.criticism.report.figures import (
     plot_probabilities,
     plot_residuals,
 )
-from tests.criticism.reports import report, residuals, tracing
+from tests.criticism.report.reports import report, residuals, tracing
 
 
 class Page(HTMLParser):

@@ -9,8 +9,8 @@ import torch
 from sbi_active import DiscreteActions, InformationGainDesigner, RandomDesigner
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
+from tests.design.test_designer import ACTIONS, VALUES
 from tests.linear_gaussian import PRIOR, ExactModel, simulator
-from tests.test_designer import ACTIONS, VALUES
 
 
 def test_invalid_outcomes_count():

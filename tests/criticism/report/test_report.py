@@ -11,7 +11,7 @@ from sbi.utils import BoxUniform
 from sbi_active.criticism import Trials, joint_prior
 from sbi_active.criticism.report import find_warnings, with_error
 from sbi_active.criticism.results import SevereTest
-from tests.criticism.reports import (
+from tests.criticism.report.reports import (
     DRAG,
     evaluation,
     flat,

@@ -20,7 +20,7 @@ from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior
-from tests.inference.refined_worlds import BOX, draws, numerical, observe
+from tests.inference.refinement.refined_worlds import BOX, draws, numerical, observe
 
 
 def test_priors_with_one_bound_or_mixed_parts():
