@@ -43,7 +43,7 @@ def test_each_round_has_a_network_that_notes_and_diagnostics_ask():
     trial = one_round(c)
     assert trial.network_used_by == ("notes", "start", "diagnostics")
     assert {"simulation", "training"} < {*trial.cpu_seconds}
-    assert "chained_loss" in c.belief.diagnostics
+    assert "chained_loss" in c.belief.diagnostics.figures
 
 
 def test_on_demand_a_round_with_declared_noise_trains_none():

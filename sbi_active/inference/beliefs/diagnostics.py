@@ -123,12 +123,22 @@ class Diagnostics:
         return _restored, (parts | {name: dict(parts[name]) for name in plain},)
 
     def __getitem__(self, name: str) -> Any:
+        return self._as_dict(f"[{name!r}]")[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._as_dict(f".__contains__({name!r})")
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return an entry by its name, as of a dict (deprecated)."""
+        return self._as_dict(f".get({name!r})").get(name, default)
+
+    def _as_dict(self, used: str) -> dict[str, Any]:
         warnings.warn(
-            f"diagnostics[{name!r}] is deprecated; use diagnostics.{name} or to_dict()",
+            f"diagnostics{used} is deprecated; use an attribute, or to_dict()",
             DeprecationWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-        return self.to_dict()[name]
+        return self.to_dict()
 
 
 def _is_any_of(value: Any, others: tuple[Any, ...]) -> bool:

@@ -70,5 +70,9 @@ def test_a_name_that_is_not_there():
 
 
 def test_entries_by_name_go_in_the_next_version():
-    with pytest.warns(DeprecationWarning, match=r"use diagnostics\.trustworthy"):
+    with pytest.warns(DeprecationWarning, match=r"use an attribute, or to_dict"):
         assert KNOWN["trustworthy"]
+    with pytest.warns(DeprecationWarning, match=r"get\('bandwidth'\) is deprecated"):
+        assert KNOWN.get("bandwidth") == 0.1
+    with pytest.warns(DeprecationWarning, match="deprecated"):
+        assert "width" not in KNOWN
