@@ -16,6 +16,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from benchmarks.location_finding.particles import ParticleBelief
 from benchmarks.location_finding.static_design import load
@@ -59,6 +60,7 @@ class Policy(ABC):
 class Random(Policy):
     """Standard normal places."""
 
+    @override
     def choose(self) -> Tensor:
         seed = derive_seed(self.seed, "place", len(self.action))
         return torch.randn(2, generator=torch.Generator().manual_seed(seed))
@@ -71,6 +73,7 @@ class Fixed(Policy):
         super().__init__(task, seed)
         self.places = load()
 
+    @override
     def choose(self) -> Tensor:
         index = len(self.action)
         if index >= len(self.places):
@@ -111,6 +114,7 @@ class Myopic(Policy):
         self._inference = ASBI(task.prior, show_progress_bars=False)
         self.belief = task.prior
 
+    @override
     def choose(self) -> Tensor:
         seed = derive_seed(self.seed, "design", len(self.action))
         places = candidates(self.belief, self.num_candidates, seed)
@@ -123,6 +127,7 @@ class Myopic(Policy):
         self.num_simulations += design.num_simulations
         return design.action
 
+    @override
     def tell(self, action: Tensor, x: Tensor) -> None:
         super().tell(action, x)
         self.belief = self._inference.update(
@@ -143,6 +148,7 @@ class MyopicParticles(Myopic):
         self._particles = ParticleBelief(task, seed=particle_seed)
         self.belief = self._particles
 
+    @override
     def tell(self, action: Tensor, x: Tensor) -> None:
         Policy.tell(self, action, x)
         self._particles.update(action, x)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
 from sbi_active.seeding import forked_generators
@@ -66,14 +67,17 @@ class BoxActions(ActionSpace):
         return f"BoxActions({', '.join(f'{n} in [{a:g}, {b:g}]' for n, a, b in rows)})"
 
     @property
+    @override
     def action_dim(self) -> int:
         return len(self.low)
 
+    @override
     def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
         with forked_generators(seed):
             share = torch.rand(*sample_shape, self.action_dim)
         return self.low + share * (self.high - self.low)
 
+    @override
     def contains(self, action: Tensor) -> Tensor:
         action = torch.as_tensor(action, dtype=torch.float32)
         slack = ROUNDING * (self.high - self.low)

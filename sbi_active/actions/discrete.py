@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
 from sbi_active.seeding import forked_generators
@@ -60,18 +61,22 @@ class DiscreteActions(ActionSpace):
         return f"DiscreteActions({len(self)} x {', '.join(self.names)})"
 
     @property
+    @override
     def action_dim(self) -> int:
         return self.values.shape[1]
 
+    @override
     def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
         with forked_generators(seed):
             index = torch.randint(len(self), torch.Size(sample_shape))
         return self.values[index]
 
+    @override
     def contains(self, action: Tensor) -> Tensor:
         action = torch.as_tensor(action, dtype=torch.float32)
         near = torch.isclose(action[..., None, :], self.values, rtol=1e-5, atol=1e-7)
         return near.all(-1).any(-1)
 
+    @override
     def listed(self) -> Tensor:
         return self.values

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
 from sbi_active.seeding import derive_seed
@@ -61,9 +62,11 @@ class MixedActions(ActionSpace):
         return f"MixedActions({' x '.join(map(repr, self._parts))})"
 
     @property
+    @override
     def action_dim(self) -> int:
         return sum(part.action_dim for part in self._parts)
 
+    @override
     def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
         columns = [
             part.sample(
@@ -74,6 +77,7 @@ class MixedActions(ActionSpace):
         ]
         return torch.cat(columns, -1)
 
+    @override
     def contains(self, action: Tensor) -> Tensor:
         columns = torch.as_tensor(action).split([p.action_dim for p in self._parts], -1)
         inside = [p.contains(c) for p, c in zip(self._parts, columns, strict=True)]
@@ -91,5 +95,6 @@ class MixedActions(ActionSpace):
             )
         return rows
 
+    @override
     def parts(self) -> list[ActionSpace]:
         return [*self._parts]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.search.base import Objective, Search
@@ -17,12 +18,15 @@ class ExhaustiveSearch(Search):
     numbers.
     """
 
+    @override
     def size(self, actions: ActionSpace) -> int:
         return len(_listed(actions))
 
+    @override
     def num_evaluations(self, budget: int, num_samples: int) -> int:
         return 0
 
+    @override
     def finalists(self, objective: Objective) -> Tensor:
         values = _listed(objective.actions)
         return values[objective.permitted(values)]

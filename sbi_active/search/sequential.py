@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.search.base import Evaluations, Objective, Search
@@ -58,6 +59,7 @@ class SequentialSearch(Search):
             )
         self.num_rounds, self.num_finalists = num_rounds, num_finalists
 
+    @override
     def size(self, actions: ActionSpace) -> int:
         if actions.listed() is not None:
             raise TypeError(
@@ -68,6 +70,7 @@ class SequentialSearch(Search):
         categories = sum(size - 1 for size in coordinates.sizes)
         return EACH * (1 + coordinates.num_continuous + categories)
 
+    @override
     def num_evaluations(self, budget: int, num_samples: int) -> int:
         num = budget // 2 // num_samples
         if num < FEWEST:
@@ -78,6 +81,7 @@ class SequentialSearch(Search):
             )
         return num
 
+    @override
     def finalists(self, objective: Objective) -> Tensor:
         coordinates = Coordinates(objective.actions)
         found, left = objective.known, objective.num_evaluations

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
+from typing_extensions import override
 
 __all__ = ["Product"]
 
@@ -35,10 +36,12 @@ class Product(Distribution):
         )
 
     @property
+    @override
     def mean(self) -> Tensor:
         return torch.cat([part.mean for part in self.parts])
 
     @property
+    @override
     def variance(self) -> Tensor:
         return torch.cat([part.variance for part in self.parts])
 

@@ -151,10 +151,14 @@ class NestedGain:
             {1 + \frac{l}{m} t_i(z_j) / b(z_j)}.
 
         Args:
-            x: As in _log_marginal, and so action, outer, inner, inner_belief and
-                generator.
+            x: Outcomes, as in _log_marginal.
+            action: Of each outcome, as there.
+            outer: Parameters behind the outcomes, as there.
+            inner: Draws of the belief, as there.
+            inner_belief: Their log densities, as there.
             pairs: Rows i and draws j of the belief that matter to them, both (p,).
             log_term: log p(x_i | z_j) of these, shape (p,).
+            generator: Of the local draws.
         """
         n, m, (i, j) = len(x), len(inner), pairs
 

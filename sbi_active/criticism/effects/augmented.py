@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.criticism.effects.application import applied
 from sbi_active.criticism.effects.declarations import require_distinct
@@ -168,6 +169,7 @@ class AugmentedSimulator(SimulatorModel):
         theta, *phi = parameters.split([theta_dim, *sizes], -1)
         return theta, {e.name: p for e, p in zip(campaign, phi, strict=True)}
 
+    @override
     def __call__(
         self,
         theta: Tensor,

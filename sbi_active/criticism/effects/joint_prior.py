@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
+from typing_extensions import override
 
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Effect
@@ -39,6 +40,7 @@ class JointPrior(Distribution):
         super().__init__(event_shape=torch.Size([sum(self.sizes)]), validate_args=False)
 
     @property
+    @override
     def support(self) -> constraints.Constraint:  # type: ignore[override]
         parts = [_elementwise(d.support) for d in self._parts()]
         return constraints.independent(
@@ -46,13 +48,16 @@ class JointPrior(Distribution):
         )
 
     @property
+    @override
     def mean(self) -> Tensor:
         return torch.cat([_moment(d, "mean") for d in self._parts()])
 
     @property
+    @override
     def variance(self) -> Tensor:
         return torch.cat([_moment(d, "variance") for d in self._parts()])
 
+    @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = torch.Size(sample_shape)
         num = shape.numel()
@@ -60,6 +65,7 @@ class JointPrior(Distribution):
         phi = [effect.sample(num).to(theta.dtype) for effect in self.effects]
         return torch.cat([theta, *phi], -1).reshape(*shape, sum(self.sizes))
 
+    @override
     def log_prob(self, value: Tensor) -> Tensor:
         rows = value.reshape(-1, sum(self.sizes))
         theta, *phi = rows.split(self.sizes, -1)

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import (
@@ -80,6 +81,7 @@ class OneOutlier(ErrorModel):
             for cell in noise.cells
         ]
 
+    @override
     def log_likelihood(self, residual: Array) -> Array:
         parts = [
             self._joint(residual, c).reshape(len(residual), -1)
@@ -124,9 +126,11 @@ class OneOutlier(ErrorModel):
         cell, scale = np.unravel_index(best, log_p.shape[1:])
         return cell, self.noise.scales[scale]
 
+    @override
     def start(self) -> Whitener:
         return self.noise.start()
 
+    @override
     def whitener(self, residual: Array) -> Whitener:
         cells = range(len(self.noise.cells))
         joint = np.stack([self._joint(residual[None], c)[0] for c in cells])
@@ -134,6 +138,7 @@ class OneOutlier(ErrorModel):
         cell, trial, scale, kind, size = map(int, best)
         return self._whitener(cell, trial, scale, kind, self.sizes[size])
 
+    @override
     def regimes(self, residual: Array) -> list[Whitener]:
         # Without one trial the parameters may be elsewhere, and are less certain.
         share = self.responsibility(residual[None])[0]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
+from typing_extensions import override
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -131,6 +132,7 @@ class NoiseGrid(ErrorModel):
             else log_weights - log_sum_exp(log_weights)
         )
 
+    @override
     def log_likelihood(self, residual: Array) -> Array:
         return log_sum_exp(self.joint(residual).reshape(len(residual), -1), axis=1)
 
@@ -154,10 +156,12 @@ class NoiseGrid(ErrorModel):
         joint = self.joint(residual[None])[0]
         return np.exp(joint - log_sum_exp(joint))
 
+    @override
     def start(self) -> Whitener:
         cell, scale = self._typical()
         return lambda residual: cell.whiten(residual) / scale
 
+    @override
     def whitener(self, residual: Array) -> Whitener:
         best = np.unravel_index(np.argmax(self.joint(residual[None])[0]), self.shape)
         cell, scale = self.cells[best[0]], self.scales[best[1]]

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import (
@@ -119,13 +120,16 @@ class ResidualProcess(ErrorModel):
                     )
                 )
 
+    @override
     def log_likelihood(self, residual: Array) -> Array:
         parts = [self._joint(residual, basis) for basis in self._bases]
         return log_sum_exp(np.stack(parts, 1).reshape(len(residual), -1), axis=1)
 
+    @override
     def start(self) -> Whitener:
         return self.noise.start()
 
+    @override
     def whitener(self, residual: Array) -> Whitener:
         joint = np.stack([self._joint(residual[None], b)[0] for b in self._bases])
         place = np.unravel_index(np.argmax(joint), joint.shape)
@@ -134,6 +138,7 @@ class ResidualProcess(ErrorModel):
             basis, self.amplitudes[place[1]], self.noise.scales[place[2]]
         )
 
+    @override
     def regimes(self, residual: Array) -> list[Whitener]:
         # A large process leaves the parameters wide, a small one narrow.
         cell = int(np.argmax(self.noise.log_prior))

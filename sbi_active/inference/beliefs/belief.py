@@ -13,6 +13,7 @@ from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.seeding import forked_generators
@@ -62,6 +63,7 @@ class Belief(Distribution, ABC):
         """Return the normalized log density inside the support, (n, d) -> (n,)."""
 
     @property
+    @override
     def support(self) -> Any:
         return self.prior.support
 

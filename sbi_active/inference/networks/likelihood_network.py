@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor, nn
+from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
@@ -92,6 +93,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         self.register_buffer("is_gaussian", torch.tensor(False))
 
     @property
+    @override
     def embedding_net(self) -> nn.Module:
         return nn.Identity()
 

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor, nn
+from typing_extensions import override
 
 from sbi_active.inference.networks.baseline import Frames, local
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
@@ -137,6 +138,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         self.register_buffer("strict_upper", torch.ones(dim, dim).triu(1))
 
     @property
+    @override
     def embedding_net(self) -> nn.Module:
         return self._embedding
 

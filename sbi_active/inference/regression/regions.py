@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 from scipy.stats import chi, chi2
+from typing_extensions import override
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture, Particles
+from sbi_active.inference.sampling.student_mixture import Proposal
 
 __all__ = [
     "PriorProposal",
@@ -128,30 +130,34 @@ def nearest_region(regions: list[Region], z: Array) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True)
-class PriorProposal:
+class PriorProposal(Proposal):
     """The prior as a proposal."""
 
     coordinates: PriorCoordinates
 
+    @override
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         return self.coordinates.sample_prior(num_samples, rng)
 
+    @override
     def log_prob(self, z: Array) -> Array:
         return self.coordinates.log_prior(z)
 
 
 @dataclass(frozen=True)
-class RegionsProposal:
+class RegionsProposal(Proposal):
     """Equal shares of uniform densities over ellipsoids."""
 
     regions: list[Region]
 
+    @override
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         share = np.full(len(self.regions), 1 / len(self.regions))
         count = rng.multinomial(num_samples, share)
         pairs = zip(self.regions, count, strict=True)
         return np.concatenate([r.sample_uniform(n, rng) for r, n in pairs])
 
+    @override
     def log_prob(self, z: Array) -> Array:
         density = np.stack(
             [

@@ -12,6 +12,7 @@ class SilentTracker:
 
     @property
     def log_dir(self) -> str | None:
+        """None: there is no folder."""
         return None
 
     def log_metric(self, name: str, value: float, step: int | None = None) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
+from typing_extensions import override
 
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -84,7 +85,7 @@ class KernelProposal(Defended):
 
 
 @dataclass(frozen=True)
-class EitherProposal:
+class EitherProposal(Proposal):
     """Two proposals, each as likely.
 
     Attributes:
@@ -95,11 +96,13 @@ class EitherProposal:
     first: Proposal
     second: Proposal
 
+    @override
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         num = int(rng.binomial(num_samples, 0.5))
         parts = self.first.sample(num, rng), self.second.sample(num_samples - num, rng)
         return np.concatenate(parts)
 
+    @override
     def log_prob(self, z: Array) -> Array:
         both = np.logaddexp(self.first.log_prob(z), self.second.log_prob(z))
         return both - np.log(2.0)

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
+from typing_extensions import override
 
 from sbi_active.inference.sampling.weights import log_sum_exp, systematic
 
@@ -104,7 +105,7 @@ class StudentMixture:
 
 
 @dataclass(frozen=True)
-class Defended:
+class Defended(Proposal):
     r"""A proposal with a share of another that covers the target.
 
     .. math::
@@ -124,11 +125,13 @@ class Defended:
     base: Proposal
     share: float
 
+    @override
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         num_base = rng.binomial(num_samples, self.share)
         drawn = self.main.sample(num_samples - num_base, rng)
         return np.concatenate([drawn, self.base.sample(num_base, rng)])
 
+    @override
     def log_prob(self, z: Array) -> Array:
         return np.logaddexp(
             np.log1p(-self.share) + self.main.log_prob(z),

@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.estimators.contrast import Contrast, near_limit
@@ -43,6 +44,7 @@ class ContrastiveGain(Contrast):
     def _terms(self, own: Tensor, contrastive: Tensor) -> Tensor:
         return torch.cat([own[:, None], contrastive], 1)
 
+    @override
     def cautions(self, gain: Tensor) -> list[str]:
         limit = math.log(self.num_contrastive + 1)
         near = near_limit(gain, limit)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from sbi_active.information_gain.base import (
     CandidateSimulations,
@@ -100,6 +101,7 @@ class EntropyGain(InformationGainEstimator):
                 ) / len(outcomes)
         return gain
 
+    @override
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         return presence_notes(simulations)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.information_gain.base import (
     Bound,
@@ -84,6 +85,7 @@ class InfoNCEGain(InformationGainEstimator):
                 gain[a, block] = torch.stack(of_each).mean(0)
         return gain
 
+    @override
     def cautions(self, gain: Tensor) -> list[str]:
         # the smallest block limits; candidates may have lost rows to faults
         smallest = [

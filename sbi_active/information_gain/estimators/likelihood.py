@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from torch import Tensor
+from typing_extensions import override
 
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.estimators.contrast import Contrast, near_limit
@@ -61,9 +62,11 @@ class LikelihoodGain(Contrast):
     def _terms(self, own: Tensor, contrastive: Tensor) -> Tensor:
         return contrastive
 
+    @override
     def bound_on(self, model: Any) -> Bound:
         return "upper" if getattr(model, "exact_likelihood", False) else "none"
 
+    @override
     def cautions(self, gain: Tensor) -> list[str]:
         limit = math.log(self.num_contrastive)
         near = near_limit(gain, limit)

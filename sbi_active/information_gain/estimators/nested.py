@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from sbi_active.information_gain.base import (
     CandidateSimulations,
@@ -145,6 +146,7 @@ class NestedGain(InformationGainEstimator):
                 )
         return gain
 
+    @override
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
         notes = presence_notes(simulations)
         few = int((~_enough(simulations)).sum())

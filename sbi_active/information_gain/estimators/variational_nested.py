@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from sbi_active.information_gain.base import (
     Bound,
@@ -94,6 +95,7 @@ class VariationalNestedGain(InformationGainEstimator):
         self.num_contrastive = at_least(num_contrastive, 2, "num_contrastive")
         self.seed, self.batch_size = seed, batch_size
 
+    @override
     def bound_on(self, model: Any) -> Bound:
         return "upper" if getattr(model, "exact_likelihood", False) else "none"
 

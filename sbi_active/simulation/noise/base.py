@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
@@ -157,6 +158,7 @@ class ScaleNoise(NoiseModel):
         known = "" if self.posterior is None else ", with a posterior"
         return f"{type(self).__name__}({text}{known})"
 
+    @override
     def sample(
         self,
         mean: Tensor,
@@ -173,6 +175,7 @@ class ScaleNoise(NoiseModel):
         noise = self._draw(seeds, shape, rows, self.times if times is None else times)
         return mean + noise.to(mean)
 
+    @override
     def log_prob(
         self,
         x: Tensor,

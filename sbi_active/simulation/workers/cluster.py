@@ -17,6 +17,7 @@ from typing import Any
 import cloudpickle
 from joblib import Parallel, delayed, effective_n_jobs
 from joblib.parallel import get_active_backend
+from typing_extensions import override
 
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.pools import Pool, WorkerPool, pickled
@@ -78,13 +79,16 @@ class DaskPool(Pool):
         self._last_seen: float | None = time.monotonic()  # None once it was said
 
     @property
+    @override
     def num_free(self) -> int:
         return self.num_slots - len(self._running) - len(self._waiting)
 
+    @override
     def submit(self, call: Call, time_limit: float | None) -> None:
         self._waiting.append(call)
         self._look()
 
+    @override
     def collect(self) -> list[tuple[Call, Reply]]:
         from distributed import wait
 
@@ -100,6 +104,7 @@ class DaskPool(Pool):
                 return [(self._running[f][0], self._reply(f)) for f in over]
         return []
 
+    @override
     def close(self) -> None:
         self._client.cancel([*self._running])
         self._running, self._waiting = {}, []
@@ -193,12 +198,15 @@ class JoblibPool(Pool):
         self._round: Iterator[tuple[Call, Reply]] | None = None
 
     @property
+    @override
     def num_free(self) -> int:
         return 0 if self._round is not None else self.num_slots - len(self._waiting)
 
+    @override
     def submit(self, call: Call, time_limit: float | None) -> None:
         self._waiting.append(call)
 
+    @override
     def collect(self) -> list[tuple[Call, Reply]]:
         if self._round is None:
             self._round = self._start(self._waiting)

@@ -13,6 +13,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 import cloudpickle
+from typing_extensions import override
 
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.idle import IDLE
@@ -64,12 +65,15 @@ class InProcess(Pool):
         self._done: list[tuple[Call, Reply]] = []
 
     @property
+    @override
     def num_free(self) -> int:
         return 1 - len(self._done)
 
+    @override
     def submit(self, call: Call, time_limit: float | None) -> None:
         self._done.append((call, answer(self._simulator, call)))
 
+    @override
     def collect(self) -> list[tuple[Call, Reply]]:
         done, self._done = self._done, []
         return done
@@ -97,9 +101,11 @@ class WorkerPool(Pool):
         self._busy: dict[Worker, _Running] = {}
 
     @property
+    @override
     def num_free(self) -> int:
         return self.num_slots - len(self._busy)
 
+    @override
     def submit(self, call: Call, time_limit: float | None) -> None:
         if self._idle:
             worker = self._idle.pop()
@@ -111,6 +117,7 @@ class WorkerPool(Pool):
         if worker.is_ready:
             self._busy[worker].start()
 
+    @override
     def collect(self) -> list[tuple[Call, Reply]]:
         done: list[tuple[Call, Reply]] = []
         while self._busy and not done:
@@ -127,6 +134,7 @@ class WorkerPool(Pool):
                     self._idle.append(worker)
         return done
 
+    @override
     def close(self) -> None:
         for worker in self._busy:
             worker.end()
