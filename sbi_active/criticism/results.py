@@ -253,7 +253,7 @@ class Evaluation:
     """Error before and after, on trials used neither to fit nor to choose.
 
     Attributes:
-        scheme: "held out", "leave one out" or "prequential".
+        scheme: "held out" or "leave one out".
         trials: Positions of the scored trials, shape (s,).
         before: By metric, one value a scored trial, shape (s,): "rmse", "energy score",
             "log predictive density", "coverage" (share of entries in the central 90 %).
@@ -265,7 +265,7 @@ class Evaluation:
         selected: Verdict of each fold, shape (s,).
     """
 
-    scheme: Literal["held out", "leave one out", "prequential"]
+    scheme: Literal["held out", "leave one out"]
     trials: Array
     before: dict[str, Array]
     after: dict[str, Array]

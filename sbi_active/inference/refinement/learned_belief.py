@@ -14,7 +14,6 @@ from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import Particles
-from sbi_active.seeding import forked_generators
 
 __all__ = ["LearnedLikelihood", "LearnedBelief"]
 
@@ -73,8 +72,7 @@ class LearnedBelief(Belief):
         *,
         defensive: float,
     ) -> None:
-        with forked_generators(0):  # the base class draws once to learn the dimension
-            super().__init__(prior)
+        super().__init__(prior)
         self._surrogate = surrogate
         self._defensive = defensive
         self._proposal = particles.proposal

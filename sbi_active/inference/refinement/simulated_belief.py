@@ -14,7 +14,6 @@ from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import KernelProposal
-from sbi_active.seeding import forked_generators
 
 __all__ = ["SimulatedBelief"]
 
@@ -56,8 +55,7 @@ class SimulatedBelief(Belief):
         *,
         defensive: float,
     ) -> None:
-        with forked_generators(0):  # the base class draws once to learn the dimension
-            super().__init__(prior)
+        super().__init__(prior)
         self._coordinates, self._likelihood = coordinates, likelihood
         self._defensive = defensive
         self._log_evidence = pool.log_evidence

@@ -188,7 +188,7 @@ def _refine(
         regions.append(around(draws[coordinates.inside(draws)]))
     base: Proposal = PriorProposal(coordinates)
     first: Proposal | None = None
-    course = Course(budget=settings.num_histories)
+    course = Course()
     num_forced = 1
     least = max(MIN_STAGE, 2 * (coordinates.dim + 21))
     while True:

@@ -103,7 +103,6 @@ class Stage:
 class Course:
     """The stages so far and whether to go on."""
 
-    budget: int
     stages: list[Stage] = field(default_factory=list)
     divergence: float = np.inf
     shrinkage: float = np.inf
