@@ -21,7 +21,7 @@ from sbi_active.inference.refinement.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
 )
-from sbi_active.inference.refinement.trust import EDGE, RARE
+from sbi_active.inference.refinement.trust import misplaced
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -160,17 +160,7 @@ def _diagnose(
             f"density is off by about {effective**-0.5:.2g} nats; do raise "
             "num_histories"
         )
-    if min(tail[-1], min(tail[:-1]) * len(likelihood)) < RARE:
-        warnings.append(
-            f"the observations are unlike anything simulated (tail probability "
-            f"{min(tail):.1g}): the simulator lacks something, the prior excludes the "
-            "truth, or a measurement is wrong"
-        )
-    if edge_mass > EDGE:
-        warnings.append(
-            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
-            "prior may exclude the truth"
-        )
+    warnings += misplaced(tail[:-1], tail[-1], edge_mass)
     return Diagnostics(
         trustworthy=not warnings,
         warnings=(*warnings,),

@@ -199,7 +199,8 @@ def _refine(
         fits = [histories.regress(region) for region in regions]
         regressions = [fit for fit in fits if fit is not None]
         if not regressions:
-            if histories.valid.mean() > 0.5:  # it is not the outcomes that lack
+            # It is not the outcomes that lack.
+            if 2 * histories.valid.sum() > len(histories.valid):
                 raise ValueError(
                     f"expected at least {least} histories for {coordinates.dim} "
                     f"parameters; got {histories.num_drawn}; raise num_histories"

@@ -19,7 +19,7 @@ from sbi_active.inference.refinement.tails import tail_probability
 from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
 from sbi_active.inference.sampling.population import Particles
 
-__all__ = ["Course", "Stage", "diagnose"]
+__all__ = ["Course", "Stage", "diagnose", "misplaced"]
 
 Array = NDArray[Any]
 
@@ -219,17 +219,7 @@ def diagnose(
     warnings = [
         text.format(figure) for ok, figure, text in assumptions.values() if not ok
     ]
-    if joint < RARE or min(tail) < RARE / num_trials:
-        warnings.append(
-            f"the observations are unlike anything simulated (tail probability "
-            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
-            "excludes the truth, or a measurement is wrong"
-        )
-    if edge_mass > EDGE:
-        warnings.append(
-            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
-            "prior may exclude the truth"
-        )
+    warnings += misplaced(tail, joint, edge_mass)
     return Diagnostics(
         trustworthy=not warnings,
         warnings=(*warnings,),
@@ -257,6 +247,29 @@ def diagnose(
             "share_invalid": share_invalid,
         },
     )
+
+
+def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
+    """Return warnings of a belief that may be far from the truth.
+
+    Args:
+        tail: Tail probability of each trial.
+        joint: Of all trials.
+        edge_mass: Of the belief, near the edge of one parameter.
+    """
+    warnings = []
+    if joint < RARE or min(tail) < RARE / len(tail):
+        warnings.append(
+            f"the observations are unlike anything simulated (tail probability "
+            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
+            "excludes the truth, or a measurement is wrong"
+        )
+    if edge_mass > EDGE:
+        warnings.append(
+            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
+            "prior may exclude the truth"
+        )
+    return warnings
 
 
 def _noise_shape(
