@@ -27,6 +27,7 @@ from benchmarks.robustness.exact import Problem
 from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation import Workers
 
 ATTACKS = Attacks()
 
@@ -272,8 +273,8 @@ def same_seed(dim: int) -> None:
     simulator, x, _, _ = gaussian(matrix(4, dim), 0.5, mean, covariance)
     prior = normal_prior(mean, covariance)
     first, *others = (
-        inferred(prior, simulator, x.float(), num_histories=400, num_workers=workers)
-        for workers in (1, 1, 2)
+        inferred(prior, simulator, x.float(), num_histories=400, workers=Workers(num))
+        for num in (1, 1, 2)
     )
     with forked_generators(0):
         theta = prior.sample((200,))

@@ -123,7 +123,7 @@ class Learner:
                 self.belief,
                 num_samples=state.options.num_scored,
                 seed=derive_seed(state.seed, "score", trial.index),
-                engine=state.options.engine,
+                workers=state.options.workers,
             )
         self._state.account(
             trial.index,
@@ -149,7 +149,7 @@ class Learner:
                 self.prior,
                 num_samples=state.options.num_scored,
                 seed=derive_seed(state.seed, "prior", trial.index),
-                engine=state.options.engine,
+                workers=state.options.workers,
             )
         far = outlyingness(trial.x, rows.without_missing().x)
         lost = rows.counts["missing"]
@@ -197,7 +197,7 @@ class Learner:
                         trial.x,
                         action=trial.action,
                         simulator=self.simulator if options.refine else None,
-                        refinement=replace(options.refinement, **options.engine),
+                        refinement=replace(options.refinement, workers=options.workers),
                         seed=derive_seed(seed, "refine", trial.index),
                     )
             gained = information_gained(
@@ -241,7 +241,7 @@ class Learner:
         return self._inference.update_all(
             observed,
             simulator,
-            refinement=replace(options.refinement, **options.engine),
+            refinement=replace(options.refinement, workers=options.workers),
             seed=derive_seed(state.seed, "infer", state.version.number, key),
         )
 
@@ -307,7 +307,7 @@ class Learner:
                     theta,
                     action,
                     seed=derive_seed(seed, "x", key),
-                    **options.engine,
+                    workers=options.workers,
                 )
                 known = rows.without_missing()
                 if options.design_on == "training":
@@ -334,7 +334,7 @@ class Learner:
             action,
             seed=derive_seed(seed, "probe", 1),
             check_noise=True,
-            **self._state.options.engine,
+            workers=self._state.options.workers,
         )
         return rows.x.shape[1:]
 

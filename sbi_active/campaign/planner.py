@@ -59,10 +59,10 @@ class Planner:
                 estimator=options.estimator,
                 eliminate=options.eliminate,
                 exponent=options.exponent,
-                **options.engine,
+                workers=options.workers,
             )
             if self._designs
-            else RandomDesigner(actions, **options.engine)
+            else RandomDesigner(actions, workers=options.workers)
         )
 
     def require(self, target: str | Sequence[str]) -> None:
@@ -133,7 +133,7 @@ class Planner:
             return self._select(index, learner, self._designer, **limits), "random"
         if target == "auto" and self._checks(index):
             places = most_unlike(self._limits.permitted(exclude), executed)
-            designer = RandomDesigner(places, **options.engine)
+            designer = RandomDesigner(places, workers=options.workers)
             return self._select(index, learner, designer), "check"
         about_model = None
         # What nothing explains would draw the next trial after it; reports have it.

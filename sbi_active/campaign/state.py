@@ -15,7 +15,8 @@ from sbi_active.campaign.stopping import StopRules
 from sbi_active.design.designer import Design
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.refinement.stages import RefinementOptions
+from sbi_active.inference.refinement.settings import RefinementOptions
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = [
     "FAR",
@@ -67,8 +68,7 @@ class CampaignOptions:
             declared noise nothing in a round does, which then takes a fraction of the
             time (``benchmarks/cost/network.json``). Beliefs are refined without the
             network whoever asked for it, so that asking changes nothing.
-        refinement: Settings of the refinement; those of its simulations are taken from
-            here.
+        refinement: Settings of the refinement, whose simulations run as all others.
         num_scored: Simulations of each executed action, from the belief before the
             trial, that its outcome is compared with.
         check_every: Every so many-th trial goes where none was, instead of where most
@@ -76,11 +76,9 @@ class CampaignOptions:
             any simulator fits, and nothing tells that it is wrong. None never checks.
             A campaign that is given effects turns to the model by itself.
         stop: When :meth:`.Campaign.run` ends before its last round.
-        num_workers: Of all simulations, see
-            :func:`.simulate`.
-        time_limit: Seconds a simulated row may take; None waits for ever. With it, or
-            with more than one worker, a simulator that ends its process costs a row.
-        num_retries: How often a row that a fault lost is tried again.
+        num_workers: Of all simulations, as in :class:`.Workers`.
+        time_limit: As in :class:`.Workers`.
+        num_retries: As in :class:`.Workers`.
     """
 
     num_simulations: int = 5_000
@@ -105,13 +103,9 @@ class CampaignOptions:
     num_retries: int = 0
 
     @property
-    def engine(self) -> dict[str, Any]:
-        """Options of :func:`.simulate`."""
-        return {
-            "num_workers": self.num_workers,
-            "time_limit": self.time_limit,
-            "num_retries": self.num_retries,
-        }
+    def workers(self) -> Workers:
+        """Where all simulations run."""
+        return Workers(self.num_workers, self.time_limit, self.num_retries)
 
     @classmethod
     def faithful(cls) -> CampaignOptions:
@@ -131,6 +125,12 @@ class CampaignOptions:
         )
 
     def __post_init__(self) -> None:
+        if self.refinement.workers not in (IN_PROCESS, self.workers):
+            raise ValueError(
+                "expected the refinement's simulations to run as all others of a "
+                f"campaign, {self.workers}; got {self.refinement.workers} for them; "
+                "pass num_workers, time_limit and num_retries to CampaignOptions alone"
+            )
         if self.num_simulations < 100:
             raise ValueError(
                 f"expected num_simulations >= 100; got {self.num_simulations}; do use "

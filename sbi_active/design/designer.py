@@ -28,6 +28,7 @@ from sbi_active.search import (
 )
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["Design", "InformationGainDesigner", "RandomDesigner"]
 
@@ -69,11 +70,7 @@ class InformationGainDesigner:
             power of k among the candidates; inf takes the best.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
-        num_workers: Of the simulations, see
-            :func:`.simulate`.
-        time_limit: Seconds a simulated row may take; None waits for ever. With it, or
-            with more than one worker, a simulator that ends its process costs a row.
-        num_retries: How often a row that a fault lost is tried again.
+        workers: Of the simulations.
 
     Raises:
         ValueError: If ``num_samples`` is below 8, the exponent is negative, or the name
@@ -104,9 +101,7 @@ class InformationGainDesigner:
         search: str | Search = "auto",
         exponent: float = math.inf,
         eliminate: bool = True,
-        num_workers: int = 1,
-        time_limit: float | None = None,
-        num_retries: int = 0,
+        workers: Workers = IN_PROCESS,
     ) -> None:
         if num_samples < 8:
             raise ValueError(
@@ -123,11 +118,7 @@ class InformationGainDesigner:
         self.estimator, self.eliminate = estimator, eliminate
         self.search = _find_search(search, actions)
         self.search.size(actions)  # a search that does not apply is an error here
-        self.engine: dict[str, Any] = {
-            "num_workers": num_workers,
-            "time_limit": time_limit,
-            "num_retries": num_retries,
-        }
+        self.workers = workers
         find_estimator(estimator)  # an unknown name is an error here
 
     def select(
@@ -219,7 +210,7 @@ class InformationGainDesigner:
             num_samples=self.num_samples,
             early=self.eliminate,
             exponent=self.exponent,
-            engine=self.engine,
+            workers=self.workers,
             least=min_probability_valid,
             seed=seed,
         )

@@ -21,6 +21,7 @@ from sbi_active.design.eligibility import (
 )
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["RandomDesigner"]
 
@@ -34,10 +35,7 @@ class RandomDesigner:
         actions: The action space.
         num_samples: Simulations a candidate where ``min_probability_valid`` asks for
             its share of measurements; otherwise nothing is simulated.
-        num_workers: Of these simulations, with the next two as in
-            :class:`.InformationGainDesigner`.
-        time_limit: Seconds a simulated row may take.
-        num_retries: How often a row that a fault lost is tried again.
+        workers: Of these simulations.
     """
 
     def __init__(
@@ -45,17 +43,11 @@ class RandomDesigner:
         actions: ActionSpace,
         *,
         num_samples: int = 200,
-        num_workers: int = 1,
-        time_limit: float | None = None,
-        num_retries: int = 0,
+        workers: Workers = IN_PROCESS,
     ) -> None:
         self.actions = actions
         self.num_samples = num_samples
-        self.engine: dict[str, Any] = {
-            "num_workers": num_workers,
-            "time_limit": time_limit,
-            "num_retries": num_retries,
-        }
+        self.workers = workers
 
     def select(
         self,
@@ -157,6 +149,6 @@ class RandomDesigner:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
             drawn = simulate(
-                simulator, *rows, seed=derive_seed(seed, "x"), **self.engine
+                simulator, *rows, seed=derive_seed(seed, "x"), workers=self.workers
             )
         return drawn.status.reshape(len(values), n)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from sbi_active.information_gain.race import standard_error
 from sbi_active.search import Evaluations, Objective, Search
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
+from sbi_active.simulation.workers.settings import Workers
 
 __all__ = ["Selection"]
 
@@ -41,7 +42,7 @@ class Selection:
         num_samples: Simulations a candidate on average.
         early: Whether candidates begin with half of them.
         exponent: Of the choice.
-        engine: Options of simulations.
+        workers: Of the simulations.
         least: Share of measurements that a choice needs.
         seed: Of everything random.
     """
@@ -53,7 +54,7 @@ class Selection:
     num_samples: int
     early: bool
     exponent: float
-    engine: Mapping[str, Any]
+    workers: Workers
     least: float
     seed: int
 
@@ -80,7 +81,7 @@ class Selection:
         probed = listed
         if probed is None:
             probed = actions.sample((16,), seed=derive_seed(self.seed, "probed"))
-        sampler, estimator = target.sampler(probed, others, self.seed, self.engine)
+        sampler, estimator = target.sampler(probed, others, self.seed, self.workers)
         evaluator = GainEvaluator(sampler, estimator, target.model, target.belief)
         num_samples = max(8, self.num_samples // SHARE // 4 * 4)
         action = self.search.finalists(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ from sbi_active.information_gain import (
 from sbi_active.information_gain.candidates import CandidateSampler
 from sbi_active.information_gain.estimators.automatic import find_estimator
 from sbi_active.information_gain.estimators.model_index import RivalPredictive
+from sbi_active.simulation.workers.settings import Workers
 
 __all__ = ["Target"]
 
@@ -109,7 +110,7 @@ class Target:
         return estimator
 
     def sampler(
-        self, action: Tensor, others: Tensor, seed: int, engine: Mapping[str, Any]
+        self, action: Tensor, others: Tensor, seed: int, workers: Workers
     ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None]:
         """Return what draws outcomes of candidates, and the estimator.
 
@@ -117,7 +118,7 @@ class Target:
             action: Candidates, shape (a, action_dim).
             others: Whose outcomes will be known as well, shape (p, action_dim).
             seed: Of everything drawn.
-            engine: Options of simulations.
+            workers: Of the simulations.
 
         Raises:
             ValueError: If other outcomes have no place in the target or the estimator.
@@ -143,10 +144,10 @@ class Target:
                 "knows single outcomes; do use estimator='auto', or one action at a "
                 "time without pending ones"
             )
-        return (
-            CandidateSampler(self.simulator, self.belief, action, seed, engine, others),
-            estimator,
+        sampler = CandidateSampler(
+            self.simulator, self.belief, action, seed, workers, others
         )
+        return sampler, estimator
 
 
 def _parameters(target: str | Sequence[str], simulator: Any) -> list[int]:

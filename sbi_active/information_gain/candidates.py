@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from sbi_active.simulation import (
     simulate,
 )
 from sbi_active.simulation.model import require_noise
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["CandidateSampler"]
 
@@ -37,7 +38,7 @@ class CandidateSampler:
         belief: Distribution of the parameters.
         action: Candidates, shape (a, action_dim).
         seed: Of everything drawn.
-        engine: Options of every :func:`.simulate`; None for none.
+        workers: Of the simulations.
         others: Actions whose outcomes will be known as well, shape (p, action_dim);
             every draw then holds joint outcomes
             (:func:`.join_outcomes`). None for none.
@@ -56,13 +57,13 @@ class CandidateSampler:
         belief: Distribution,
         action: Tensor,
         seed: int,
-        engine: Mapping[str, Any] | None = None,
+        workers: Workers = IN_PROCESS,
         others: Tensor | None = None,
     ) -> None:
         self.simulator, self.belief = simulator, belief
         self.action, self.seed = action, seed
         self.others = action[:0] if others is None else others
-        self.engine = dict(engine or {})
+        self.workers = workers
         self.num_drawn = self.num_missing = 0
         self._num_waves = 0
         self.declared = self._probe()
@@ -190,7 +191,7 @@ class CandidateSampler:
     ) -> Simulations:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-            return simulate(simulator, *rows, seed=seed, **self.engine)
+            return simulate(simulator, *rows, seed=seed, workers=self.workers)
 
 
 @dataclass(frozen=True)

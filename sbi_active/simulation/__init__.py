@@ -22,6 +22,7 @@ from sbi_active.simulation.outcomes import (
     Simulations,
 )
 from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.settings import Workers
 
 __all__ = [
     "AutocorrelatedNoise",
@@ -35,6 +36,7 @@ __all__ = [
     "Simulations",
     "SimulatorModel",
     "StudentTNoise",
+    "Workers",
     "check_simulator",
     "estimate_noise",
     "reuse",

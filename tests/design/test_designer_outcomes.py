@@ -8,7 +8,7 @@ import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner, RandomDesigner
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import MissingRowsWarning
+from sbi_active.simulation import MissingRowsWarning, Workers
 from tests.design.test_designer import ACTIONS, VALUES
 from tests.linear_gaussian import PRIOR, ExactModel, simulator
 
@@ -102,7 +102,9 @@ class Hanging:
 @pytest.mark.slow
 def test_a_simulator_that_hangs_or_dies_costs_rows_and_one_warning():
     designer = InformationGainDesigner(
-        DiscreteActions([0.1, 4.0]), num_samples=200, num_workers=2, time_limit=0.05
+        DiscreteActions([0.1, 4.0]),
+        num_samples=200,
+        workers=Workers(num_workers=2, time_limit=0.05),
     )
     belief = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
     with pytest.warns(MissingRowsWarning, match="of the design are missing") as caught:

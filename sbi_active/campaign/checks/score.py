@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from sbi_active.campaign.checks.spread import Spread
 from sbi_active.inference.sampling.bandwidth import silverman
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["Score", "score_outcome"]
 
@@ -48,7 +49,7 @@ def score_outcome(
     *,
     num_samples: int,
     seed: int,
-    engine: Mapping[str, Any] | None = None,
+    workers: Workers = IN_PROCESS,
 ) -> Score:
     r"""Compare an outcome with simulations from the belief before it.
 
@@ -79,7 +80,7 @@ def score_outcome(
         belief: Before the trial.
         num_samples: n.
         seed: Of the simulations.
-        engine: Options of :func:`.simulate`.
+        workers: Of the simulations.
 
     References:
         Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &
@@ -92,7 +93,7 @@ def score_outcome(
         theta,
         action.expand(num_samples, -1),
         seed=derive_seed(seed, "x"),
-        **(engine or {}),
+        workers=workers,
     )
     drawn = rows.without_missing().x.double().flatten(1)
     drawn = torch.where(drawn.isfinite(), drawn, torch.nan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from sbi_active.campaign.state import FAR, Trial
 from sbi_active.inference.beliefs.belief import Belief, UnchangedBelief
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
+from sbi_active.simulation.workers.settings import Workers
 
 __all__ = ["doubts", "in_doubt", "is_suspect", "outlyingness", "simulate_prior"]
 
@@ -36,7 +37,7 @@ def simulate_prior(
     *,
     num_samples: int,
     seed: int,
-    engine: Mapping[str, Any],
+    workers: Workers,
 ) -> Simulations:
     """Return simulations of a trial's action from the prior.
 
@@ -46,12 +47,14 @@ def simulate_prior(
         prior: Of theta.
         num_samples: Rows.
         seed: Of the simulations.
-        engine: Options of :func:`.simulate`.
+        workers: Of the simulations.
     """
     with forked_generators(seed, "theta"):
         theta = prior.sample(torch.Size([num_samples]))
     action = trial.action.expand(num_samples, -1)
-    return simulate(simulator, theta, action, seed=derive_seed(seed, "x"), **engine)
+    return simulate(
+        simulator, theta, action, seed=derive_seed(seed, "x"), workers=workers
+    )
 
 
 def outlyingness(x: Tensor, drawn: Tensor) -> float:

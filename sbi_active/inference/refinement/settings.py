@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["RefinementOptions"]
 
@@ -43,9 +44,7 @@ class RefinementOptions:
             simulations, and report the divergence between the two: what the order and
             the draws contribute. It doubles the cost. A simulated likelihood has no
             order and no such check.
-        num_workers: Of the simulations, see :func:`.simulate`.
-        time_limit: Seconds a simulated row may take; None waits for ever.
-        num_retries: How often a row that a fault lost is tried again. A history of
+        workers: Of the simulations; in a campaign, its own are taken. A history of
             which a row stays lost is left out.
     """
 
@@ -59,9 +58,7 @@ class RefinementOptions:
     num_particles: int = 8_000
     max_regions: int = 8
     check_order: bool = False
-    num_workers: int = 1
-    time_limit: float | None = None
-    num_retries: int = 0
+    workers: Workers = IN_PROCESS
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -83,12 +80,3 @@ class RefinementOptions:
                     f"expected {name} in [{low:g}, {high:g}]; got {value}; do choose "
                     "a value in this range"
                 )
-
-    @property
-    def engine(self) -> dict[str, Any]:
-        """Options of :func:`.simulate`."""
-        return {
-            "num_workers": self.num_workers,
-            "time_limit": self.time_limit,
-            "num_retries": self.num_retries,
-        }

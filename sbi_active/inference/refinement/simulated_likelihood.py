@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
+from sbi_active.simulation.workers.settings import Workers
 
 __all__ = ["MeanTable", "SimulatedLikelihood", "declares_noise"]
 
@@ -46,15 +47,15 @@ class MeanTable:
 
     Args:
         simulator: With declared noise.
-        engine: Options of :func:`.simulate`.
+        workers: Of the simulations.
 
     Attributes:
         num_simulations: Rows simulated so far.
         num_missing: Those among them that a fault lost.
     """
 
-    def __init__(self, simulator: SimulatorModel, engine: Mapping[str, Any]) -> None:
-        self.simulator, self.engine = simulator, dict(engine)
+    def __init__(self, simulator: SimulatorModel, workers: Workers) -> None:
+        self.simulator, self.workers = simulator, workers
         self.num_simulations = self.num_missing = 0
         # The same object at each call, so that worker processes are kept.
         self._bare = simulator.without_noise()
@@ -92,7 +93,7 @@ class MeanTable:
                     actions,
                     seed=0,
                     batch_size=BATCH,
-                    **self.engine,
+                    workers=self.workers,
                 )
             except SimulationError:  # of a few rows, all may be lost
                 self.num_missing += len(theta)

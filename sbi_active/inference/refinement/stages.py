@@ -135,7 +135,7 @@ def refine(
     with single_thread():
         belief = None
         if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
-            past.table.engine = settings.engine
+            past.table.workers = settings.workers
             belief = refine_exactly(
                 prior,
                 SimulatedLikelihood(past.table, action, outcome),
@@ -178,8 +178,8 @@ def _refine(
 ) -> LearnedBelief | SimulatedBelief:
     rng = np.random.default_rng(derive_seed(seed, "refine"))
     coordinates = PriorCoordinates(prior, rng)
-    observed, engine = outcome.numpy().reshape(len(outcome), -1), settings.engine
-    histories = Histories(simulator, action, observed, coordinates, seed, past, engine)
+    observed, workers = outcome.numpy().reshape(len(outcome), -1), settings.workers
+    histories = Histories(simulator, action, observed, coordinates, seed, past, workers)
 
     regions = [whole_space(coordinates.dim)]
     for hint in hints:
@@ -244,7 +244,7 @@ def _refine(
     if stage.excess > SERIOUS_MISFIT:
         few = coordinates.to_theta(stage.draws[:8])
         if declares_noise(simulator, few, action[:1].expand(8, -1)):
-            table = MeanTable(simulator, engine)
+            table = MeanTable(simulator, workers)
             count = settings.num_histories // 4
             exact = refine_exactly(
                 prior,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from sbi_active.simulation.outcomes import (
     SimulationError,
 )
 from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["Histories", "HistoryRecord"]
 
@@ -77,7 +78,7 @@ class Histories:
         seed: Of the simulations.
         past: Histories of the first of these trials; those that are still of use are
             simulated at the further actions only.
-        engine: Options of :func:`.simulate`, such as its workers.
+        workers: Of the simulations.
 
     Attributes:
         z: Coordinates of the parameters, shape (n, d).
@@ -100,10 +101,10 @@ class Histories:
         coordinates: PriorCoordinates,
         seed: int,
         past: HistoryRecord | None = None,
-        engine: Mapping[str, Any] | None = None,
+        workers: Workers = IN_PROCESS,
     ) -> None:
         self.simulator, self.action = simulator, action
-        self.engine = {} if engine is None else engine
+        self.workers = workers
         self._seen = np.isfinite(x)
         self.used = self._seen.reshape(-1)
         self.observed = np.where(self._seen, x, 0.0).reshape(-1)
@@ -246,7 +247,11 @@ class Histories:
             warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
             try:
                 rows = simulate(
-                    self.simulator, theta, self.action[trial], seed=seed, **self.engine
+                    self.simulator,
+                    theta,
+                    self.action[trial],
+                    seed=seed,
+                    workers=self.workers,
                 )
             except SimulationError:  # of a few rows, all may be lost
                 if self.num_simulations == 0:

@@ -228,9 +228,7 @@ class ProductRounds(ActionRounds):
                     theta.repeat_interleave(len(trials), 0),
                     action.repeat(num, 1),
                     seed=derive_seed(own, "x"),
-                    num_workers=settings.num_workers,
-                    time_limit=settings.time_limit,
-                    num_retries=settings.num_retries,
+                    workers=settings.workers,
                 )
             num_simulations += len(rows)
             num_missing += rows.counts["missing"]

@@ -250,9 +250,7 @@ class SeqBED(ActiveInference):
                 theta,
                 action,
                 seed=derive_seed(seed, "x"),
-                num_workers=settings.num_workers,
-                time_limit=settings.time_limit,
-                num_retries=settings.num_retries,
+                workers=settings.workers,
             )
         known = rows.without_missing()
         with single_thread():

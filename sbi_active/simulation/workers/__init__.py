@@ -9,6 +9,7 @@ from sbi_active.simulation.workers.idle import IDLE
 from sbi_active.simulation.workers.pace import Pace, pace_of
 from sbi_active.simulation.workers.pools import pickled
 from sbi_active.simulation.workers.schedule import Schedule
+from sbi_active.simulation.workers.settings import Workers
 from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Recorder",
     "RowStore",
     "Schedule",
+    "Workers",
     "pace_of",
     "pickled",
     "run_digest",

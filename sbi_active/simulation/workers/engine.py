@@ -25,6 +25,7 @@ from sbi_active.simulation.workers.cluster import configured_pool
 from sbi_active.simulation.workers.pace import pace_of
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
 from sbi_active.simulation.workers.schedule import Schedule
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
 
 __all__ = ["simulate"]
@@ -40,6 +41,7 @@ def simulate(
     batch_size: int | None = None,
     time_limit: float | None = None,
     num_retries: int = 0,
+    workers: Workers | None = None,
     show_progress: bool = False,
     store: RowStore | None = None,
     check_noise: bool = False,
@@ -87,6 +89,7 @@ def simulate(
         time_limit: Seconds a row, loading the simulator not counted; a batch may take
             as much as its rows. None waits for ever.
         num_retries: How often a missing row is tried again, with the same seed.
+        workers: All three of these as one value, instead of them.
         show_progress: Show a progress bar.
         store: Keeps finished rows, every half second, and gives those that it has.
         check_noise: Simulate the first rows under a second seed and raise where
@@ -96,8 +99,8 @@ def simulate(
         The simulations, x in float32.
 
     Raises:
-        ValueError: If the shapes do not fit, or the simulator is deterministic and
-            ``check_noise`` is set.
+        ValueError: If the shapes or options do not fit, or the simulator is
+            deterministic and ``check_noise`` is set.
         SimulationError: If no row could be simulated.
         SimulationInterrupted: On a keyboard interrupt; it carries what is finished.
 
@@ -110,8 +113,18 @@ def simulate(
         torch.Size([3, 1])
     """
     theta, action = _checked(torch.as_tensor(theta), torch.as_tensor(action))
-    _check_options(num_workers, batch_size, time_limit, num_retries)
-    pool = _pool(simulator, num_workers, time_limit)
+    single = Workers(num_workers, time_limit, num_retries)
+    if workers is not None and single != IN_PROCESS:
+        raise ValueError(
+            "expected workers=, or num_workers=, time_limit= and num_retries=; got "
+            f"{workers} and {single}; pass one of them"
+        )
+    workers = single if workers is None else workers
+    if batch_size is not None and batch_size < 1:
+        raise ValueError(
+            f"expected batch_size >= 1; got {batch_size}; use None to have it chosen"
+        )
+    pool = _pool(simulator, workers)
     pace = None
     if not isinstance(pool, InProcess):
         theta, action = theta.detach().cpu(), action.detach().cpu()
@@ -119,8 +132,7 @@ def simulate(
         pace = pace_of(simulator)  # nobody looks on
     options = {
         "has_seeds": takes_seeds(simulator),
-        "time_limit": time_limit,
-        "num_retries": num_retries,
+        "workers": workers,
         "batch_size": batch_size,
         "pace": pace,
     }
@@ -170,41 +182,13 @@ def _own_rows(rows: Tensor) -> Tensor:
     return rows.to(torch.float32, copy=True)
 
 
-def _check_options(
-    num_workers: int,
-    batch_size: int | None,
-    time_limit: float | None,
-    num_retries: int,
-) -> None:
-    if num_workers < 1 and num_workers != -1:
-        raise ValueError(
-            f"expected num_workers >= 1, or -1 for one a core; got {num_workers}; do "
-            "use 1 to simulate in this process"
-        )
-    if batch_size is not None and batch_size < 1:
-        raise ValueError(
-            f"expected batch_size >= 1; got {batch_size}; do use None to have it chosen"
-        )
-    if time_limit is not None and not time_limit > 0:
-        raise ValueError(
-            f"expected time_limit > 0 s a row; got {time_limit}; do use None to wait "
-            "for ever"
-        )
-    if num_retries < 0:
-        raise ValueError(
-            f"expected num_retries >= 0; got {num_retries}; do use 0 to try once"
-        )
-
-
-def _pool(
-    simulator: Callable[..., Any], num_workers: int, time_limit: float | None
-) -> Pool:
-    if num_workers == 1 and time_limit is None:
+def _pool(simulator: Callable[..., Any], workers: Workers) -> Pool:
+    if workers.num_workers == 1 and workers.time_limit is None:
         return InProcess(simulator)
-    elsewhere = configured_pool(simulator, num_workers)
+    elsewhere = configured_pool(simulator, workers.num_workers)
     if elsewhere is None:
-        return WorkerPool(simulator, effective_n_jobs(num_workers))
-    if time_limit is not None:
+        return WorkerPool(simulator, effective_n_jobs(workers.num_workers))
+    if workers.time_limit is not None:
         raise ValueError(
             "expected the processes of this machine for time_limit; got another "
             "executor from joblib.parallel_config, whose workers cannot be killed from "

@@ -16,6 +16,7 @@ from sbi_active.simulation.simulator import all_finite
 from sbi_active.simulation.workers.calls import BLOCK, Call, Reply
 from sbi_active.simulation.workers.pace import Pace
 from sbi_active.simulation.workers.pools import Pool
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["Schedule"]
 
@@ -43,8 +44,8 @@ class Schedule:
         batch_size: Rows a call; None measures how many take ``BATCH_SECONDS``.
         pace: Sizes the calls where no batch size is given, as one worker needs it:
             a short simulation is one call, a long one is cut.
-        time_limit: Seconds a row; None waits for ever.
-        num_retries: How often a missing row is tried again.
+        workers: The seconds that a row may take, and how often a missing one is tried
+            again.
         on_rows: Told about finished rows: index (k,), x (k, *x_shape), status (k,).
 
     Attributes:
@@ -78,8 +79,7 @@ class Schedule:
         has_seeds: bool,
         batch_size: int | None = None,
         pace: Pace | None = None,
-        time_limit: float | None = None,
-        num_retries: int = 0,
+        workers: Workers = IN_PROCESS,
         on_rows: Callable[[Tensor, Tensor, Tensor], None] | None = None,
     ) -> None:
         self.theta = theta
@@ -89,8 +89,7 @@ class Schedule:
         self.has_seeds = has_seeds
         self.batch_size = batch_size
         self.pace = pace
-        self.time_limit = time_limit
-        self.num_retries = num_retries
+        self.workers = workers
         self.on_rows = on_rows
         self.x: Tensor | None = None
         self.status = torch.full((len(theta),), _UNFINISHED, dtype=torch.int8)
@@ -183,12 +182,13 @@ class Schedule:
         return size if self.has_seeds else -(-size // BLOCK) * BLOCK
 
     def _limit(self, call: Call) -> float | None:
-        if self.time_limit is None:
+        row_limit = self.workers.time_limit
+        if row_limit is None:
             return None
-        limit = self.time_limit * len(call)
+        limit = row_limit * len(call)
         if call.draws == "seeds" and self._seconds_a_row is not None:
             usual = self._seconds_a_row * len(call)
-            limit = min(limit, self.time_limit + self.SLACK * usual)
+            limit = min(limit, row_limit + self.SLACK * usual)
         return limit
 
     def _receive(self, call: Call, reply: Reply) -> None:
@@ -310,7 +310,7 @@ class Schedule:
             return
         self.tracebacks.setdefault(row, reply.traceback)
         self._attempts[row] += 1
-        if self._attempts[row] <= self.num_retries:
+        if self._attempts[row] <= self.workers.num_retries:
             self._urgent.append(call)
             return
         self.status[row] = Outcome.MISSING

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation import Workers
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
 ACTIONS = torch.tensor([-2.0, -1.0, 1.0, 2.0])
@@ -209,6 +210,6 @@ def test_settings_reach_the_engine():
             PRIOR,
             torch.ones(1, 1),
             torch.ones(1, 1),
-            settings=RefinementOptions(num_workers=0),
+            settings=RefinementOptions(workers=Workers(num_workers=0)),
             seed=0,
         )

@@ -1,0 +1,48 @@
+"""Where simulations run, and what a row may cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["IN_PROCESS", "Workers"]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where simulations run, and what a row may cost; nothing of x depends on it.
+
+    Attributes:
+        num_workers: Calls at a time; -1 means one a core. One worker without a time
+            limit is this process.
+        time_limit: Seconds a row, loading the simulator not counted; a batch may take
+            as much as its rows. None waits for ever. With it, or with more than one
+            worker, a simulator that ends its process costs a row.
+        num_retries: How often a missing row is tried again, with the same seed.
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+
+    num_workers: int = 1
+    time_limit: float | None = None
+    num_retries: int = 0
+
+    def __post_init__(self) -> None:
+        if self.num_workers < 1 and self.num_workers != -1:
+            raise ValueError(
+                "expected num_workers >= 1, or -1 for one a core; got "
+                f"{self.num_workers}; use 1 to simulate in this process"
+            )
+        if self.time_limit is not None and not self.time_limit > 0:
+            raise ValueError(
+                f"expected time_limit > 0 s a row; got {self.time_limit}; use None to "
+                "wait for ever"
+            )
+        if self.num_retries < 0:
+            raise ValueError(
+                f"expected num_retries >= 0; got {self.num_retries}; use 0 to try once"
+            )
+
+
+#: Without other processes, whose death would cost a row.
+IN_PROCESS = Workers()
