@@ -43,7 +43,7 @@ from benchmarks.box_collision.summary import (
 )
 from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
 from sbi_active.campaign import Trial
-from sbi_active.campaign.methods import METHODS, find_method
+from sbi_active.campaign.learning.methods import METHODS, find_method
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 from sbi_active.tasks.box_collision import (  # pyright: ignore

@@ -47,7 +47,7 @@ from benchmarks.numerical.run import (
     short,
 )
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
-from sbi_active.campaign.methods import METHODS, faithful_options
+from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.isolation import isolated
-from sbi_active.campaign.learner import Learner
-from sbi_active.campaign.limits import Limits
-from sbi_active.campaign.methods import METHODS, find_method
-from sbi_active.campaign.planner import Planner
-from sbi_active.campaign.revision import criticize, recompute, revise
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.learning.limits import Limits
+from sbi_active.campaign.learning.methods import METHODS, find_method
+from sbi_active.campaign.learning.planner import Planner
+from sbi_active.campaign.learning.revision import criticize, recompute, revise
 from sbi_active.campaign.state import (
-    UNSCORED,
     CampaignOptions,
     CampaignState,
-    Status,
     Trial,
 )
-from sbi_active.campaign.telling import find_trial, told_trial
-from sbi_active.seeding import derive_seed
+from sbi_active.campaign.storage.directory import CampaignDirectory
+from sbi_active.campaign.storage.loading import load
+from sbi_active.campaign.storage.manifest import new_manifest, write_manifest
+from sbi_active.campaign.storage.storage import Storage, stored
+from sbi_active.campaign.trials import CampaignTrials
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["METHODS", "Campaign"]
 
 
-class Campaign:
+class Campaign(CampaignTrials):
     r"""Estimate a simulator's parameters from a few real trials.
 
     A round: :meth:`ask` for an action, execute it, :meth:`tell` the outcome.
@@ -63,6 +64,10 @@ class Campaign:
             (n,), bool. The network learns about the others as well.
         seed: Of everything random; the same seed and outcomes give the same campaign.
         options: Sizes and estimators.
+        directory: New or empty folder to keep the campaign in, as it happens: whatever
+            ends the process, :meth:`load` goes on. None keeps it in memory alone.
+        on_trial: Called with each trial that was told, once it is recorded.
+        on_update: Called with each trial, once the belief contains it.
 
     Raises:
         ValueError: If the method is unknown, the prior has no support, or no width that
@@ -100,37 +105,121 @@ class Campaign:
         constraint: Callable[[Tensor], Tensor] | None = None,
         seed: int = 0,
         options: CampaignOptions | None = None,
+        directory: str | os.PathLike[str] | None = None,
+        on_trial: Callable[[Trial], None] | None = None,
+        on_update: Callable[[Trial], None] | None = None,
     ) -> None:
         find_method(method)  # an unknown name is an error here
-        self.actions = actions
         options = CampaignOptions() if options is None else options
-        self.state = CampaignState(method=method, seed=seed, options=options)
-        self._learner = Learner(simulator, prior, actions, self.state)
+        state = CampaignState(method=method, seed=seed, options=options)
+        learner = Learner(simulator, prior, actions, state)
         limits = Limits(actions, constraint, cost)
-        self._planner = Planner(limits, self.state, effects)
+        self._begin(state, actions, learner, Planner(limits, state, effects))
+        self.on_trial, self.on_update = on_trial, on_update
+        disk = None
+        if directory is not None:
+            manifest = new_manifest(
+                state,
+                simulator=simulator,
+                prior=prior,
+                actions=actions,
+                x_shape=learner.x_shape,
+                effects=[effect.name for effect in effects],
+                has_cost=cost is not None,
+                has_constraint=constraint is not None,
+            )
+            write_manifest(Path(directory), manifest)
+            disk = CampaignDirectory(Path(directory))
+        self._storage = Storage(disk, options.bank)
 
-    def __repr__(self) -> str:
-        done, pending = len(self.history), self.pending is not None
-        return (
-            f"Campaign({self.state.method}, {done} trials"
-            f"{', one pending' if pending else ''})"
-        )
+    def _begin(
+        self, state: CampaignState, actions: ActionSpace, learner: Any, planner: Planner
+    ) -> None:
+        self.state, self.actions = state, actions
+        self._learner, self._planner = learner, planner
 
-    @property
-    def belief(self) -> Distribution:
-        """The belief after the trials in ``state.processed``; the prior before any.
-
-        A trial that nothing in the prior explains, as after a slip of the unit, is left
-        out of it: five times the range of all simulations from the prior beyond them,
-        the model's word would be an extrapolation that pushes the belief to an edge.
-        ``belief.diagnostics.trustworthy`` is then False and ``warnings`` names
-        the trial, until it is told again or withdrawn. Trials that are beyond all
-        simulations but nearer stay in the belief and are named as well.
-        """
-        return self._learner.stated_belief
-
-    @property
+    @classmethod
     @isolated
+    def load(
+        cls,
+        directory: str | os.PathLike[str],
+        *,
+        simulator: Callable[..., Any] | None = None,
+        prior: Distribution | None = None,
+        actions: ActionSpace | None = None,
+        effects: Sequence[Effect] = (),
+        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        constraint: Callable[[Tensor], Tensor] | None = None,
+        options: CampaignOptions | None = None,
+        on_trial: Callable[[Trial], None] | None = None,
+        on_update: Callable[[Trial], None] | None = None,
+        simulator_changed: bool = False,
+        repair: bool = False,
+    ) -> Campaign:
+        """Return the campaign in a directory, where it was left or killed.
+
+        It goes on as if nothing had happened: with the same actions, outcomes and
+        beliefs, to the last bit. Nothing in the directory is executed.
+
+        Args:
+            directory: As given to the constructor.
+            simulator: As given there. Without it the campaign can be read, told and
+                corrected, and neither :meth:`ask` nor :meth:`update` compute.
+            prior: Needed where it is a class of your own; else None takes the
+                directory's.
+            actions: Likewise.
+            effects: As given to the constructor; functions are not stored.
+            cost: As given to the constructor.
+            constraint: As given to the constructor.
+            options: None takes the directory's; needed where an estimator is of your
+                own. Sizes may be others than before.
+            on_trial: As in the constructor.
+            on_update: As in the constructor.
+            simulator_changed: Take another simulator than the campaign was made with,
+                and compute everything again with it.
+            repair: Give up what is damaged. The files before are kept beside, and a
+                warning names each trial that has to be told again.
+
+        Raises:
+            ValueError: If there is no campaign, or one of another simulator or schema.
+            DamagedCampaignError: If a file does not hold what was written.
+        """
+        found = load(
+            directory,
+            simulator=simulator,
+            prior=prior,
+            actions=actions,
+            effects=effects,
+            options=options,
+            has_cost=cost is not None,
+            has_constraint=constraint is not None,
+            simulator_changed=simulator_changed,
+            repair=repair,
+        )
+        self = cls.__new__(cls)
+        limits = Limits(found.actions, constraint, cost)
+        planner = Planner(limits, found.state, effects)
+        self._begin(found.state, found.actions, found.learner, planner)
+        self.on_trial, self.on_update = on_trial, on_update
+        self._storage = Storage(found.disk, found.state.options.bank)
+        return self
+
+    def close(self) -> None:
+        """Let other processes write to the directory; the next call takes it again."""
+        self._storage.close()
+
+    def __enter__(self) -> Campaign:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy is in memory alone: a directory belongs to one campaign.
+        return {**vars(self), "_storage": Storage()}
+
+    @property
+    @stored
     def posterior(self) -> ActionPosterior:
         r"""The amortized posterior :math:`q(\theta | x, \xi)` under the current belief.
 
@@ -142,60 +231,7 @@ class Campaign:
         index = len(self.state.trials) if self.pending is None else self.pending.index
         return self._learner.posterior(index)
 
-    @property
-    def simulator(self) -> Callable[..., Any]:
-        """The current simulator, with the effects that were adopted."""
-        return self._learner.simulator
-
-    @simulator.setter
-    def simulator(self, simulator: Callable[..., Any]) -> None:
-        self._learner.simulator = simulator
-
-    @property
-    def prior(self) -> Distribution:
-        """The original prior, times those of the effects that were adopted."""
-        return self._learner.prior
-
-    @property
-    def effects(self) -> Sequence[Effect]:
-        """What the simulator may lack, as the campaign was told."""
-        return self._planner.effects
-
-    @property
-    def health(self) -> Health:
-        """Whether the simulator still explains the trials that the belief contains.
-
-        While it is right, an "alarm" comes in at most 5 % of campaigns, however long
-        they are, and a "watch" now and then. Under an alarm the belief may be narrow
-        and wrong: do :meth:`criticize`.
-        """
-        return assess(self.state)
-
-    @property
-    def history(self) -> Sequence[Trial]:
-        """The trials that were told, in order."""
-        return tuple(t for t in self.state.trials if t.status != "pending")
-
-    @property
-    def pending(self) -> Trial | None:
-        """The trial that was asked for and not told yet."""
-        waiting = [t for t in self.state.trials if t.status == "pending"]
-        return waiting[0] if waiting else None
-
-    @property
-    def stop_reason(self) -> str | None:
-        """Why ``options.stop`` says to stop, after the trials the belief contains.
-
-        None while the health is not "ok": a confident wrong belief would stop first.
-        """
-        if self.health != "ok":
-            return None
-        design = None if self.pending is None else self.pending.design
-        return self.state.options.stop.reason(
-            self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
-        )
-
-    @isolated
+    @stored
     def ask(self, *, target: str | Sequence[str] = "auto") -> Trial:
         """Return the pending trial, or design the next one.
 
@@ -230,89 +266,29 @@ class Campaign:
         except BaseException:
             self.state.trials.pop()
             raise
+        self._storage.write("asked", self.state.trials[index])
+        self._storage.save(self.state, self._learner)
         return self.state.trials[index]
 
-    @isolated
-    def tell(
-        self,
-        x: Tensor | np.ndarray | float | Sequence[float] | None = None,
-        *,
-        trial: Trial | int | None = None,
-        action: Tensor | np.ndarray | Sequence[float] | None = None,
-        status: Status = "ok",
-    ) -> Trial:
-        """Record the outcome of a trial and return at once.
-
-        A trial can be told again: with ``trial=``, another outcome takes the place of
-        the recorded one, and the next :meth:`update` computes everything again, beliefs
-        and scores of the later trials too, as if it had been told at once. Trials
-        behind an adoption are then given to the current model anew, and no longer have
-        scores under the models before it.
-
-        Args:
-            x: The outcome, shape x_shape; NaN throughout makes the trial "invalid", NaN
-                in part of it says that these numbers were not observed, which tells
-                nothing by itself. Infinite numbers count as NaN, with a warning.
-            trial: The trial or its index; None is the pending one, or a new trial
-                where none is pending and ``action`` is given.
-            action: The executed action where it is not the one asked for.
-            status: "ok", "invalid" (it ran and gave no measurement, which tells about
-                the parameters) or "missing" (a fault unrelated to them).
-
-        Returns:
-            The recorded trial. Telling the same outcome again changes nothing, with
-            ``trial=`` or, for the last trial while none is pending, without.
-
-        Raises:
-            ValueError: If there is no such trial, shapes do not fit, the action is not
-                finite, or what was told are no real numbers that float32 holds.
-        """
-        told = told_trial(
-            self.state,
-            x,
-            trial=trial,
-            action=action,
-            status=status,
-            x_shape=self._learner.x_shape,
-            actions=self.actions,
-        )
-        if any(told is known for known in self.state.trials):
-            return told
-        return self.state.record(told)
-
-    def withdraw(self, trial: Trial | int, *, reason: str = "") -> Trial:
-        """Take a trial out; it stays in the history, with the status "withdrawn".
-
-        The next :meth:`update` computes everything again without it, as if it had been
-        "missing". :meth:`tell` with ``trial=`` brings it back.
-
-        Args:
-            trial: The trial or its index, a pending one too.
-            reason: Kept with the trial.
-
-        Returns:
-            The recorded trial.
-
-        Raises:
-            ValueError: If there is no such trial.
-        """
-        found = find_trial(self.state, trial)
-        changes: dict[str, Any] = {"status": "withdrawn", "reason": reason}
-        return self.state.record(replace(found, **changes, **UNSCORED))
-
-    @isolated
+    @stored
     def update(self) -> Distribution:
         """Bring the belief up to date with every trial told so far, and return it."""
-        if self.state.is_stale:
-            recompute(self.state, self._learner)
+        state, learner = self.state, self._learner
+        _ = learner.belief  # one that cannot be read has all computed again
+        if state.is_stale:
+            recompute(state, learner)
+            self._storage.save(state, learner)
         for trial in self.history:
-            if trial.index in self.state.processed:
+            if trial.index in state.processed:
                 continue
             if trial.is_measured:
-                if trial.version != self.state.version.number:
-                    self._learner.score(trial)
-                self._learner.learn(self.state.trials[trial.index])
-            self.state.processed.append(trial.index)
+                if trial.version != state.version.number:
+                    learner.score(trial)
+                learner.learn(state.trials[trial.index])
+            state.processed.append(trial.index)
+            self._storage.save(state, learner)
+            if self.on_update is not None:
+                self.on_update(state.trials[trial.index])
         return self.belief
 
     def run(
@@ -351,7 +327,7 @@ class Campaign:
                 on_round(self.state.trials[index])
         return self.belief
 
-    @isolated
+    @stored
     def criticize(
         self, effects: Sequence[Effect] | None = None, *, evaluate: bool = True
     ) -> Report:
@@ -371,14 +347,18 @@ class Campaign:
                 not fit.
         """
         self.update()
-        return criticize(
+        report = criticize(
             self.state,
             self._planner.compare(self._learner, self.state.measured, effects),
             evaluate=evaluate,
             designed=find_method(self.state.method).designs,
         )
+        chosen = [*report.tracing.chosen]
+        found = {"digest": report.digest, "verdict": report.verdict, "chosen": chosen}
+        self._storage.write("examined", **found)
+        return report
 
-    @isolated
+    @stored
     def adopt(self, report: Report) -> Distribution:
         """Go on with the augmented simulator of a report.
 
@@ -397,4 +377,6 @@ class Campaign:
         """
         self.update()
         self._learner = revise(self.state, self.actions, report)
+        self._storage.write("adopted", version=asdict(self.state.version))
+        self._storage.save(self.state, self._learner)
         return self.belief

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -79,6 +80,10 @@ class CampaignOptions:
         num_workers: Of all simulations, as in :class:`.Workers`.
         time_limit: As in :class:`.Workers`.
         num_retries: As in :class:`.Workers`.
+        bank: Folder of simulations, which campaigns on the same simulator may share one
+            after another: what one has simulated the next reads, and its first round
+            begins with the rows of others, weighted by :func:`.reuse`. None keeps them
+            in the campaign's directory, if it has one.
     """
 
     num_simulations: int = 5_000
@@ -101,6 +106,7 @@ class CampaignOptions:
     num_workers: int = 1
     time_limit: float | None = None
     num_retries: int = 0
+    bank: str | None = None
 
     @property
     def workers(self) -> Workers:
@@ -125,6 +131,8 @@ class CampaignOptions:
         )
 
     def __post_init__(self) -> None:
+        if self.bank is not None:
+            object.__setattr__(self, "bank", os.fspath(self.bank))
         if self.refinement.workers not in (IN_PROCESS, self.workers):
             raise ValueError(
                 "expected the refinement's simulations to run as all others of a "
@@ -312,6 +320,15 @@ class CampaignState:
         self.trials[trial.index] = trial
         self.is_stale |= trial.index in self.processed
         return trial
+
+    def examined(self, digest: str) -> None:
+        """Note that the current model was compared with the trials.
+
+        Args:
+            digest: Of the comparison.
+        """
+        examined = (*self.version.examined, digest)
+        self.versions[-1] = replace(self.version, examined=examined)
 
     def unscore(self, index: int) -> None:
         """Forget what a trial was found to be."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 
-__all__ = ["find_trial", "told_trial"]
+__all__ = ["find_trial", "new_trial", "recorded", "told_trial"]
 
 LARGEST = torch.finfo(torch.float32).max
 
@@ -62,7 +63,7 @@ def told_trial(
         warnings.warn(
             f"the executed action {executed.tolist()} is not in {actions}; it is "
             "simulated where it was executed",
-            stacklevel=4,
+            stacklevel=5,
         )
     told = replace(target, action=executed, x=outcome, status=status)
     if target.status != "pending":
@@ -87,6 +88,33 @@ def find_trial(state: CampaignState, trial: Trial | int) -> Trial:
             f"{trial if index < 0 else index}; pass the trial that ask() returned"
         )
     return state.trials[index]
+
+
+def new_trial(state: CampaignState) -> Trial:
+    """Return the record of a trial that is not one of the campaign yet."""
+    return Trial(len(state.trials), torch.empty(0))
+
+
+def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
+    """Return the record of a trial as the log has it.
+
+    What was found about it stays where it is the same trial as before.
+
+    Args:
+        state: Of the campaign.
+        facts: Fields of :class:`.Trial`, its index among them.
+
+    Raises:
+        ValueError: If trials before it are not there.
+    """
+    index = facts["index"]
+    if index == len(state.trials):
+        return Trial(**facts)
+    before = find_trial(state, index)
+    after = replace(before, **facts)
+    if before.status == "pending" or same_outcome(before, after):
+        return after
+    return replace(after, **UNSCORED)
 
 
 def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
@@ -127,7 +155,7 @@ def _measured(x: Tensor) -> Tensor:
     warnings.warn(
         f"{int(infinite.sum())} of {x.numel()} told numbers are infinite and count as "
         "not measured; pass NaN where a sensor gave nothing",
-        stacklevel=6,
+        stacklevel=7,
     )
     return torch.where(infinite, torch.nan, x)
 
@@ -150,13 +178,15 @@ def _trial_to_tell(
     has_action: bool,
 ) -> Trial:
     """Return the trial that is meant, a new one where none is pending."""
+    if isinstance(trial, Trial) and trial.index == len(state.trials):
+        return trial
     if trial is not None:
         return find_trial(state, trial)
     pending = [t for t in state.trials if t.status == "pending"]
     if pending:
         return pending[0]
     if has_action:
-        return Trial(len(state.trials), torch.empty(0))
+        return new_trial(state)
     if state.trials:  # the last one, told twice
         last = state.trials[-1]
         if same_outcome(last, replace(last, x=outcome, status=status)):

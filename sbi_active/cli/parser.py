@@ -21,7 +21,7 @@ TASKS = (
     "ball_drops",
     "location_finding",
 )
-#: Names of the methods, as in ``sbi_active.campaign.methods.METHODS``.
+#: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
 METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
 #: Names of the settings of a method, as in ``sbi_active.cli.run.SETTINGS``.
 SETTINGS = ("default", "faithful")

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
-from sbi_active.campaign.methods import faithful_options, find_method
+from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.options import make_task
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sbi_active import Campaign, CampaignOptions, GaussianNoise, SimulatorModel
-from sbi_active.campaign.round_model import RoundModel
+from sbi_active.campaign.learning.round_model import RoundModel
 from sbi_active.seeding import forked_generators, row_normals
 from tests.campaign.test_campaign import ACTIONS, OPTIONS, PRIOR
 

@@ -7,7 +7,7 @@ import torch
 from torch.distributions import Independent, Normal
 
 from sbi_active import Campaign, StopRules
-from tests.campaign.test_revision import (
+from tests.campaign.learning.test_revision import (
     ACTIONS,
     BIAS,
     LIBRARY,

@@ -160,6 +160,16 @@ class ActiveInference(ABC):
             raise ValueError("expected at least one trial; got none; pass trials")
         return self._conclude(Told((*trials,), simulator, refinement, seed, True))
 
+    def resume(self, belief: Distribution, trials: Sequence[Observation]) -> None:
+        """Go on from a belief that was inferred before.
+
+        Args:
+            belief: After the trials.
+            trials: They replace the history.
+        """
+        self._belief, self.trials = belief, [*trials]
+        self._forget_round()
+
     @abstractmethod
     def _infer(self, told: Told) -> Belief:
         """Return the belief after trials, and change nothing."""

@@ -26,7 +26,12 @@ from sbi_active.simulation.workers.pace import pace_of
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
 from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
-from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
+from sbi_active.simulation.workers.store import (
+    Recorder,
+    RowStore,
+    find_store,
+    run_digest,
+)
 
 __all__ = ["simulate"]
 
@@ -91,7 +96,8 @@ def simulate(
         num_retries: How often a missing row is tried again, with the same seed.
         workers: All three of these as one value, instead of them.
         show_progress: Show a progress bar.
-        store: Keeps finished rows, every half second, and gives those that it has.
+        store: Keeps finished rows, every half second, and gives those that it has;
+            None takes that of the campaign whose directory this is called for, if any.
         check_noise: Simulate the first rows under a second seed and raise where
             nothing differs.
 
@@ -125,6 +131,7 @@ def simulate(
             f"expected batch_size >= 1; got {batch_size}; use None to have it chosen"
         )
     pool = _pool(simulator, workers)
+    store = find_store(simulator) if store is None else store
     pace = None
     if not isinstance(pool, InProcess):
         theta, action = theta.detach().cpu(), action.detach().cpu()

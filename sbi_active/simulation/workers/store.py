@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import time
-from typing import TYPE_CHECKING, Protocol, TypedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 
 import torch
 from torch import Tensor
@@ -12,7 +15,15 @@ from torch import Tensor
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["Recorder", "RowStore", "StoredRows", "run_digest"]
+__all__ = [
+    "FindStore",
+    "Recorder",
+    "RowStore",
+    "StoredRows",
+    "find_store",
+    "run_digest",
+    "storing",
+]
 
 
 class StoredRows(TypedDict):
@@ -61,6 +72,32 @@ class RowStore(Protocol):
             **rows: The rows, as keywords.
         """
         ...
+
+
+#: Takes a simulator and returns the store of its rows, or None.
+FindStore = Callable[[Callable[..., Any]], RowStore | None]
+
+_FINDERS: ContextVar[FindStore | None] = ContextVar("stores", default=None)
+
+
+@contextmanager
+def storing(find: FindStore) -> Iterator[None]:
+    """Have all simulations in the block stored that are given no store of their own.
+
+    Args:
+        find: Returns the store of a simulator's rows.
+    """
+    token = _FINDERS.set(find)
+    try:
+        yield
+    finally:
+        _FINDERS.reset(token)
+
+
+def find_store(simulator: Callable[..., Any]) -> RowStore | None:
+    """Return the store of a simulator's rows, if the caller is in :func:`storing`."""
+    find = _FINDERS.get()
+    return None if find is None else find(simulator)
 
 
 def run_digest(seed: int, theta: Tensor, action: Tensor) -> str:

@@ -167,7 +167,7 @@ def test_a_failed_adoption_changes_nothing(monkeypatch):
     def fails(*arguments, **options):
         raise RuntimeError("out of licenses")
 
-    monkeypatch.setattr("sbi_active.campaign.learner.Learner.infer", fails)
+    monkeypatch.setattr("sbi_active.campaign.learning.learner.Learner.infer", fails)
     with pytest.raises(RuntimeError, match="licenses"):
         c.adopt(report)
     assert c.belief is belief

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.learner import Learner
+from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -18,7 +19,7 @@ from sbi_active.simulation import SimulatorModel
 if TYPE_CHECKING:
     from sbi_active.criticism import Criticism, Effect, Report
 
-__all__ = ["compare", "criticize", "recompute", "revise"]
+__all__ = ["compare", "criticize", "rebuilt", "recompute", "revise"]
 
 
 def compare(
@@ -77,14 +78,13 @@ def criticize(
         evaluate: Whether to report the error before and after.
         designed: Whether the actions were chosen for information.
     """
-    version = state.version
+    examined = state.version.examined
     report = criticism.report(
         evaluate=evaluate,
         designed=designed,
-        exploratory=any(d != criticism.digest for d in version.examined),
+        exploratory=any(d != criticism.digest for d in examined),
     )
-    examined = (*version.examined, criticism.digest)
-    state.versions[-1] = replace(version, examined=examined)
+    state.examined(criticism.digest)
     return report
 
 
@@ -129,6 +129,43 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
         raise
     state.versions[-1] = replace(version, misfit=misfit)
     return revised
+
+
+def rebuilt(
+    state: CampaignState,
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    actions: ActionSpace,
+    effects: Sequence[Effect],
+) -> tuple[Callable[..., Any], Distribution]:
+    """Return the simulator and the prior of the current version, made anew.
+
+    Args:
+        state: Of the campaign.
+        simulator: That it began with.
+        prior: That it began with.
+        actions: The permitted ones.
+        effects: Among them those that were adopted.
+
+    Raises:
+        ValueError: If an adopted effect is not among them.
+    """
+    for before, version in itertools.pairwise(state.versions):
+        added = [name for name in version.effects if name not in before.effects]
+        lacking = {*added} - {effect.name for effect in effects}
+        if lacking:
+            raise ValueError(
+                f"expected the effects that the campaign adopted, {', '.join(added)}; "
+                f"got none named {', '.join(sorted(lacking))}; pass effects= as they "
+                "were declared"
+            )
+        then = replace(state, versions=[before], trials=state.trials)
+        trials = [t for i in version.trials if (t := state.trials[i]).is_measured]
+        criticism = compare(
+            then, simulator, prior, actions, trials=trials, effects=effects
+        )
+        simulator, prior = criticism.add(added)
+    return simulator, prior
 
 
 def recompute(state: CampaignState, learner: Learner) -> None:

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from sbi_active.campaign.checks.unlike import most_unlike
-from sbi_active.campaign.learner import Learner
-from sbi_active.campaign.limits import Limits
-from sbi_active.campaign.methods import find_method
-from sbi_active.campaign.revision import compare
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.learning.limits import Limits
+from sbi_active.campaign.learning.methods import find_method
+from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, action_name
 from sbi_active.design.designer import InformationGainDesigner, RandomDesigner

@@ -16,7 +16,7 @@ from sbi_active import (
     MixtureDensity,
     RefinementOptions,
 )
-from sbi_active.campaign.methods import METHODS, faithful_options
+from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.inference import LFIRE, RatioClassifier
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -21,9 +22,13 @@ from sbi_active.campaign.checks.unexplained import (
     outlyingness,
     simulate_prior,
 )
-from sbi_active.campaign.indexed import IndexedSimulator, at_index, depends_on_index
-from sbi_active.campaign.methods import find_method
-from sbi_active.campaign.round_model import RoundModel
+from sbi_active.campaign.learning.indexed import (
+    IndexedSimulator,
+    at_index,
+    depends_on_index,
+)
+from sbi_active.campaign.learning.methods import find_method
+from sbi_active.campaign.learning.round_model import RoundModel
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import (
     information_gained,
@@ -34,6 +39,7 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
+from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 
@@ -49,6 +55,7 @@ class Learner:
         prior: Over its parameters.
         actions: Of the campaign.
         state: Of the campaign.
+        x_shape: Of an outcome; None finds it by a few simulations.
 
     Attributes:
         x_shape: Of an outcome.
@@ -66,26 +73,60 @@ class Learner:
         prior: Distribution,
         actions: ActionSpace,
         state: CampaignState,
+        *,
+        x_shape: torch.Size | None = None,
     ) -> None:
         self.simulator, self.prior = simulator, require_support(prior)
         self._actions, self._state = actions, state
         names = getattr(simulator, "parameter_names", None)
         require_width(prior, names, seed=derive_seed(state.seed, "width"))
         self.restart()
-        self.x_shape = self._probe()
-        seed = derive_seed(state.seed, "index")
-        self._has_index = depends_on_index(simulator, prior, actions, seed=seed)
+        self.x_shape = self._probe() if x_shape is None else x_shape
 
     def restart(self) -> None:
         """Forget all trials: the belief is the prior again."""
-        self._inference = find_method(self._state.method).build(
+        self._trainer = find_method(self._state.method).build(
             self.prior, self._state.options
         )
         # Asking for the network must not change the beliefs of a campaign.
-        self._inference.starts_at_network = self._state.options.network == "each round"
+        self._trainer.starts_at_network = self._state.options.network == "each round"
+        self._saved: Callable[[], Distribution] | None = None
         self._end_round()
         self._stated: tuple[Distribution, list[str], Distribution] | None = None
         self.simulations: Simulations | None = None
+
+    @cached_property
+    def _has_index(self) -> bool:
+        """Whether the simulator is another one at each trial."""
+        seed = derive_seed(self._state.seed, "index")
+        return depends_on_index(self.simulator, self.prior, self._actions, seed=seed)
+
+    def forget(self) -> None:
+        """Have the next update compute everything again."""
+        self._state.is_stale = bool(self._state.processed)
+
+    def resume(self, belief: Callable[[], Distribution]) -> None:
+        """Go on where ``state.processed`` ends.
+
+        Args:
+            belief: Returns the belief of then, read when it is first asked for.
+        """
+        self._saved = belief
+
+    @property
+    def _inference(self) -> ActiveInference:
+        """What learns, where the belief stands."""
+        saved, self._saved = self._saved, None
+        if saved is not None:
+            trials = [self._observation(t) for t in self._state.explained]
+            self._trainer.resume(saved(), trials)
+        return self._trainer
+
+    def _observation(self, trial: Trial) -> Observation:
+        assert trial.x is not None
+        place = torch.tensor([float(trial.index)]) if self._has_index else None
+        action = trial.action if place is None else torch.cat([trial.action, place])
+        return Observation(action, trial.x.float())
 
     def _end_round(self) -> None:
         self._round_ready, self._asked = False, ()
@@ -230,16 +271,10 @@ class Learner:
         simulator: Any = self.simulator
         if self._has_index:
             simulator = IndexedSimulator(simulator)
-        observed = []
-        for trial in trials:
-            assert trial.x is not None
-            place = torch.tensor([float(trial.index)]) if self._has_index else None
-            action = trial.action if place is None else torch.cat([trial.action, place])
-            observed.append(Observation(action, trial.x.float()))
         state = self._state
         options = state.options
         return self._inference.update_all(
-            observed,
+            [self._observation(trial) for trial in trials],
             simulator,
             refinement=replace(options.refinement, workers=options.workers),
             seed=derive_seed(state.seed, "infer", state.version.number, key),

@@ -1,0 +1,316 @@
+"""Objects of this library as plain data, and back, without executing any of it.
+
+Pickle calls what a file names; here a file holds numbers and names, and an object is
+made of a class of this library, torch or sbi and its attributes. What a user wrote, a
+simulator or a distribution of his own, is not stored but referred to, and is put back
+from where he gives it again.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import math
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["Absent", "NotStorableError", "decode", "encode"]
+
+#: Packages whose classes are stored by their attributes.
+TRUSTED = (
+    "sbi_active.",
+    "sbi.utils.",
+    "sbi.neural_nets.",
+    "torch.distributions.",
+    "torch.nn.modules.",
+)
+#: Levels of attributes below what is given again in which to look for references.
+DEPTH = 5
+TAG = "!"  # of whatever JSON does not hold by itself
+
+_SEQUENCES: dict[str, Callable[[list[Any]], Any]] = {
+    "list": list,
+    "tuple": tuple,
+    "set": set,
+    "frozenset": frozenset,
+    "size": torch.Size,
+}
+_KINDS = {list: "list", tuple: "tuple", set: "set", frozenset: "frozenset"}
+_KINDS[torch.Size] = "size"
+_MAPPINGS: dict[str, type] = {"dict": dict, "ordered": OrderedDict}
+
+
+class Absent:
+    """Stands for what a reader does not have, and for whatever hangs from it."""
+
+
+class NotStorableError(TypeError):
+    """Something in an object is neither of this library nor given again."""
+
+
+def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
+    """Return an object as bytes; one that occurs twice is stored once.
+
+    Args:
+        value: Numbers, texts, arrays, tensors, containers, and objects of this library,
+            sbi's utilities and networks, torch's distributions and modules.
+        known: What the reader has too, by name, such as the simulator and the prior.
+            It is stored by its name, and what hangs from it, where it is of a class
+            that is not stored, by its place.
+
+    Raises:
+        NotStorableError: If there is anything else in it.
+    """
+    writer = _Writer(known)
+    structure = json.dumps(writer.node(value), allow_nan=False)
+    buffer = io.BytesIO()
+    torch.save({"structure": structure, "arrays": writer.arrays}, buffer)
+    return zlib.compress(buffer.getvalue(), 1)
+
+
+def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
+    """Return the object of :func:`encode`.
+
+    Nothing in the content is executed: tensors are read by torch's restricted reader,
+    and objects are made without calling their constructors.
+
+    Args:
+        content: The bytes.
+        known: As given to :func:`encode`, by the same names.
+
+    Raises:
+        ValueError: If the content is nothing that :func:`encode` writes.
+    """
+    try:
+        stored = torch.load(io.BytesIO(zlib.decompress(content)), weights_only=True)
+        return _Reader(known, stored["arrays"]).value(json.loads(stored["structure"]))
+    except Exception as error:  # each library has its own
+        raise ValueError(
+            f"expected what this library stores; got {type(error).__name__}: "
+            f"{str(error):.200}; restore the file from a copy"
+        ) from error
+
+
+class _Writer:
+    """Turns values into JSON, and collects their arrays."""
+
+    def __init__(self, known: Mapping[str, Any]) -> None:
+        self.arrays: list[Tensor] = []
+        self._roots = {id(value): [name] for name, value in known.items()}
+        self._places = {id(value): [*path] for path, value in _places(known)}
+        self._numbers: dict[int, int] = {}
+        self._kept: list[Any] = []
+
+    def node(self, value: Any) -> Any:
+        """Return a value as JSON."""
+        if _is_scalar(value):
+            return _scalar(value)
+        if id(value) in self._roots:
+            return {TAG: "known", "path": self._roots[id(value)]}
+        if id(value) in self._numbers:
+            return {TAG: "seen", "number": self._numbers[id(value)]}
+        self._numbers[id(value)] = len(self._numbers)
+        self._kept.append(value)  # so that no other object gets its identity
+        return self._new(value)
+
+    def _new(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return self._tensor(value)
+        if isinstance(value, np.ndarray | np.generic):
+            return self._array(value)
+        if isinstance(value, torch.dtype):
+            return {TAG: "dtype", "name": str(value).removeprefix("torch.")}
+        if isinstance(value, torch.device):
+            return {TAG: "device", "name": str(value)}
+        kind = _KINDS.get(type(value))
+        if kind is not None:
+            return {TAG: kind, "items": [self.node(item) for item in value]}
+        if isinstance(value, MappingProxyType):
+            return {TAG: "proxy", "of": self.node({**value})}
+        for name, mapping in _MAPPINGS.items():
+            if type(value) is mapping:
+                pairs = [[self.node(k), self.node(v)] for k, v in value.items()]
+                return {TAG: name, "items": pairs}
+        return self._object(value)
+
+    def _tensor(self, value: Tensor) -> Any:
+        self.arrays.append(value.detach().cpu().clone())
+        what = "parameter" if isinstance(value, torch.nn.Parameter) else "tensor"
+        number = len(self.arrays) - 1
+        return {TAG: what, "array": number, "gradient": value.requires_grad}
+
+    def _array(self, value: Any) -> Any:
+        array = np.ascontiguousarray(value)
+        if array.dtype.kind not in "biufc":
+            raise NotStorableError(f"an array of {array.dtype}")
+        single = array.astype(np.float32) if array.dtype == np.float64 else array
+        # Simulations are float32 in most places; the other half need not be stored.
+        lossless = np.array_equal(single, array, equal_nan=array.dtype.kind == "f")
+        self.arrays.append(torch.from_numpy((single if lossless else array).copy()))
+        return {
+            TAG: "array" if isinstance(value, np.ndarray) else "number",
+            "array": len(self.arrays) - 1,
+            "shape": [*np.shape(value)],
+            "dtype": array.dtype.str,
+        }
+
+    def _object(self, value: Any) -> Any:
+        kind = type(value)
+        if not _is_trusted(kind.__module__) or _class(_name(kind)) is not kind:
+            if id(value) in self._places:
+                return {TAG: "known", "path": self._places[id(value)]}
+            raise NotStorableError(f"{kind.__module__}.{kind.__qualname__}")
+        state = {**getattr(value, "__dict__", {})}
+        for base in kind.__mro__:
+            for slot in _slots(base):
+                if hasattr(value, slot):
+                    state[slot] = getattr(value, slot)
+        items = [[name, self.node(part)] for name, part in state.items()]
+        return {TAG: "object", "class": _name(kind), "state": items}
+
+
+class _Reader:
+    """Turns JSON back into values."""
+
+    def __init__(self, known: Mapping[str, Any], arrays: list[Tensor]) -> None:
+        self._known, self._arrays = known, arrays
+        self._seen: list[Any] = []
+
+    def value(self, node: Any) -> Any:
+        """Return what a node stands for."""
+        if not isinstance(node, dict):
+            return node
+        kind = node[TAG]
+        if kind == "float":
+            return float(node["value"])
+        if kind == "known":
+            if len(node["path"]) > 1:  # counted by the writer
+                self._seen.append(_at(self._known, node["path"]))
+            return _at(self._known, node["path"])
+        if kind == "seen":
+            return self._seen[node["number"]]
+        number = len(self._seen)
+        self._seen.append(None)
+        if kind in _MAPPINGS:
+            made = self._seen[number] = _MAPPINGS[kind]()
+            made.update((self.value(k), self.value(v)) for k, v in node["items"])
+        elif kind == "list":
+            made = self._seen[number] = []
+            made.extend(self.value(item) for item in node["items"])
+        elif kind == "object":
+            made = self._seen[number] = _blank(node["class"])
+            for name, part in node["state"]:
+                # Frozen dataclasses refuse to be changed, and modules look first.
+                object.__setattr__(made, name, self.value(part))
+        else:
+            made = self._seen[number] = self._whole(kind, node)
+        return made
+
+    def _whole(self, kind: str, node: dict[str, Any]) -> Any:
+        """Return what cannot contain itself."""
+        if kind in _SEQUENCES:
+            return _SEQUENCES[kind]([self.value(item) for item in node["items"]])
+        if kind == "proxy":
+            return MappingProxyType(self.value(node["of"]))
+        if kind == "dtype":
+            found = getattr(torch, node["name"])
+            if not isinstance(found, torch.dtype):
+                raise TypeError(f"no dtype {node['name']!r}")
+            return found
+        if kind == "device":
+            return torch.device(node["name"])
+        tensor = self._arrays[node["array"]]
+        if kind == "parameter":
+            return torch.nn.Parameter(tensor, requires_grad=node["gradient"])
+        if kind == "tensor":
+            return tensor.requires_grad_(node["gradient"])
+        dtype = np.dtype(node["dtype"])
+        array = tensor.numpy().astype(dtype).reshape(node["shape"])
+        return array if kind == "array" else array[()]
+
+
+def _is_scalar(value: Any) -> bool:
+    return value is None or type(value) in (bool, int, float, str)
+
+
+def _scalar(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return {TAG: "float", "value": str(value)}
+    return value
+
+
+def _is_trusted(module: str) -> bool:
+    return module.startswith(TRUSTED) and not module.endswith("__main__")
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _class(name: str) -> Any:
+    """Return the class of a name, of a trusted module that defines it; else None."""
+    module, _, path = name.partition(":")
+    if not _is_trusted(module):
+        return None
+    found: Any = importlib.import_module(module)
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    is_own = isinstance(found, type) and found.__module__ == module
+    return found if is_own else None
+
+
+def _blank(name: str) -> Any:
+    kind = _class(name)
+    if kind is None:
+        raise TypeError(f"no class {name!r} that is stored")
+    return object.__new__(kind)
+
+
+def _slots(kind: type) -> tuple[str, ...]:
+    slots = kind.__dict__.get("__slots__", ())
+    names = (slots,) if isinstance(slots, str) else tuple(slots)
+    return tuple(name for name in names if name not in ("__dict__", "__weakref__"))
+
+
+def _places(known: Mapping[str, Any]) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Yield where each object below what is known hangs, the nearest last."""
+    level: list[tuple[tuple[Any, ...], Any]] = [((n,), v) for n, v in known.items()]
+    levels, seen = [level], {id(value) for value in known.values()}
+    for _ in range(DEPTH):
+        below = []
+        for path, value in level:
+            for name, part in _parts(value):
+                if not _is_scalar(part) and id(part) not in seen:
+                    seen.add(id(part))
+                    below.append(((*path, name), part))
+        levels.append(below)
+        level = below
+    for level in reversed(levels):
+        yield from level
+
+
+def _parts(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield what hangs from an object: attributes by name, items by number or key."""
+    if isinstance(value, list | tuple):
+        yield from enumerate(value)
+    elif isinstance(value, dict):
+        yield from ((k, v) for k, v in value.items() if isinstance(k, str))
+    elif not isinstance(value, type | Tensor | np.ndarray):
+        yield from getattr(value, "__dict__", {}).items()
+
+
+def _at(known: Mapping[str, Any], path: list[Any]) -> Any:
+    found: Any = known[path[0]]
+    for name in path[1:]:
+        if isinstance(found, Absent):
+            return found
+        found = dict(_parts(found))[name]
+    return found

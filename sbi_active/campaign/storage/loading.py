@@ -1,0 +1,174 @@
+"""A campaign from its folder."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import torch
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.campaign.checks.unexplained import doubts, in_doubt
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.learning.revision import rebuilt
+from sbi_active.campaign.state import CampaignOptions, CampaignState
+from sbi_active.campaign.storage.codec import Absent
+from sbi_active.campaign.storage.described import (
+    actions_from,
+    options_from,
+    prior_from,
+)
+from sbi_active.campaign.storage.directory import CampaignDirectory
+from sbi_active.campaign.storage.manifest import require_same_simulator
+from sbi_active.campaign.storage.storage import known
+from sbi_active.simulation.bank.fingerprint import fingerprint
+
+if TYPE_CHECKING:
+    from sbi_active.criticism import Effect
+
+__all__ = ["Loaded", "StoredLearner", "load"]
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """The parts of a campaign."""
+
+    disk: CampaignDirectory
+    state: CampaignState
+    actions: ActionSpace
+    learner: Learner | StoredLearner
+
+
+class StoredLearner:
+    """What is known of a campaign without its simulator.
+
+    Args:
+        prior: Over the parameters.
+        x_shape: Of an outcome.
+        state: Of the campaign.
+        belief: Returns the belief, read when it is first asked for; None for none.
+
+    Attributes:
+        prior: As given; without those of effects that were adopted.
+        x_shape: As given.
+    """
+
+    simulator = None
+
+    def __init__(
+        self,
+        prior: Distribution,
+        x_shape: torch.Size,
+        state: CampaignState,
+        belief: Callable[[], Distribution] | None,
+    ) -> None:
+        self.prior, self.x_shape, self._state = prior, x_shape, state
+        self._saved, self._belief = belief, prior
+
+    @property
+    def belief(self) -> Distribution:
+        """The belief when the campaign was last brought up to date."""
+        saved, self._saved = self._saved, None
+        if saved is not None:
+            self._belief = saved()
+        return self._belief
+
+    @property
+    def stated_belief(self) -> Distribution:
+        """That, marked untrustworthy where trials are not in it."""
+        texts = doubts(self._state.measured)
+        if self._state.is_stale:
+            texts.append(
+                "trials were told or corrected since: update() computes it again"
+            )
+        return in_doubt(self.belief, self.prior, texts)
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise ValueError(
+            "expected the simulator, which is not stored with a campaign; got none; "
+            "pass it: Campaign.load(directory, simulator=...)"
+        )
+
+
+def load(
+    directory: str | os.PathLike[str],
+    *,
+    simulator: Callable[..., Any] | None,
+    prior: Distribution | None,
+    actions: ActionSpace | None,
+    effects: Sequence[Effect],
+    options: CampaignOptions | None,
+    has_cost: bool,
+    has_constraint: bool,
+    simulator_changed: bool,
+    repair: bool,
+) -> Loaded:
+    """Return the parts of a campaign, see :meth:`.Campaign.load`."""
+    disk = CampaignDirectory(Path(directory), repair=repair)
+    manifest = disk.manifest
+    settings: CampaignOptions = _given("options", options, manifest, options_from)
+    space: ActionSpace = _given("actions", actions, manifest, actions_from)
+    first_prior: Distribution = _given("prior", prior, manifest, prior_from)
+    state = CampaignState(manifest["method"], manifest["seed"], settings)
+    name = disk.restore(state)
+    shape = torch.Size(manifest["x_shape"])
+    for note in disk.notes:
+        warnings.warn(note, stacklevel=3)
+    if simulator is None:
+        without = {"simulator": Absent(), "prior": first_prior}
+        saved = None if name is None else lambda: disk.belief(name, without)
+        reader = StoredLearner(first_prior, shape, state, saved)
+        return Loaded(disk, state, space, reader)
+    for what, given in (("cost", has_cost), ("constraint", has_constraint)):
+        if given != manifest[f"has_{what}"]:
+            raise ValueError(
+                f"expected {what}= {'left out' if given else 'as declared'}; got "
+                f"{'one' if given else 'none'}; pass what the campaign was made with"
+            )
+    names = [effect.name for effect in effects]
+    if names != manifest["effects"]:
+        raise ValueError(
+            f"expected the effects {manifest['effects']}; got {names}; pass effects= "
+            "as they were declared"
+        )
+    if simulator_changed:
+        disk.write("simulator changed", simulator=fingerprint(simulator))
+        state.is_stale = bool(state.processed)
+    else:
+        require_same_simulator(manifest, simulator)
+    model, joint = rebuilt(state, simulator, first_prior, space, effects)
+    learner = Learner(model, joint, space, state, x_shape=shape)
+    if name is not None and not state.is_stale:
+        learner.resume(lambda: _belief(disk, name, learner))
+    return Loaded(disk, state, space, learner)
+
+
+def _belief(disk: CampaignDirectory, name: str, learner: Learner) -> Distribution:
+    """Return the belief, or the prior where all has to be computed again."""
+    try:
+        return disk.belief(name, known(learner))
+    except (OSError, ValueError) as error:
+        warnings.warn(f"the belief is computed again: {error}", stacklevel=4)
+        learner.forget()
+        return learner.prior
+
+
+def _given(
+    what: str, given: Any, manifest: dict[str, Any], made: Callable[[Any], Any]
+) -> Any:
+    """Return what was passed, or else what the manifest describes."""
+    if given is not None:
+        return given
+    if manifest[what] is None:
+        raise ValueError(
+            f"expected {what}=, which only its author can make again; got None; pass "
+            f"what the campaign was made with: {manifest[f'{what}_text']:.200}"
+        )
+    return made(manifest[what])

@@ -1,0 +1,100 @@
+"""What a campaign keeps: nothing, simulations, or all of it in a folder."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.campaign.storage.directory import CampaignDirectory
+from sbi_active.campaign.storage.simulations import CampaignBanks
+from sbi_active.simulation.workers.store import storing
+
+__all__ = ["Storage", "known", "stored"]
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def stored(method: Method) -> Method:
+    """Return a method whose simulations are kept, apart from torch's global state.
+
+    See :func:`.isolated`.
+    """
+    apart = isolated(method)
+
+    @functools.wraps(method)
+    def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
+        learner, version = campaign._learner, campaign.state.version.number
+        with campaign._storage.working(learner.simulator, version):
+            return apart(campaign, *arguments, **options)
+
+    return kept  # type: ignore[return-value]
+
+
+class Storage:
+    """Keeps a campaign in a folder, its simulations in banks, or neither.
+
+    Args:
+        disk: The folder; None keeps the campaign in memory alone.
+        bank: Folder of the simulations; None is one in the campaign's.
+    """
+
+    def __init__(
+        self, disk: CampaignDirectory | None = None, bank: str | None = None
+    ) -> None:
+        self.disk = disk
+        folder = None if disk is None else disk.simulations
+        folder = folder if bank is None else Path(bank)
+        self._banks = None if folder is None else CampaignBanks(folder)
+
+    @property
+    def path(self) -> Path | None:
+        """The folder of the campaign."""
+        return None if self.disk is None else self.disk.path
+
+    @contextmanager
+    def working(
+        self, simulator: Callable[..., Any] | None, version: int
+    ) -> Iterator[None]:
+        """Hold the right to write, and keep simulations of the current simulator.
+
+        Args:
+            simulator: The current one.
+            version: Its number.
+        """
+        if self.disk is not None:
+            self.disk.acquire()
+        if self._banks is None or simulator is None:
+            yield
+            return
+        self._banks.use(simulator, version)
+        with storing(self._banks.find):
+            yield
+
+    def write(self, event: str, trial: Trial | None = None, **entries: Any) -> None:
+        """Write down what happened; it is on the disk when this returns."""
+        if self.disk is not None:
+            self.disk.write(event, trial, **entries)
+
+    def save(self, state: CampaignState, learner: Learner) -> None:
+        """Save what was computed."""
+        if self.disk is not None:
+            belief = None if learner.belief is learner.prior else learner.belief
+            self.disk.save(state, belief, known(learner))
+
+    def close(self) -> None:
+        """Let others write."""
+        if self._banks is not None:
+            self._banks.close()
+        if self.disk is not None:
+            self.disk.close()
+
+
+def known(learner: Any) -> dict[str, Any]:
+    """Return what a reader of a belief has too."""
+    return {"simulator": learner.simulator, "prior": learner.prior}

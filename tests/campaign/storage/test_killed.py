@@ -1,0 +1,129 @@
+"""SIGKILL at any moment: the campaign resumes, and ends where it would have ended."""
+
+import json
+import os
+import random
+import signal
+import time
+
+import pytest
+import torch
+
+from sbi_active import Campaign
+from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+NUM_TRIALS = 6
+
+
+def run(folder):
+    """Begin the campaign or go on with it, as a robot's program would."""
+    if (folder / "campaign.json").exists():
+        campaign = Campaign.load(folder, simulator=drawn)
+    else:
+        campaign = new(folder)
+    return go_on(campaign, NUM_TRIALS)
+
+
+def killed(work, after=None, at_call=None):
+    """Run a function in a process that is killed; return whether it ended before.
+
+    Args:
+        work: The function.
+        after: Seconds.
+        at_call: Number of the call that makes something durable, on which it dies.
+    """
+    pid = os.fork()
+    if pid == 0:
+        if at_call is not None:
+            _die_at(at_call)
+        work()
+        os._exit(0)
+    if after is not None:
+        time.sleep(after)
+        os.kill(pid, signal.SIGKILL)
+    return os.waitpid(pid, 0)[1] == 0
+
+
+def _die_at(number):
+    """Have the process killed before the n-th call that reaches the disk."""
+    count = [0]
+
+    def dying(function):
+        def call(*arguments, **options):
+            count[0] += 1
+            if count[0] == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **options)
+
+        return call
+
+    os.fsync, os.replace = dying(os.fsync), dying(os.replace)
+
+
+def told_of(folder):
+    path = folder / "trials.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    entries = [json.loads(line) for line in lines if line.endswith(b"\n")]
+    return [entry["trial"] for entry in entries if entry["event"] == "told"]
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return go_on(new(), NUM_TRIALS)
+
+
+@pytest.mark.parametrize("how", ["by the clock", "at the disk"])
+def test_killed_and_resumed(tmp_path, how, whole):
+    rng = random.Random(0)
+    folder, told = tmp_path / "c", []
+    num_killed = 0
+    while num_killed < 10:
+        if how == "by the clock":
+            moment = {"after": rng.uniform(0.02, 0.4)}
+        else:
+            moment = {"at_call": rng.randint(1, 14)}
+        ended = killed(lambda: run(folder), **moment)
+        now = told_of(folder)
+        assert now[: len(told)] == told  # what was told is never lost
+        told = now
+        if ended:
+            break
+        num_killed += 1
+    campaign = run(folder)
+    assert num_killed >= 5
+    assert torch.equal(draws(campaign), draws(whole))
+    assert facts(campaign) == facts(whole)
+    assert len(told_of(folder)) == NUM_TRIALS
+
+
+@pytest.mark.parametrize("at_call", range(1, 13))
+def test_killed_at_each_write_of_a_round(tmp_path, at_call, whole):
+    """A first round, from the manifest on, dies at each of its writes in turn."""
+    folder = tmp_path / "c"
+    killed(lambda: go_on(new(folder), 1), at_call=at_call)
+    campaign = run_from(folder)
+    assert torch.equal(draws(campaign), draws(whole))
+
+
+def run_from(folder):
+    complete = (folder / "campaign.json").exists()
+    if not complete and folder.exists():  # died before there was a campaign
+        for path in sorted(folder.rglob("*"), reverse=True):
+            path.unlink()
+    return run(folder)
+
+
+def test_a_measurement_whose_tell_returned_is_there(tmp_path):
+    folder = tmp_path / "c"
+    campaign = new(folder)
+    campaign.ask()
+    campaign.close()
+
+    def tell():
+        loaded = Campaign.load(folder, simulator=drawn)
+        loaded.tell([1.0, 2.0, 3.0, 4.0])
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    killed(tell)
+    assert Campaign.load(folder).history[0].x.tolist() == [1.0, 2.0, 3.0, 4.0]

@@ -1,0 +1,286 @@
+"""Campaigns that go on from their directory, as if they had never been left."""
+
+import json
+import pickle
+
+import pytest
+import torch
+from torch.distributions import Normal
+
+from sbi_active import Campaign, CampaignOptions
+from sbi_active.criticism import Effect
+from sbi_active.simulation.bank import Bank, LockedError
+from tests.campaign.storage.campaigns import (
+    MODEL,
+    OPTIONS,
+    PRIOR,
+    drawn,
+    draws,
+    facts,
+    go_on,
+    new,
+    outcome,
+)
+
+CALLS = []  # sizes of what was simulated
+
+
+def counted(theta, action):
+    CALLS.append(len(theta))
+    return drawn(theta, action)
+
+
+@pytest.mark.parametrize(
+    ("method", "simulator"),
+    [("asbi", drawn), ("asbi", MODEL), ("nsbi", drawn), ("nlhi", drawn)],
+)
+def test_left_after_every_step(tmp_path, method, simulator):
+    whole = go_on(new(method=method, simulator=simulator), 3)
+
+    campaign = new(tmp_path / "c", method=method, simulator=simulator)
+    for index in range(3):
+        action = campaign.ask().action
+        campaign.close()
+        campaign = Campaign.load(tmp_path / "c", simulator=simulator)
+        assert torch.equal(campaign.pending.action, action)
+        assert campaign.pending.design is not None
+        campaign.tell(outcome(action, index))
+        campaign.close()
+        campaign = Campaign.load(tmp_path / "c", simulator=simulator)
+        if index != 1:
+            campaign.update()
+            campaign.close()
+            campaign = Campaign.load(tmp_path / "c", simulator=simulator)
+
+    assert torch.equal(draws(campaign), draws(whole))
+    assert facts(campaign) == facts(whole)
+
+
+def test_what_follows_is_computed_again_from_the_log_without_simulating(tmp_path):
+    whole = go_on(new(tmp_path / "c", simulator=counted), 2)
+    whole.close()
+    for path in (tmp_path / "c").glob("*.bin"):
+        path.unlink()
+    CALLS.clear()
+
+    campaign = Campaign.load(tmp_path / "c", simulator=counted)
+    campaign.update()
+
+    assert torch.equal(draws(campaign), draws(whole))
+    assert facts(campaign) == facts(whole)
+    assert not CALLS
+
+
+def test_without_a_simulator_it_is_read_told_and_corrected(tmp_path):
+    whole = go_on(new(tmp_path / "c"), 2)
+    action = whole.ask().action
+    whole.close()
+
+    reader = Campaign.load(tmp_path / "c")
+    assert torch.equal(draws(reader), draws(whole))
+    assert reader.health == whole.health
+    assert reader.pending.index == 2
+    reader.tell(outcome(action, 2))
+    with pytest.raises(ValueError, match="pass it: Campaign.load"):
+        reader.update()
+    reader.correct(0, 2 * outcome(action, 0), reason="gain of 2")
+    reader.close()
+
+    whole = new()
+    whole.attach(reader.history[0].action, reader.history[0].x)
+    for trial in reader.history[1:]:
+        whole.attach(trial.action, trial.x)
+    whole.update()
+    again = Campaign.load(tmp_path / "c", simulator=drawn)
+    again.update()
+    assert torch.equal(draws(again), draws(whole))
+    assert again.history[0].reason == "gain of 2"
+
+
+def test_correct_and_withdraw_keep_the_old_lines(tmp_path):
+    campaign = go_on(new(tmp_path / "c"), 2)
+    x = campaign.history[1].x
+    campaign.correct(1, 100 * x, reason="told in m")
+    campaign.correct(1, x, reason="it was cm")
+    campaign.withdraw(0, reason="bumped into the table")
+    campaign.close()
+
+    lines = [
+        json.loads(line)
+        for line in (tmp_path / "c" / "trials.jsonl").read_text().splitlines()
+    ]
+    events = [(line["event"], line["trial"]["reason"]) for line in lines]
+    assert events[-3:] == [
+        ("corrected", "told in m"),
+        ("corrected", "it was cm"),
+        ("withdrawn", "bumped into the table"),
+    ]
+    again = Campaign.load(tmp_path / "c")
+    assert [t.status for t in again.history] == ["withdrawn", "ok"]
+    assert torch.equal(again.history[1].x, x)
+
+
+def test_attached_before_and_while_a_trial_is_pending(tmp_path):
+    campaign = new(tmp_path / "c")
+    campaign.attach([1.0], [0.3, 0.5, 0.7, 0.9])
+    asked = campaign.ask()
+    campaign.attach([2.0], status="invalid")
+    assert campaign.pending.index == asked.index == 1
+    campaign.close()
+
+    again = Campaign.load(tmp_path / "c", simulator=drawn)
+    assert [t.status for t in again.state.trials] == ["ok", "pending", "invalid"]
+    assert again.state.trials[2].x.isnan().all()
+
+
+def test_what_is_refused_is_written_down(tmp_path):
+    campaign = new(tmp_path / "c")
+    campaign.ask()
+    with pytest.raises(ValueError, match="expected x of shape"):
+        campaign.tell([1.0, 2.0, 3.0])
+    last = (tmp_path / "c" / "trials.jsonl").read_text().splitlines()[-1]
+    assert '"refused"' in last
+    assert "[1.0, 2.0, 3.0]" in last
+    assert Campaign.load(tmp_path / "c").pending.index == 0
+
+
+def test_one_writer_any_number_of_readers(tmp_path):
+    campaign = go_on(new(tmp_path / "c"), 1)
+    other = Campaign.load(tmp_path / "c", simulator=drawn)
+    assert torch.equal(draws(other), draws(campaign))
+    with pytest.raises(LockedError, match="expected no other writer"):
+        other.tell([0.0] * 4, action=[1.0])
+    campaign.tell([0.3] * 4, action=[1.0])
+    campaign.close()
+    with pytest.raises(ValueError, match="load it again"):
+        other.tell([0.0] * 4, action=[1.0])
+    with Campaign.load(tmp_path / "c", simulator=drawn) as third:
+        assert len(third.history) == 2
+
+
+def test_a_new_campaign_wants_an_empty_directory(tmp_path):
+    new(tmp_path / "c").close()
+    with pytest.raises(ValueError, match=r"go on with it by Campaign\.load"):
+        new(tmp_path / "c")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").touch()
+    with pytest.raises(ValueError, match=r"with 'thesis\.tex'; choose another"):
+        new(tmp_path / "other")
+    with pytest.raises(ValueError, match="expected a folder with a campaign"):
+        Campaign.load(tmp_path / "other")
+
+
+def test_another_simulator_is_refused_or_computes_everything_again(tmp_path):
+    go_on(new(tmp_path / "c"), 2).close()
+
+    def mended(theta, action):
+        return drawn(theta, action) + 0.1
+
+    with pytest.raises(ValueError, match="got another: simulator.source"):
+        Campaign.load(tmp_path / "c", simulator=mended)
+    with Campaign.load(
+        tmp_path / "c", simulator=mended, simulator_changed=True
+    ) as campaign:
+        campaign.update()
+        shifted = draws(campaign).mean(0)
+    anew = new(simulator=mended)
+    for trial in campaign.history:
+        anew.attach(trial.action, trial.x)
+    anew.update()
+    assert torch.equal(draws(campaign), draws(anew))
+    again = Campaign.load(tmp_path / "c", simulator=mended)
+    assert torch.equal(draws(again).mean(0), shifted)
+
+
+def price(action):
+    return 1 + action[:, 0]
+
+
+class OwnPrior(torch.distributions.Uniform):
+    pass
+
+
+def test_what_only_its_author_can_make_is_asked_for(tmp_path):
+    prior = torch.distributions.Independent(OwnPrior(torch.zeros(2), torch.ones(2)), 1)
+    campaign = Campaign(
+        *(drawn, prior, new().actions),
+        method="nsbi",
+        options=OPTIONS,
+        directory=tmp_path / "c",
+        cost=price,
+    )
+    go_on(campaign, 1).close()
+    with pytest.raises(ValueError, match="expected prior=, which only its author"):
+        Campaign.load(tmp_path / "c")
+    with pytest.raises(ValueError, match="expected cost= as declared; got none"):
+        Campaign.load(tmp_path / "c", simulator=drawn, prior=prior)
+    again = Campaign.load(tmp_path / "c", simulator=drawn, prior=prior, cost=price)
+    assert torch.equal(draws(again), draws(campaign))
+
+
+def test_adopted_effects_come_back(tmp_path):
+    bias = Effect(
+        "bias",
+        hook="observation",
+        prior=Normal(0.0, 1.0),
+        null=0.0,
+        apply=lambda x, phi, action, context: x + phi,
+    )
+    campaign = new(tmp_path / "c", simulator=MODEL, effects=[bias])
+    for index, action in enumerate(torch.linspace(0.5, 2.0, 6)):
+        campaign.attach([float(action)], outcome(action[None], index) + 1)
+    report = campaign.criticize(evaluate=False)
+    assert report.verdict == "bias"
+    campaign.adopt(report)
+    campaign.close()
+
+    with pytest.raises(ValueError, match=r"expected the effects \['bias'\]; got"):
+        Campaign.load(tmp_path / "c", simulator=MODEL)
+    again = Campaign.load(tmp_path / "c", simulator=MODEL, effects=[bias])
+    assert again.state.version.effects == ("bias",)
+    assert torch.equal(draws(again), draws(campaign))
+    assert draws(again).shape[1] == 3
+    go_on(again, 7)
+
+
+def test_a_bank_that_campaigns_share(tmp_path):
+    options = CampaignOptions(**{**vars(OPTIONS), "bank": tmp_path / "bank"})
+
+    def run():
+        campaign = Campaign(
+            counted, PRIOR, new().actions, method="nsbi", options=options
+        )
+        go_on(campaign, 1)
+        campaign.close()
+        return sum(CALLS), draws(campaign)
+
+    first, before = run()
+    CALLS.clear()
+    second, after = run()
+    assert torch.equal(before, after)
+    assert second < first / 5
+    assert len(Bank(tmp_path / "bank" / "drawn")) > 0
+
+
+def test_a_pickled_copy_lives_in_memory(tmp_path):
+    campaign = go_on(new(tmp_path / "c"), 1)
+    copy = pickle.loads(pickle.dumps(campaign))
+    copy.tell([0.1] * 4, action=[1.0])
+    assert len(campaign.history) == 1
+    assert len(Campaign.load(tmp_path / "c").history) == 1
+
+
+def test_called_back_in_order(tmp_path):
+    seen = []
+    campaign = new(
+        tmp_path / "c",
+        on_trial=lambda t: seen.append(("told", t.index, t.surprise)),
+        on_update=lambda t: seen.append(("updated", t.index, t.surprise is None)),
+    )
+    go_on(campaign, 2)
+    assert seen == [
+        ("told", 0, None),
+        ("updated", 0, False),
+        ("told", 1, None),
+        ("updated", 1, False),
+    ]
