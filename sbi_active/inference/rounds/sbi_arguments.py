@@ -6,10 +6,11 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
-__all__ = ["NEVER", "given_arguments", "require_likelihood_loss", "takes"]
+__all__ = ["NEVER", "extends", "given_arguments", "require_likelihood_loss", "takes"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Ours = TypeVar("Ours", bound=Callable[..., Any])
 
 #: As many epochs as sbi's own default allows.
 NEVER = 2**31 - 1
@@ -26,6 +27,23 @@ def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, 
 
     def decorate(ours: Callable[..., Any]) -> Callable[P, R]:
         ours.__signature__ = inspect.signature(theirs)  # pyright: ignore
+        return ours
+
+    return decorate
+
+
+def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
+    """Give a method the signature of sbi's, with keywords of its own after that.
+
+    Args:
+        theirs: A method of one of sbi's trainers.
+    """
+
+    def decorate(ours: Ours) -> Ours:
+        further = inspect.signature(ours).parameters.values()
+        own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
+        known = inspect.signature(theirs).parameters.values()
+        ours.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
         return ours
 
     return decorate

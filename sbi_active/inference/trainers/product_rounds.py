@@ -61,12 +61,13 @@ class ProductRounds(ActionRounds):
     two stages or, from the prior, four; the options' ``num_histories`` is their sum.
 
     Args:
-        arguments: Of :class:`.ActionRounds`.
+        args: Of :class:`.ActionRounds`.
         posterior: How the belief is sampled: "importance", annealed importance
             sampling; one of sbi's Markov chains, for example "slice_np_vectorized" or
             "nuts_pyro"; or "kde", the paper's: draws of the belief before times the
             last trial's factor, as a kernel density estimate.
         bandwidth: Of "kde", see :class:`.KernelBelief`.
+        kwargs: Of :class:`.ActionRounds`.
 
     References:
         Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
@@ -78,17 +79,14 @@ class ProductRounds(ActionRounds):
     _factor: ClassVar[type[ActionFactor]]
 
     def __init__(
-        self,
-        *arguments: Any,
-        posterior: str,
-        bandwidth: Bandwidth,
+        self, *args: Any, posterior: str, bandwidth: Bandwidth, **kwargs: Any
     ) -> None:
         if posterior not in SAMPLERS:
             raise ValueError(
                 f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
                 f"{posterior!r}; do choose one of these"
             )
-        super().__init__(*arguments)
+        super().__init__(*args, **kwargs)
         self._sampler = posterior
         self._bandwidth: Bandwidth = bandwidth
 
@@ -144,23 +142,7 @@ class ProductRounds(ActionRounds):
             theta, x, action, belief, exclude_invalid_x, data_device
         )
 
-    def _create_posterior(
-        self,
-        estimator: Any,
-        prior: Any,
-        sample_with: Any,
-        device: Any,
-        posterior_parameters: Any,
-    ) -> Any:
-        """Return sbi's posterior, with actions what was learned of a trial."""
-        if self.has_actions:
-            return self._learned(estimator)
-        sbi_trainer: Any = super()
-        return sbi_trainer._create_posterior(
-            estimator, prior, sample_with, device, posterior_parameters
-        )
-
-    def _learned(self, estimator: Any) -> ActionFactor:
+    def _model(self, estimator: Any, *arguments: Any) -> ActionFactor:
         assert self._outcome_shape is not None
         assert self._action_dim is not None
         return self._factor(
@@ -228,9 +210,7 @@ class ProductRounds(ActionRounds):
                     theta.repeat_interleave(len(trials), 0),
                     action.repeat(num, 1),
                     seed=derive_seed(own, "x"),
-                    num_workers=settings.num_workers,
-                    time_limit=settings.time_limit,
-                    num_retries=settings.num_retries,
+                    **settings.engine,
                 )
             num_simulations += len(rows)
             num_missing += rows.counts["missing"]
@@ -274,7 +254,7 @@ class ProductRounds(ActionRounds):
             hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
         chained = self._sampler == "kde"
         self._require_trained()
-        learned = self._learned(deepcopy(self._neural_net))
+        learned = self._model(deepcopy(self._neural_net))
         used = trials[-1:] if chained else trials
         counted = [t for t in used if _says_something(learned, t, prior)]
         product = Product(

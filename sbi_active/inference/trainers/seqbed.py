@@ -208,7 +208,6 @@ class SeqBED(ActiveInference):
         return self._model
 
     def _forget_round(self) -> None:
-        """Have the next update do without what was learned in this round."""
         self._model, self._rows = None, []
 
     def _infer(self, told: Told) -> Belief:
@@ -250,9 +249,7 @@ class SeqBED(ActiveInference):
                 theta,
                 action,
                 seed=derive_seed(seed, "x"),
-                num_workers=settings.num_workers,
-                time_limit=settings.time_limit,
-                num_retries=settings.num_retries,
+                **settings.engine,
             )
         known = rows.without_missing()
         with single_thread():
