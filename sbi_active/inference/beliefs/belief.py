@@ -74,14 +74,7 @@ class Belief(Distribution, ABC):
             return self._sample(shape.numel()).float().reshape(*shape, -1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density; -inf outside the support.
-
-        Args:
-            value: Shape (..., theta_dim).
-
-        Returns:
-            Shape (...), float32.
-        """
+        """Return the log density, (..., theta_dim) -> (...); -inf off the support."""
         theta = torch.as_tensor(value, dtype=torch.float32)
         rows = theta.reshape(-1, theta.shape[-1])
         inside = within_support(self.prior, rows)
@@ -89,13 +82,9 @@ class Belief(Distribution, ABC):
         return log_prob.reshape(theta.shape[:-1])
 
     def smooth_log_prob(self, value: Tensor) -> Tensor:
-        """Return a log density that costs no simulations, for many places.
+        """Return a log density that costs no simulations, for many places (..., d).
 
-        Args:
-            value: Shape (..., theta_dim).
-
-        Returns:
-            Shape (...), float32; :meth:`log_prob` but for beliefs that simulate that.
+        It is :meth:`log_prob` but for beliefs that simulate that.
         """
         theta = torch.as_tensor(value, dtype=torch.float32)
         rows = theta.reshape(-1, theta.shape[-1])
@@ -215,12 +204,7 @@ MINIMAL_ACCEPTANCE = 1e-3
 
 
 class UnchangedBelief(Belief):
-    """The belief before a trial that the network knows nothing of.
-
-    Args:
-        prior: The original prior.
-        previous: The belief before the trial.
-    """
+    """The belief before a trial that the network knows nothing of."""
 
     label = "unchanged"
 
@@ -242,13 +226,9 @@ def information_gained(
 
     .. math::
         \mathrm{KL}(b \,\|\, p) \approx \frac{1}{n} \sum_i \log b(\theta_i)
-        - \log p(\theta_i), \qquad \theta_i \sim b.
+        - \log p(\theta_i), \qquad \theta_i \sim b,
 
-    Args:
-        belief: After the trial.
-        previous: Before it.
-        num_samples: Draws n.
-        seed: Of the draws.
+    with b the belief after the trial and p the one before.
     """
     with forked_generators(seed):
         theta = belief.sample((num_samples,))
@@ -299,12 +279,8 @@ def require_width(
 
     Args:
         prior: Of the parameters.
-        names: Of the parameters.
+        names: Of the parameters, for the error.
         seed: Of some draws.
-
-    Raises:
-        ValueError: If draws of a parameter are not in the support, or too few steps of
-            float32 apart.
     """
     with forked_generators(seed):
         draws = prior.sample(torch.Size([256])).reshape(256, -1).float()

@@ -28,13 +28,8 @@ def compare(
         \mathrm{bluntness} = H(c) - H(r).
 
     A loss with a positive bluntness is under-confidence; a loss without it is
-    overconfidence or a wrong place. The loss is bounded by 60 nats.
-
-    Args:
-        refined: Its ``diagnostics`` gain refined_log_score, chained_log_score,
-            chained_loss, chained_bluntness and, beyond half a nat, a warning.
-        chained: The network's value at the same trial.
-        num_samples: Draws of each.
+    overconfidence or a wrong place. The loss is bounded by 60 nats; beyond half a nat
+    it is a warning.
     """
     with forked_generators(0, "compare"):
         draws = refined.sample((num_samples,))
@@ -68,13 +63,9 @@ def compare_orders(belief: Belief, other: Belief, *, num_samples: int = 2_000) -
     .. math::
         \mathrm{KL}(b \,\|\, b') = E_b[\log b(\theta) - \log b'(\theta)],
 
-    with b' from the trials in another order and other simulations. The likelihood is
-    a product over trials, so anything beyond Monte Carlo error is an error.
-
-    Args:
-        belief: Its ``diagnostics`` gain order_swap_kl and, beyond .2 nat, a warning.
-        other: Of the same trials.
-        num_samples: Draws.
+    with b' from the trials in another order and other simulations. The likelihood is a
+    product over trials, so anything beyond Monte Carlo error is an error; beyond .2 nat
+    it is a warning.
     """
     with forked_generators(0, "orders"):
         draws = belief.sample((num_samples,))

@@ -15,14 +15,11 @@ __all__ = ["ActionFactor"]
 class ActionFactor(ABC):
     """A learned factor of the likelihood of a trial.
 
-    Args:
+    Attributes:
         estimator: sbi's, of flat outcomes, parameters and actions.
         belief: The distribution of theta it was trained under.
         x_shape: Shape of one outcome.
         action_dim: Numbers in an action.
-
-    Attributes:
-        belief: As given.
     """
 
     def __init__(

@@ -12,42 +12,26 @@ __all__ = ["ActionLikelihood"]
 
 
 class ActionLikelihood(ActionFactor):
-    r"""Surrogate likelihood :math:`q(x | \theta, \xi)`.
-
-    Args:
-        estimator: Of flat x given packed (theta, action).
-        belief: The distribution of theta it was trained under.
-        x_shape: Shape of one outcome.
-        action_dim: Numbers in an action.
-
-    Attributes:
-        belief: As given.
-    """
+    r"""Surrogate likelihood :math:`q(x | \theta, \xi)`, x flat for its network."""
 
     def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
-        r"""Return :math:`\log q(x_i | \theta_i, \xi_i)` row by row.
+        r"""Return :math:`\log q(x_i | \theta_i, \xi_i)` row by row, shape (n,).
 
         Args:
             x: Shape (n, *x_shape); NaN throughout a row where there was no measurement.
             theta: Shape (n, theta_dim).
             action: Shape (n, action_dim).
-
-        Returns:
-            Shape (n,).
         """
         outcome = outcome_rows(x, self.x_shape).flatten(1)
         return self.estimator.log_prob(outcome[None], self._condition(theta, action))[0]
 
     def log_likelihood_table(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
-        r"""Return :math:`\log q(x_i | \theta_j, \xi)` of every pair.
+        r"""Return :math:`\log q(x_i | \theta_j, \xi)` of every pair, shape (n, m).
 
         Args:
             x: Shape (n, *x_shape).
             theta: Shape (m, theta_dim).
             action: One action, shape (action_dim,).
-
-        Returns:
-            Shape (n, m).
         """
         outcome = outcome_rows(x, self.x_shape).flatten(1)
         pairs = outcome[:, None].expand(-1, len(theta), -1)

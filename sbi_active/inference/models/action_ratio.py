@@ -13,27 +13,17 @@ __all__ = ["ActionRatio"]
 class ActionRatio(ActionFactor):
     r"""Learned log ratio :math:`\log p(x | \theta, \xi) / p(x | \xi)`.
 
-    Args:
-        estimator: Of theta and packed (x, action).
-        belief: The distribution of theta it was trained under, to which p(x | action)
-            belongs.
-        x_shape: Shape of one outcome.
-        action_dim: Numbers in an action.
-
-    Attributes:
-        belief: As given.
+    Its estimator is of theta and packed (x, action); p(x | action) belongs to its
+    belief.
     """
 
     def log_ratio(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        r"""Return :math:`\log r(\theta_i; x_i, \xi_i)` row by row.
+        r"""Return :math:`\log r(\theta_i; x_i, \xi_i)` row by row, shape (n,).
 
         Args:
             theta: Shape (n, theta_dim).
             x: Shape (n, *x_shape); NaN throughout a row where there was no measurement.
             action: Shape (n, action_dim).
-
-        Returns:
-            Shape (n,).
         """
         rows = outcome_rows(x, self.x_shape)
         action = action_rows(action, self.action_dim, num_rows=len(rows))

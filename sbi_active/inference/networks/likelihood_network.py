@@ -98,24 +98,14 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return nn.Identity()
 
     def residual_rows(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the mixture is trained on: residuals and its conditions.
-
-        Args:
-            x: Outcomes, shape (n, x_dim); rows without a measurement are left out.
-            condition: Shape (n, condition_dim).
-        """
+        """Return what the mixture is trained on: residuals and their conditions."""
         valid = _valid(x)
         with torch.no_grad():
             z, _ = self._standardize(x[valid].double(), condition[valid])
             return z.float(), self._see(condition[valid])
 
     def choose(self, residual: Tensor, seen: Tensor) -> None:
-        """Take the standard normal density unless the mixture predicts better.
-
-        Args:
-            residual: Held-out, of :meth:`residual_rows`, shape (n, x_dim).
-            seen: Shape (n, p).
-        """
+        """Take the standard normal density unless the mixture does better held out."""
         if self.response is None or not len(residual):
             return
         with torch.no_grad():
@@ -127,15 +117,12 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return -self._log_density(input[None], condition)[0]
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
-        """Return log q(input | condition).
+        """Return log q(input | condition), shape (sample_dim, batch_dim), float32.
 
         Args:
             input: Shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
             condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
             kwargs: Not used.
-
-        Returns:
-            Shape (sample_dim, batch_dim), float32.
         """
         self._check_condition_shape(condition)
         self._check_input_shape(input)

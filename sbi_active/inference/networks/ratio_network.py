@@ -125,15 +125,7 @@ class RatioNetwork(RatioEstimator):
             self.x_scaling = ActionScaling(y, action[valid])
 
     def unnormalized_log_ratio(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return log ratios.
-
-        Args:
-            theta: Shape (..., theta_dim).
-            x: Packed (x, action), shape (..., x_dim + action_dim).
-
-        Returns:
-            Shape (...), float32.
-        """
+        """Return log ratios of theta (..., d) and packed (x, action) (..., c)."""
         shape = self._get_shape_prefix(theta, x)
         rows = theta.reshape(-1, theta.shape[-1]), x.reshape(-1, x.shape[-1])
         return self._log_ratio(*rows).reshape(shape)

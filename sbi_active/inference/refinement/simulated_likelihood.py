@@ -29,10 +29,7 @@ def declares_noise(
 ) -> TypeGuard[SimulatorModel]:
     """Return whether the simulator is a noise-free function beside positive noise.
 
-    Args:
-        simulator: Any simulator.
-        theta: A few parameters to try, shape (n, d).
-        action: Actions, shape (n, action_dim).
+    It is tried at a few parameters (n, d) and actions (n, action_dim).
     """
     if not isinstance(simulator, SimulatorModel) or simulator.noise is None:
         return False
@@ -42,11 +39,7 @@ def declares_noise(
 
 
 class MeanTable:
-    """Noise-free outcomes of a simulator, each simulated once.
-
-    Args:
-        simulator: With declared noise.
-        engine: Options of :func:`.simulate`.
+    """Noise-free outcomes of a simulator with declared noise, each simulated once.
 
     Attributes:
         num_simulations: Rows simulated so far.
@@ -63,12 +56,8 @@ class MeanTable:
     def mean(self, theta: Tensor, action: Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return noise-free outcomes at one action, and which rows are lost to faults.
 
-        Args:
-            theta: Shape (n, d), float32.
-            action: Shape (action_dim,), float32.
-
-        Returns:
-            Shapes (n, *x_shape), NaN where there is no measurement, and (n,).
+        Float32 parameters (n, d) and action (action_dim,) give shapes (n, *x_shape),
+        NaN where there is no measurement, and (n,).
         """
 
         def simulated(rows: NDArray[np.int64]) -> list[Array | None]:

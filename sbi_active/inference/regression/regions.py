@@ -180,16 +180,9 @@ def cover(
     """Return ellipsoids around the clusters of a sample.
 
     More clusters are taken only where that makes the sample denser by a factor, since
-    each needs simulations of its own.
-
-    Args:
-        particles: The sample.
-        rng: Source of randomness.
-        min_regions: At least this many clusters, where the sample allows.
-        max_regions: At most this many.
-        generous: Whether to reach four deviations of each cluster; else the ellipsoid
-            just holds its particles, which a surrogate with misfit has spread already.
-        num_points: Particles to cluster.
+    each needs simulations of its own. Generous ones reach four deviations of each
+    cluster; else an ellipsoid just holds its particles, which a surrogate with misfit
+    has spread already.
     """
     points = particles.resample(num_points, rng)
     d = points.shape[1]

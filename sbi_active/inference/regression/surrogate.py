@@ -67,10 +67,7 @@ class NoiseEstimate:
 def estimate_noise(first: Array, second: Array, scale: Array) -> NoiseEstimate:
     """Return the noise of pairs of outcomes, each of shape (r, q).
 
-    Args:
-        first: Outcomes.
-        second: Outcomes at the same parameters.
-        scale: Largest size of each outcome, shape (q,), whose rounding is a floor.
+    The rounding of the largest size of each outcome, shape (q,), is a floor.
     """
     variance = 0.5 * ((first - second) ** 2).mean(0)
     return NoiseEstimate(variance + (FLOAT32 * scale) ** 2 + 1e-300, len(first))
@@ -198,14 +195,7 @@ class LocalRegression:
         )
 
     def whitened(self, z: Array) -> tuple[Array, Array]:
-        """Return the whitened prediction less the observation, and 1 + h.
-
-        Args:
-            z: Shape (n, d).
-
-        Returns:
-            Shapes (n, q) and (n,).
-        """
+        """Return the whitened prediction less the observed (n, q), and 1 + h (n,)."""
         features = self.basis(self.region.scaled(z))
         leverage = ((features @ self.root) ** 2).sum(1)
         return features @ self.coefficient, 1 + leverage
@@ -235,12 +225,7 @@ class LocalRegression:
         return float(max(CAUTION, square.max() / chi2.ppf(0.9, self.used.sum())))
 
     def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
-        """Return the log likelihood of the observation, shape (n,).
-
-        Args:
-            z: Shape (n, d).
-            caution: Factor of the variance.
-        """
+        """Return the log likelihood of the observation, (n, d) -> (n,)."""
         features = self.basis(self.region.scaled(z))
         widening = 1 + ((features @ self.root) ** 2).sum(1)
         q = int(self.used.sum())
@@ -308,17 +293,11 @@ def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
 
 
 def _excess(ratio: Array, num_alike: float, freedom: int, num_pairs: int) -> float:
-    """Return the misfit, residual over noise variance, with chance removed.
+    """Return the misfit, residual over noise variance (q,), with chance removed.
 
-    The mean over outcomes is sharp where all are missed a little, the maximum where
-    one is missed; each less what chance alone reaches: ratios are F distributed and
+    The mean over outcomes is sharp where all are missed a little, the maximum where one
+    is missed; each less what chance alone reaches: ratios are F distributed and
     correlate as the squares of the residuals' correlations.
-
-    Args:
-        ratio: Of the outcomes, shape (q,).
-        num_alike: Outcomes that vary as one, by their correlations.
-        freedom: Rows less coefficients.
-        num_pairs: That the noise is known from.
     """
     q = len(ratio)
     if q == 0:

@@ -19,11 +19,7 @@ _NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_at
 
 
 def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
-    """Give a method of ours the signature of sbi's, which is then written once.
-
-    Args:
-        theirs: A method of one of sbi's trainers.
-    """
+    """Give a method of ours the signature of sbi's, which is then written once."""
 
     def decorate(ours: Callable[..., Any]) -> Callable[P, R]:
         ours.__signature__ = inspect.signature(theirs)  # pyright: ignore
@@ -33,11 +29,7 @@ def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, 
 
 
 def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
-    """Give a method the signature of sbi's, with keywords of its own after that.
-
-    Args:
-        theirs: A method of one of sbi's trainers.
-    """
+    """Give a method the signature of sbi's, with keywords of its own after that."""
 
     def decorate(ours: Ours) -> Ours:
         further = inspect.signature(ours).parameters.values()
@@ -52,14 +44,9 @@ def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
 def given_arguments(
     method: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return by name the arguments that a call of sbi's ``train`` was given.
+    """Return by name the arguments that a call of a method of sbi's was given.
 
     None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
-
-    Args:
-        method: sbi's, bound.
-        args: By position.
-        kwargs: By name.
     """
     given = inspect.signature(method).bind(*args, **kwargs).arguments
     return {
@@ -72,11 +59,7 @@ def given_arguments(
 def require_likelihood_loss(
     method: Callable[..., Any], given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the arguments without those of the losses of several rounds.
-
-    Args:
-        method: ``NPE_C.train``.
-        given: By the caller.
+    """Return arguments without those of the losses of several rounds.
 
     Raises:
         ValueError: If one of these was given another value than its default.

@@ -99,13 +99,10 @@ class GaussianMixture:
         *,
         num_iterations: int = 25,
     ) -> GaussianMixture:
-        """Fit by expectation-maximization from seeds spread over the points.
+        """Fit by expectation-maximization from seeds spread over points (n, d).
 
-        Args:
-            points: Shape (n, d); repeated points count as often as they occur.
-            num_components: At most this many; fewer where points are few.
-            rng: Source of the starting points.
-            num_iterations: At most this many.
+        Repeated points count as often as they occur; where points are few, components
+        are fewer.
         """
         center = points.mean(0)
         # A relative floor: a cluster may be 1e-5 of the cloud wide, or one point.
@@ -199,10 +196,7 @@ class WidenedMixture:
 class StudentProposal(Defended):
     """Student mixture over fitted Gaussian components, with a share of a base.
 
-    Args:
-        mixture: The components.
-        base: The defensive proposal.
-        unbounding: Where the components were fitted; None is in z itself.
+    Where there is an unbounding, the components were fitted on its line.
     """
 
     def __init__(

@@ -150,9 +150,6 @@ class SeqBED(ActiveInference):
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             action: Shape (n, action_dim).
             belief: The distribution of the particles; None is the current belief.
-
-        Raises:
-            ValueError: If there are no actions, or shapes do not fit.
         """
         if action is None:
             raise ValueError(
