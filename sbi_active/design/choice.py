@@ -33,18 +33,9 @@ def choose(
 ) -> Design:
     r"""Return the design.
 
-    A finite exponent k draws the action, :math:`P(\xi) \propto \max(U(\xi), 0)^k`.
-
-    Args:
-        estimates: Of the candidates.
-        actions: The space.
-        cost: Of the candidates, shape (a,); None for none.
-        exponent: k; inf takes the leader.
-        estimator: Name of the class that estimated.
-        bound: Side of the information that the estimates lie on.
-        num_simulations: Spent.
-        num_missing: Of them.
-        seed: Of the draw and those behind probabilities.
+    A finite exponent k draws the action, :math:`P(\xi) \propto \max(U(\xi), 0)^k`,
+    instead of taking the leader. The seed is that of the draw and of those behind
+    probabilities.
     """
     price = torch.ones(len(estimates.action)) if cost is None else cost
     chosen = estimates.leader
@@ -104,9 +95,7 @@ def pricing(
 ) -> Callable[[Tensor], Tensor] | None:
     """Return the cost as a function of actions (n, action_dim) -> (n,), float64.
 
-    Args:
-        cost: The same, or one number an action of a list, shape (a,); None for none.
-        actions: The space.
+    It may be given as one number an action of a list, shape (a,).
 
     Raises:
         ValueError: If the shape is another, or when called if a cost is not positive.

@@ -41,11 +41,7 @@ class Permission:
     exclude: Tensor
 
     def __call__(self, action: Tensor) -> Tensor:
-        """Return which of actions (n, action_dim) are permitted, shape (n,), bool.
-
-        Raises:
-            ValueError: If the constraint returns another shape.
-        """
+        """Return which of actions (n, action_dim) are permitted, shape (n,), bool."""
         inside = torch.ones(len(action)).bool()
         if self.constraint is not None:
             answer = torch.as_tensor(self.constraint(action))
@@ -83,11 +79,7 @@ class Permission:
     def drawn(self, seed: int | None) -> Tensor:
         """Return the permitted among draws of a space without end.
 
-        Args:
-            seed: Of the draws; None goes on with torch's global generator.
-
-        Raises:
-            ValueError: If none is.
+        Without a seed they go on with torch's global generator.
         """
         drawn = self.actions.sample((MANY,), seed=seed)
         drawn = drawn[self(drawn)]
@@ -110,11 +102,7 @@ class Permission:
 
 
 def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
-    """Return actions as rows (t, action_dim); none for None.
-
-    Raises:
-        ValueError: If the shape is another.
-    """
+    """Return actions as rows (t, action_dim); none for None."""
     dim = actions.action_dim
     if given is None:
         return torch.empty(0, dim)
@@ -130,10 +118,6 @@ def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
 
 def reaches(valid: Tensor, least: float) -> Tensor:
     """Return which candidates give a measurement often enough, shape (a,).
-
-    Args:
-        valid: Share of measurements, shape (a,); NaN where every simulation was lost.
-        least: Share asked for.
 
     Raises:
         ValueError: If none does; it names the largest share.

@@ -66,9 +66,6 @@ def eliminate(
         min_probability_valid: Share of measurements that a choice needs.
         weight: Of the information in the utility, shape (a,).
         seed: Of the draws behind probabilities.
-
-    Returns:
-        Estimates of all candidates, fewer simulations behind those eliminated.
     """
     num_actions = len(action)
     sampler = evaluator.sampler

@@ -64,11 +64,6 @@ class GivenGains:
     ) -> Estimates:
         """Return estimates of candidates on their own rows.
 
-        Args:
-            action: Candidates, shape (a, action_dim).
-            min_probability_valid: Share of measurements that a choice needs.
-            cost: Of the candidates, shape (a,).
-
         Raises:
             ValueError: If no candidate has rows enough.
         """
@@ -109,13 +104,6 @@ class GivenGains:
         min_probability_valid: float,
     ) -> Estimates:
         """Search a continuous space; return the estimates of the finalists.
-
-        Args:
-            actions: The space.
-            search: For the finalists.
-            permitted: Which of actions (n, action_dim) may be chosen.
-            cost: Of actions (n, action_dim), shape (n,).
-            min_probability_valid: Share of measurements that a choice needs.
 
         Raises:
             ValueError: If the estimator does not score rows one by one.
@@ -255,10 +243,8 @@ class GivenGains:
 class RowSimulations(CandidateSimulations):
     """Rows of which each has an action of its own, for estimators that score rows.
 
-    x has shape (1, n, *x_shape), and ``action`` is of no meaning.
-
-    Attributes:
-        each: Shape (n, action_dim).
+    x has shape (1, n, *x_shape), ``each`` (n, action_dim), and ``action`` is of no
+    meaning.
     """
 
     each: Tensor = field(default_factory=lambda: torch.empty(0))

@@ -58,11 +58,7 @@ class Selection:
     seed: int
 
     def by_simulation(self, others: Tensor, budget: int | None) -> Design:
-        """Return the design of one action.
-
-        Args:
-            others: Actions whose outcomes will be known as well, shape (p, action_dim).
-            budget: Simulations in all; None is ``num_samples`` a candidate.
+        """Return the design of one action, given others (p, action_dim) under way.
 
         Raises:
             ValueError: If the budget is too small.

@@ -59,14 +59,9 @@ class Contrast(InformationGainEstimator):
 
     @abstractmethod
     def _terms(self, own: Tensor, contrastive: Tensor) -> Tensor:
-        """Return the log likelihoods whose mean is the evidence.
+        """Return the log likelihoods whose mean is the evidence, (n, L) or (n, L + 1).
 
-        Args:
-            own: log q(x_i | theta_i), shape (n,).
-            contrastive: log q(x_i | theta'_l), shape (n, L).
-
-        Returns:
-            Shape (n, L) or, with the own one in front, (n, L + 1).
+        Of log q(x_i | theta_i), shape (n,), and log q(x_i | theta'_l), shape (n, L).
         """
 
     def _contributions(
@@ -127,15 +122,7 @@ def log_mean(terms: Tensor) -> Tensor:
 
 
 def near_limit(gain: Tensor, limit: float) -> Tensor:
-    """Return where estimates are near a limit or above it.
-
-    Args:
-        gain: Contributions, shape (a, n).
-        limit: Nats.
-
-    Returns:
-        Shape (a,), bool.
-    """
+    """Return where estimates are near a limit or above it, (a, n) -> (a,)."""
     return gain.nanmean(1) > limit - NEAR
 
 

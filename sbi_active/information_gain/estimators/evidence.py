@@ -46,11 +46,10 @@ class Evidence:
     def __call__(
         self, x: Tensor, slope: Tensor, rows: Tensor, num_local: int
     ) -> tuple[Tensor, Tensor]:
-        """Return log evidences with Jensen's bias removed, and what they rest on.
+        """Return log evidences without Jensen's bias, and what they rest on.
 
-        Returns:
-            The log evidences, shape (rows,), and the share of each simulation in them,
-            summed over the outcomes, shape (n,). Local draws have the rest.
+        That is the share of each simulation in them, summed over the outcomes, shape
+        (n,); local draws have the rest.
         """
         m = int(self.complete.counted.sum()) - 1
         parts = []
