@@ -11,7 +11,7 @@ from sbi.neural_nets import likelihood_nn
 from torch import Tensor
 
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
-from sbi_active.inference.models.action_likelihood import ActionLikelihood
+from sbi_active.inference.models.factors import ActionLikelihood
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.training import (

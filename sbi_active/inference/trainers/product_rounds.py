@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import Belief, require_support
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
-from sbi_active.inference.models.action_factor import ActionFactor
+from sbi_active.inference.models.factors import ActionFactor
 from sbi_active.inference.products.belief import sample_product
 from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, MarkovChainBelief
 from sbi_active.inference.products.product import (

@@ -12,7 +12,7 @@ from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor
 
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
-from sbi_active.inference.models.action_ratio import ActionRatio
+from sbi_active.inference.models.factors import ActionRatio
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
 from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
