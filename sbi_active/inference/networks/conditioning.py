@@ -12,7 +12,14 @@ from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
 from sbi_active.inference.networks.response import STRAIGHT
 
-__all__ = ["BaselineKind", "Conditioning", "covariance_factor", "scale_of"]
+__all__ = [
+    "BaselineKind",
+    "Conditioning",
+    "covariance_factor",
+    "log_normal",
+    "scale_of",
+    "whitened",
+]
 
 BaselineKind = Literal["none", "linear", "curved"]
 
@@ -114,7 +121,7 @@ class Conditioning(nn.Module):
         test = held_out(len(u))
         best = -math.inf
         if baseline == "best":
-            best = self.scores["none"] = float(_log_normal(u[test]).mean())
+            best = self.scores["none"] = float(log_normal(u[test]).mean())
         for kind in KINDS if baseline == "best" else (baseline,):
             bends = self.baseline is None or self.baseline.bend(u, y, action) > STRAIGHT
             if kind == "curved" and baseline == "best" and not bends:
@@ -133,10 +140,7 @@ class Conditioning(nn.Module):
 
     def whiten(self, theta: Tensor) -> Tensor:
         """Return u, (..., d) -> (..., d)."""
-        step = (theta.double() - self.theta_mean)[..., None]
-        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
-            ..., 0
-        ]
+        return whitened(theta.double() - self.theta_mean, self.theta_factor)
 
     def unwhiten(self, u: Tensor) -> Tensor:
         """Return theta, the inverse of :meth:`whiten`."""
@@ -192,13 +196,19 @@ def _with_global(frames: Frames) -> Frames:
     )
 
 
-def _log_normal(u: Tensor) -> Tensor:
+def whitened(step: Tensor, factor: Tensor) -> Tensor:
+    """Return steps (..., d) in units of a lower factor (d, d) of their covariance."""
+    return torch.linalg.solve_triangular(factor, step[..., None], upper=False)[..., 0]
+
+
+def log_normal(u: Tensor) -> Tensor:
+    """Return the log density of the standard normal, (..., d) -> (...)."""
     return -0.5 * u.square().sum(-1) - 0.5 * u.shape[-1] * math.log(2 * math.pi)
 
 
 def _log_mixture(u: Tensor, frames: Frames) -> Tensor:
     """Log density of the local frames, equally weighted, with 1 % of the global one."""
-    log_density = frames.log_det + _log_normal(local(u, frames))
+    log_density = frames.log_det + log_normal(local(u, frames))
     weight = torch.full((log_density.shape[1],), 0.99 / (log_density.shape[1] - 1))
     weight[-1] = 0.01
     return (log_density + weight.to(u).log()).logsumexp(-1)

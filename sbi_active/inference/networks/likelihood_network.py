@@ -11,7 +11,12 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
+from sbi_active.inference.networks.conditioning import (
+    covariance_factor,
+    log_normal,
+    scale_of,
+    whitened,
+)
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.response import Response, exceeds_chance
 from sbi_active.inference.networks.validity_network import ValidityNetwork
@@ -109,7 +114,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         if self.response is None or not len(residual):
             return
         with torch.no_grad():
-            gain = -self.mixture.loss(residual, seen) - _log_normal(residual)
+            gain = -self.mixture.loss(residual, seen) - log_normal(residual)
             self.is_gaussian.fill_(not exceeds_chance(gain.double()))
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
@@ -165,7 +170,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         z, log_det = self._standardize(known, condition)
         z, seen = z.to(torch.float32), self._see(condition)
         if bool(self.is_gaussian):
-            log_density = _log_normal(z)
+            log_density = log_normal(z)
         else:
             log_density = self.mixture.log_prob(z, seen)
         log_density = log_density + log_det.to(log_density)
@@ -199,15 +204,8 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return torch.cat([self._whiten(theta), action], 1).float()
 
     def _whiten(self, theta: Tensor) -> Tensor:
-        step = (theta - self.theta_mean)[..., None]
-        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
-            ..., 0
-        ]
+        return whitened(theta - self.theta_mean, self.theta_factor)
 
 
 def _valid(x: Tensor) -> Tensor:
     return x.isfinite().all(-1)
-
-
-def _log_normal(z: Tensor) -> Tensor:
-    return -0.5 * z.square().sum(-1) - 0.5 * z.shape[-1] * math.log(2 * math.pi)

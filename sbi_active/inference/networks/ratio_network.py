@@ -9,7 +9,11 @@ from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor, nn
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
+from sbi_active.inference.networks.conditioning import (
+    covariance_factor,
+    scale_of,
+    whitened,
+)
 from sbi_active.inference.networks.response import Response
 
 __all__ = ["RatioClassifier", "RatioNetwork"]
@@ -152,7 +156,4 @@ class RatioNetwork(RatioEstimator):
         return torch.where(valid, base, 0.0).float() + correction
 
     def _whiten(self, theta: Tensor) -> Tensor:
-        step = (theta - self.theta_mean)[..., None]
-        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
-            ..., 0
-        ]
+        return whitened(theta - self.theta_mean, self.theta_factor)
