@@ -33,6 +33,7 @@ COVERED = 0.9997
 SPREAD = 2.2
 #: Nats a dimension that more clusters must save.
 WORTH = 0.1
+NUM_POINTS = 1_000  # particles to cluster
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,6 @@ def cover(
     min_regions: int,
     max_regions: int,
     generous: bool,
-    num_points: int = 1_000,
 ) -> list[Region]:
     """Return ellipsoids around the clusters of a sample.
 
@@ -184,7 +184,7 @@ def cover(
     cluster; else an ellipsoid just holds its particles, which a surrogate with misfit
     has spread already.
     """
-    points = particles.resample(num_points, rng)
+    points = particles.resample(NUM_POINTS, rng)
     d = points.shape[1]
     counts = sorted(
         {min(max(k, min_regions), max_regions) for k in (1, 2, 3, 4, 6, 8, min_regions)}

@@ -37,6 +37,7 @@ INFLATION = 1.4  # of the covariance of Student components
 SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
 SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
+MAX_STEPS = 40  # four times those that a peak of 1e-8 of the base's volume takes
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
 FITTED = 8  # of them for each number in a covariance
 
@@ -229,7 +230,6 @@ def population_monte_carlo(
     num_particles: int,
     first: Proposal | None = None,
     num_components: int = 6,
-    max_iterations: int = 40,
     unbounding: Unbounding | None = None,
 ) -> tuple[Particles, int]:
     r"""Sample a density by importance sampling from mixtures fitted to it.
@@ -249,7 +249,6 @@ def population_monte_carlo(
         num_particles: At the last steps; half as many on the way.
         first: A guess at the target to begin with; None begins at the base.
         num_components: Of the fitted mixtures.
-        max_iterations: Steps at most.
         unbounding: Where mixtures are fitted; None is in z itself.
 
     Returns:
@@ -261,7 +260,7 @@ def population_monte_carlo(
     beta, at_target, share = 0.0, 0, SHARE_OF_STEP
     proposal = base if first is None else first
     best: Particles | None = None
-    for step in range(max_iterations):
+    for step in range(MAX_STEPS):
         num = num_particles if beta == 1 or step == 0 else num_particles // 2
         z = proposal.sample(num, rng)
         log_q = proposal.log_prob(z)
