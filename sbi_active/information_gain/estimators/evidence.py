@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,25 +24,23 @@ CLOSER = 0.2  # ... at this share of the posterior's width, lest all others miss
 BLOCK = 256  # rows at once
 
 
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
     """The log evidence of outcomes of one candidate, log p(x_i)."""
 
-    def __init__(
-        self,
-        *,
-        emulator: MeanEmulator,
-        columns: slice,
-        mean: Tensor,
-        scale: Tensor,
-        complete: Completeness,
-        noise: NoiseModel,
-        belief: Distribution,
-        log_belief: Tensor,
-    ) -> None:
-        self.emulator, self.columns = emulator, columns
-        self.mean, self.scale, self.complete = mean, scale, complete
-        self.noise, self.belief, self.log_belief = noise, belief, log_belief
-        self.knots = emulator.knots
+    emulator: MeanEmulator
+    columns: slice
+    mean: Tensor
+    scale: Tensor
+    complete: Completeness
+    noise: NoiseModel
+    belief: Distribution
+    log_belief: Tensor
+
+    @property
+    def knots(self) -> Tensor:
+        """Coordinates of the simulations, shape (n, d)."""
+        return self.emulator.knots
 
     def __call__(
         self, x: Tensor, slope: Tensor, rows: Tensor, num_local: int
