@@ -130,7 +130,7 @@ def refine_exactly(
             f"{num_missing} of {num_simulations} simulations of the refinement are "
             "missing, by faults of the simulator; their draws were left out",
             MissingRowsWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     return belief
 

@@ -14,7 +14,11 @@ from torch import Tensor
 
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
-from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
+from sbi_active.inference.regression.surrogate import (
+    LocalRegression,
+    estimate_noise,
+    fewest_rows,
+)
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.model import require_noise
@@ -313,7 +317,7 @@ class Histories:
     def regress(self, region: Region) -> LocalRegression | None:
         """Regress the histories in a region, or the nearest where it holds few."""
         distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
-        needed = 2 * (self.coordinates.dim + 21)
+        needed = 2 * fewest_rows(self.coordinates.dim)
         rows = _nearest(np.where(valid, distance, np.inf), needed)
         first, second = np.array(self.first, int), np.array(self.second, int)
         both = valid[first] & valid[second]

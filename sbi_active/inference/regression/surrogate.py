@@ -37,11 +37,18 @@ from sbi_active.inference.regression.residual_covariance import (
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
-__all__ = ["LocalRegression", "NoiseEstimate", "Surrogate", "estimate_noise"]
+__all__ = [
+    "LocalRegression",
+    "NoiseEstimate",
+    "Surrogate",
+    "estimate_noise",
+    "fewest_rows",
+]
 
 Array = NDArray[Any]
 
 CAUTION = 2.0  # at least, under misfit
+FREEDOM = 20  # degrees at least, which know a variance to a third
 MISFIT = 1.12  # residual over noise variance above which the basis misses something
 MANY = 6  # parameters beyond which bases without products are tried too
 CHANCE = 0.03  # that the largest ratio is taken for misfit where there is none
@@ -152,7 +159,7 @@ class LocalRegression:
             if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
                 break  # a cubic will do, or another stage makes it do
             p = basis.num_features
-            if n < p + max(20, p // 2):
+            if n < p + max(FREEDOM, p // 2):
                 continue
             features = basis(u)
             ridge = np.diag(np.full(p, 1e-4 if is_wave else 1e-9))
@@ -276,6 +283,11 @@ class Surrogate:
     def assign(self, z: Array) -> NDArray[np.intp]:
         """Return the region of each place, shape (n,); -1 where there is none."""
         return nearest_region([r.region for r in self.regressions], z)
+
+
+def fewest_rows(dim: int) -> int:
+    """Return the rows that a linear regression on so many parameters takes."""
+    return 1 + dim + FREEDOM
 
 
 def _candidates(dim: int, num_rows: int) -> list[Basis]:
