@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.design import Design, action_name
+from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.race import Race, paired_errors, standard_error
@@ -21,9 +22,8 @@ __all__ = ["as_batch", "choose", "pricing"]
 
 def choose(
     estimates: Estimates,
-    actions: ActionSpace,
+    limits: DesignLimits,
     *,
-    cost: Tensor | None,
     exponent: float,
     estimator: str,
     bound: Bound,
@@ -37,7 +37,7 @@ def choose(
     instead of taking the leader. The seed is that of the draw and of those behind
     probabilities.
     """
-    price = torch.ones(len(estimates.action)) if cost is None else cost
+    price = limits.cost(estimates.action)
     chosen = estimates.leader
     eligible = estimates.eligible
     if math.isfinite(exponent):
@@ -66,13 +66,13 @@ def choose(
         bound=bound,
         index=chosen,
         num_simulations=num_simulations,
-        name=action_name(actions),
+        name=action_name(limits.actions),
         estimator=estimator,
         num_samples=estimates.num_samples,
         stopped=estimates.stopped,
         num_missing=num_missing,
         notes=estimates.notes,
-        cost=cost,
+        cost=None if limits.price is None else price,
     )
 
 
