@@ -13,6 +13,8 @@ from sbi_active.inference.networks.baseline import Baseline, Frames, local
 from sbi_active.inference.networks.response import STRAIGHT
 
 __all__ = [
+    "MAX_OUTCOMES",
+    "MIN_ROWS",
     "BaselineKind",
     "Conditioning",
     "covariance_factor",
@@ -23,9 +25,10 @@ __all__ = [
 
 BaselineKind = Literal["none", "linear", "curved"]
 
-MAX_OUTCOMES = 32  # numbers in x beyond which no regression on the action is tried
-MIN_ROWS = 40
-LARGEST_MISFIT = 20.0
+#: Numbers in x beyond which no regression is tried: each has coefficients of its own.
+MAX_OUTCOMES = 32
+MIN_ROWS = 40  # with a measurement, of which a fifth is held out
+LARGEST_MISFIT = 20.0  # nats, beyond which a frame has no part in the posterior
 KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
 #: Nats by which a baseline must beat the simpler one: its frames and what the network
 #: sees of them are more to overfit.

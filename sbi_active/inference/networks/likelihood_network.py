@@ -12,6 +12,8 @@ from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
+    MAX_OUTCOMES,
+    MIN_ROWS,
     covariance_factor,
     log_normal,
     scale_of,
@@ -22,9 +24,6 @@ from sbi_active.inference.networks.response import Response, exceeds_chance
 from sbi_active.inference.networks.validity_network import ValidityNetwork
 
 __all__ = ["LikelihoodNetwork"]
-
-MAX_OUTCOMES = 32  # numbers in x beyond which no regression is tried
-MIN_ROWS = 40
 
 
 class LikelihoodNetwork(ConditionalDensityEstimator):

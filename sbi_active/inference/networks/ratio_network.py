@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
+    MAX_OUTCOMES,
+    MIN_ROWS,
     covariance_factor,
     scale_of,
     whitened,
@@ -18,8 +20,6 @@ from sbi_active.inference.networks.response import Response
 
 __all__ = ["RatioClassifier", "RatioNetwork"]
 
-MAX_OUTCOMES = 32  # numbers in x beyond which no regression is tried
-MIN_ROWS = 40
 FAR = 4.0  # noise deviations, beyond which a residual is squashed
 
 

@@ -21,7 +21,7 @@ Array = NDArray[Any]
 
 BATCH = 64  # rows a call: the same ones whatever the number of workers
 DEEP = 30.0  # nats below the peak that count as any more do
-FORGETTING = 0.3
+FORGETTING = 0.3  # share of the latest call in the mean that orders trials
 
 
 def declares_noise(

@@ -38,8 +38,8 @@ SAMPLERS = ("importance", "kde", *MARKOV_CHAINS)
 #: Shares of the budget by stage, by what they begin at: this round's network, the
 #: belief before, or the prior.
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
-NUM_KERNELS = 2_000
-NUM_HINTS = 1_000
+NUM_KERNELS = 2_000  # draws behind a kernel density estimate
+NUM_HINTS = 1_000  # rows that the importance sampling begins around
 NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 
 

@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from sbi_active.information_gain.fits.cross_fitting import NUM_FOLDS
 from sbi_active.information_gain.fits.emulator import kernel, whitening
 
 __all__ = ["ParameterFeatures", "cross_fitted", "fit_logistic", "probability"]
 
-NUM_FOLDS = 4
 NUM_KNOTS = 12  # of the radial features
 NUM_STEPS = 25  # of Newton's method at most
 MAX_MOVE = 4.0  # of a logit in one step, lest separable labels run away
-CONVERGED = 1e-6
+CONVERGED = 1e-6  # of a logit in one step
 #: Features and precision of the coefficients' Gaussian prior; held-out rows choose.
 OPTIONS = (
     ("linear", 0.01),
