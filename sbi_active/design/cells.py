@@ -13,14 +13,8 @@ FEWEST = 8  # points of a cell
 def cells(point: Tensor, num: int, *, num_continuous: int) -> list[Tensor]:
     """Halve groups of points across their widest side until they are small enough.
 
-    Args:
-        point: Shape (n, dim), the first entries of which are in a unit cube; points
-            of a cell agree in the others.
-        num: About how many cells.
-        num_continuous: Entries to halve by.
-
-    Returns:
-        Indices of the points of each cell.
+    About ``num`` cells of points (n, dim), whose first entries are in a unit cube and
+    are halved by; points of a cell agree in the others.
 
     Example:
         >>> point = torch.tensor([[0.0], [1.0], [0.25], [0.75]] * 8)

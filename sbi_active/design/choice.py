@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.design import Design, action_name
+from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.race import Race, paired_errors, standard_error
@@ -21,9 +22,8 @@ __all__ = ["as_batch", "choose", "pricing"]
 
 def choose(
     estimates: Estimates,
-    actions: ActionSpace,
+    limits: DesignLimits,
     *,
-    cost: Tensor | None,
     exponent: float,
     estimator: str,
     bound: Bound,
@@ -33,20 +33,11 @@ def choose(
 ) -> Design:
     r"""Return the design.
 
-    A finite exponent k draws the action, :math:`P(\xi) \propto \max(U(\xi), 0)^k`.
-
-    Args:
-        estimates: Of the candidates.
-        actions: The space.
-        cost: Of the candidates, shape (a,); None for none.
-        exponent: k; inf takes the leader.
-        estimator: Name of the class that estimated.
-        bound: Side of the information that the estimates lie on.
-        num_simulations: Spent.
-        num_missing: Of them.
-        seed: Of the draw and those behind probabilities.
+    A finite exponent k draws the action, :math:`P(\xi) \propto \max(U(\xi), 0)^k`,
+    instead of taking the leader. The seed is that of the draw and of those behind
+    probabilities.
     """
-    price = torch.ones(len(estimates.action)) if cost is None else cost
+    price = limits.cost(estimates.action)
     chosen = estimates.leader
     eligible = estimates.eligible
     if math.isfinite(exponent):
@@ -75,13 +66,13 @@ def choose(
         bound=bound,
         index=chosen,
         num_simulations=num_simulations,
-        name=action_name(actions),
+        name=action_name(limits.actions),
         estimator=estimator,
         num_samples=estimates.num_samples,
         stopped=estimates.stopped,
         num_missing=num_missing,
         notes=estimates.notes,
-        cost=cost,
+        cost=None if limits.price is None else price,
     )
 
 
@@ -104,9 +95,7 @@ def pricing(
 ) -> Callable[[Tensor], Tensor] | None:
     """Return the cost as a function of actions (n, action_dim) -> (n,), float64.
 
-    Args:
-        cost: The same, or one number an action of a list, shape (a,); None for none.
-        actions: The space.
+    It may be given as one number an action of a list, shape (a,).
 
     Raises:
         ValueError: If the shape is another, or when called if a cost is not positive.

@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.design.choice import as_batch, pricing
 from sbi_active.design.design import Design
-from sbi_active.design.eligibility import Permission, rows_of, warn_missing
+from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.selection import Selection
 from sbi_active.design.target import Target
@@ -189,10 +189,13 @@ class InformationGainDesigner:
                 f"expected num_actions >= 1; got {num_actions}; do ask for one or more"
             )
         others = rows_of(self.actions, pending, "pending")
-        permission = Permission(
-            self.actions, constraint, rows_of(self.actions, exclude, "exclude")
+        limits = DesignLimits(
+            self.actions,
+            constraint,
+            rows_of(self.actions, exclude, "exclude"),
+            pricing(cost, self.actions),
+            min_probability_valid,
         )
-        price = pricing(cost, self.actions)
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         about = Target.of(
             target,
@@ -204,14 +207,12 @@ class InformationGainDesigner:
         )
         selection = Selection(
             target=about,
-            permission=permission,
-            price=price,
+            limits=limits,
             search=self.search,
             num_samples=self.num_samples,
             early=self.eliminate,
             exponent=self.exponent,
             workers=self.workers,
-            least=min_probability_valid,
             seed=seed,
         )
         if simulations is not None:

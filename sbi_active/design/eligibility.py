@@ -13,9 +13,7 @@ from sbi_active.actions import ActionSpace, BoxActions
 from sbi_active.simulation import MissingRowsWarning
 
 __all__ = [
-    "Permission",
-    "excluded_note",
-    "reaches",
+    "DesignLimits",
     "rows_of",
     "warn_missing",
 ]
@@ -25,8 +23,8 @@ SAME = 0.01  # of the width of a box, within which two actions are the same
 
 
 @dataclass(frozen=True)
-class Permission:
-    """Which actions may be chosen at all.
+class DesignLimits:
+    """Which actions may be chosen, and what they cost.
 
     Attributes:
         actions: The space.
@@ -34,18 +32,18 @@ class Permission:
             None permits all.
         exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
             nor others within a hundredth of its width in every entry.
+        price: Cost of actions (n, action_dim), shape (n,); None for none.
+        least: Share of measurements that a choice needs.
     """
 
     actions: ActionSpace
     constraint: Callable[[Tensor], Tensor] | None
     exclude: Tensor
+    price: Callable[[Tensor], Tensor] | None = None
+    least: float = 0.0
 
     def __call__(self, action: Tensor) -> Tensor:
-        """Return which of actions (n, action_dim) are permitted, shape (n,), bool.
-
-        Raises:
-            ValueError: If the constraint returns another shape.
-        """
+        """Return which of actions (n, action_dim) are permitted, shape (n,), bool."""
         inside = torch.ones(len(action)).bool()
         if self.constraint is not None:
             answer = torch.as_tensor(self.constraint(action))
@@ -83,11 +81,7 @@ class Permission:
     def drawn(self, seed: int | None) -> Tensor:
         """Return the permitted among draws of a space without end.
 
-        Args:
-            seed: Of the draws; None goes on with torch's global generator.
-
-        Raises:
-            ValueError: If none is.
+        Without a seed they go on with torch's global generator.
         """
         drawn = self.actions.sample((MANY,), seed=seed)
         drawn = drawn[self(drawn)]
@@ -98,6 +92,44 @@ class Permission:
                 "permitted"
             )
         return drawn
+
+    def cost(self, action: Tensor) -> Tensor:
+        """Return the cost of actions (n, action_dim), shape (n,); 1 for none."""
+        if self.price is None:
+            return torch.ones(len(action)).double()
+        return self.price(action)
+
+    def reached_by(self, valid: Tensor) -> Tensor:
+        """Return which shares of measurements suffice, shape (a,).
+
+        They are NaN where every simulation was lost.
+
+        Raises:
+            ValueError: If none does; it names the largest share.
+        """
+        eligible = valid >= self.least
+        if bool(eligible.any()):
+            return eligible
+        if bool(valid.isnan().all()):
+            raise ValueError(
+                "expected simulations; got none, all rows of all candidates were lost "
+                "to faults; do look at the simulator's tracebacks"
+            )
+        raise ValueError(
+            f"expected a candidate that gives a measurement with a probability of at "
+            f"least {self.least:g}; got {float(valid.nan_to_num(0.0).max()):.3g} at "
+            "most; do lower min_probability_valid or add gentler candidates"
+        )
+
+    def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
+        """Say how many candidates are excluded; nothing where none is."""
+        num = int((~eligible).sum())
+        if num == 0:
+            return ()
+        return (
+            f"{num} of {len(eligible)} candidates excluded: a measurement is less "
+            f"probable than {self.least:g}, or every simulation was lost",
+        )
 
     def _tolerance(self) -> Tensor:
         parts = []
@@ -110,11 +142,7 @@ class Permission:
 
 
 def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
-    """Return actions as rows (t, action_dim); none for None.
-
-    Raises:
-        ValueError: If the shape is another.
-    """
+    """Return actions as rows (t, action_dim); none for None."""
     dim = actions.action_dim
     if given is None:
         return torch.empty(0, dim)
@@ -126,42 +154,6 @@ def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
             "one row an action"
         )
     return rows
-
-
-def reaches(valid: Tensor, least: float) -> Tensor:
-    """Return which candidates give a measurement often enough, shape (a,).
-
-    Args:
-        valid: Share of measurements, shape (a,); NaN where every simulation was lost.
-        least: Share asked for.
-
-    Raises:
-        ValueError: If none does; it names the largest share.
-    """
-    eligible = valid >= least
-    if not bool(eligible.any()):
-        if bool(valid.isnan().all()):
-            raise ValueError(
-                "expected simulations; got none, all rows of all candidates were lost "
-                "to faults; do look at the simulator's tracebacks"
-            )
-        raise ValueError(
-            f"expected a candidate that gives a measurement with a probability of at "
-            f"least {least:g}; got {float(valid.nan_to_num(0.0).max()):.3g} at most; "
-            "do lower min_probability_valid or add gentler candidates"
-        )
-    return eligible
-
-
-def excluded_note(eligible: Tensor, least: float) -> tuple[str, ...]:
-    """Say how many candidates are excluded; nothing where none is."""
-    num = int((~eligible).sum())
-    if num == 0:
-        return ()
-    return (
-        f"{num} of {len(eligible)} candidates excluded: a measurement is less probable "
-        f"than {least:g}, or every simulation was lost",
-    )
 
 
 def warn_missing(num_missing: int, num_simulations: int) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_active.design.eligibility import excluded_note, reaches
+from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.information_gain import CandidateSimulations
 from sbi_active.information_gain.race import Race
@@ -51,8 +51,7 @@ def eliminate(
     num_samples: int,
     early: bool,
     budget: int,
-    min_probability_valid: float,
-    weight: Tensor,
+    limits: DesignLimits,
     seed: int,
 ) -> Estimates:
     """Simulate candidates until one leads, in ever smaller groups.
@@ -63,12 +62,8 @@ def eliminate(
         num_samples: Simulations a candidate on average.
         early: Whether to begin with half of them.
         budget: Simulations in all, those of the sampler so far included.
-        min_probability_valid: Share of measurements that a choice needs.
-        weight: Of the information in the utility, shape (a,).
+        limits: Of the choice.
         seed: Of the draws behind probabilities.
-
-    Returns:
-        Estimates of all candidates, fewer simulations behind those eliminated.
     """
     num_actions = len(action)
     sampler = evaluator.sampler
@@ -80,8 +75,10 @@ def eliminate(
     notes = [*evaluator.notes, *evaluator.estimator.remarks(first)]
     halves = _halves(first)
     num_valid, num_counted = first.num_valid()
-    eligible = reaches(num_valid / num_counted, min_probability_valid)
-    notes += excluded_note(eligible, min_probability_valid)
+    eligible = limits.reached_by(num_valid / num_counted)
+    notes += limits.excluded_note(eligible)
+    cost = limits.cost(action)
+    weight = cost.mean() / cost
 
     gains = [[torch.empty(0)] * num_actions for _ in range(2)]
 

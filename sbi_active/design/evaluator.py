@@ -75,12 +75,7 @@ class GainEvaluator:
         return num + torch.arange(len(action))
 
     def draw(self, num_samples: int, index: Tensor) -> CandidateSimulations:
-        """Simulate candidates; the first call settles the estimator.
-
-        Args:
-            num_samples: Of each candidate.
-            index: Of the candidates, shape (k,).
-        """
+        """Simulate candidates (k,); the first call settles the estimator."""
         if self.replicates is not None:
             return self.sampler.draw(num_samples, index, replicates=self.replicates)
         replicates = self._chosen is None or self._chosen.needs_noise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace
 from sbi_active.design.cells import cells
-from sbi_active.design.eligibility import excluded_note, reaches
+from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.information_gain import (
     CandidateSimulations,
@@ -50,6 +48,7 @@ class GivenGains:
         estimator: Of the information.
         model: What the estimator needs.
         belief: Of the parameters in the rows.
+        limits: Of the choice.
         seed: Of the split.
     """
 
@@ -57,17 +56,11 @@ class GivenGains:
     estimator: InformationGainEstimator
     model: Any
     belief: Distribution
+    limits: DesignLimits
     seed: int
 
-    def of_list(
-        self, action: Tensor, *, min_probability_valid: float, cost: Tensor
-    ) -> Estimates:
+    def of_list(self, action: Tensor) -> Estimates:
         """Return estimates of candidates on their own rows.
-
-        Args:
-            action: Candidates, shape (a, action_dim).
-            min_probability_valid: Share of measurements that a choice needs.
-            cost: Of the candidates, shape (a,).
 
         Raises:
             ValueError: If no candidate has rows enough.
@@ -91,31 +84,10 @@ class GivenGains:
                 f"expected simulations with at least {FEWEST} rows of a candidate; got "
                 "fewer of every one; do pass rows at the actions of the list"
             )
-        return self._estimates(
-            action,
-            halves,
-            share,
-            min_probability_valid=min_probability_valid,
-            cost=cost,
-        )
+        return self._estimates(action, halves, share)
 
-    def of_space(
-        self,
-        actions: ActionSpace,
-        search: Search,
-        *,
-        permitted: Callable[[Tensor], Tensor],
-        cost: Callable[[Tensor], Tensor],
-        min_probability_valid: float,
-    ) -> Estimates:
+    def of_space(self, search: Search) -> Estimates:
         """Search a continuous space; return the estimates of the finalists.
-
-        Args:
-            actions: The space.
-            search: For the finalists.
-            permitted: Which of actions (n, action_dim) may be chosen.
-            cost: Of actions (n, action_dim), shape (n,).
-            min_probability_valid: Share of measurements that a choice needs.
 
         Raises:
             ValueError: If the estimator does not score rows one by one.
@@ -126,13 +98,13 @@ class GivenGains:
                 f"and continuous actions; got {type(self.estimator).__name__}; do use "
                 "estimator='posterior', or leave out simulations="
             )
-        coordinates = Coordinates(actions)
+        coordinates = Coordinates(self.limits.actions)
         everything = torch.arange(len(self.simulations))
         averages = [
             self._averages(coordinates, half) for half in self._split(everything)
         ]
         first = averages[0]
-        price = cost(first.action)
+        price = self.limits.cost(first.action)
         known = Evaluations(
             first.action,
             first.gain / price,
@@ -141,12 +113,12 @@ class GivenGains:
         )
         action = search.finalists(
             Objective(
-                actions=actions,
-                permitted=permitted,
+                actions=self.limits.actions,
+                permitted=self.limits,
                 evaluate=_nothing,
                 num_evaluations=0,
                 seed=derive_seed(self.seed, "search"),
-                min_probability_valid=min_probability_valid,
+                min_probability_valid=self.limits.least,
                 known=known,
             )
         )
@@ -164,13 +136,7 @@ class GivenGains:
                 shares.append(share(point)[0].detach().clamp(0, 1))
             else:
                 shares.append(torch.ones(len(point)).double())
-        return self._estimates(
-            action,
-            halves,
-            torch.stack(shares).mean(0),
-            min_probability_valid=min_probability_valid,
-            cost=cost(action),
-        )
+        return self._estimates(action, halves, torch.stack(shares).mean(0))
 
     def _split(self, rows: Tensor) -> list[Tensor]:
         generator = torch.Generator().manual_seed(derive_seed(self.seed, "split"))
@@ -224,16 +190,13 @@ class GivenGains:
         action: Tensor,
         halves: list[list[Tensor]],
         share: Tensor,
-        *,
-        min_probability_valid: float,
-        cost: Tensor,
     ) -> Estimates:
         known = torch.tensor([bool(g.isfinite().any()) for g in halves[0]])
-        eligible = known & reaches(share, min_probability_valid)
+        eligible, cost = known & self.limits.reached_by(share), self.limits.cost(action)
         index = torch.nonzero(eligible)[:, 0]
         race = Race.run([halves[0][a] / cost[a] for a in index], self.seed)
         few = int((~known).sum())
-        notes = [IN_SAMPLE, *excluded_note(eligible | ~known, min_probability_valid)]
+        notes = [IN_SAMPLE, *self.limits.excluded_note(eligible | ~known)]
         if few:
             notes.append(f"{few} candidates with fewer than {FEWEST} rows excluded")
         return Estimates(
@@ -255,10 +218,8 @@ class GivenGains:
 class RowSimulations(CandidateSimulations):
     """Rows of which each has an action of its own, for estimators that score rows.
 
-    x has shape (1, n, *x_shape), and ``action`` is of no meaning.
-
-    Attributes:
-        each: Shape (n, action_dim).
+    x has shape (1, n, *x_shape), ``each`` (n, action_dim), and ``action`` is of no
+    meaning.
     """
 
     each: Tensor = field(default_factory=lambda: torch.empty(0))

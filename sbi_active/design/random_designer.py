@@ -12,13 +12,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.design import Design, action_name
-from sbi_active.design.eligibility import (
-    Permission,
-    excluded_note,
-    reaches,
-    rows_of,
-    warn_missing,
-)
+from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
@@ -85,15 +79,16 @@ class RandomDesigner:
             ValueError: If a share of measurements is asked for without a simulator or a
                 belief, or no candidate reaches it.
         """
-        permission = Permission(
-            self.actions, constraint, rows_of(self.actions, exclude, "exclude")
+        limits = DesignLimits(
+            self.actions,
+            constraint,
+            rows_of(self.actions, exclude, "exclude"),
+            least=min_probability_valid,
         )
-        candidates, notes = permission.listed()
+        candidates, notes = limits.listed()
         if candidates is None:
             own = None if seed is None else derive_seed(seed, "candidates")
-            candidates = permission.drawn(own)[
-                : FEW if min_probability_valid > 0 else 1
-            ]
+            candidates = limits.drawn(own)[: FEW if min_probability_valid > 0 else 1]
         num = len(candidates)
         unknown = torch.full((num,), torch.nan, dtype=torch.float64)
         valid, num_simulations, num_missing = unknown, 0, 0
@@ -113,7 +108,7 @@ class RandomDesigner:
             num_simulations = status.numel()
             num_missing = num_simulations - int(counted.sum())
             warn_missing(num_missing, num_simulations)
-            eligible = reaches(valid, min_probability_valid)
+            eligible = limits.reached_by(valid)
         with forked_generators(seed):
             remaining = torch.nonzero(eligible)[:, 0]
             chosen = int(remaining[int(torch.randint(len(remaining), ()))])
@@ -131,7 +126,7 @@ class RandomDesigner:
             name=action_name(self.actions),
             num_samples=torch.full((num,), num_simulations // num).long(),
             num_missing=num_missing,
-            notes=(*excluded_note(eligible, min_probability_valid), *notes),
+            notes=(*limits.excluded_note(eligible), *notes),
         )
 
     def _outcomes(

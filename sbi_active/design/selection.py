@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from sbi_active.design.choice import choose
 from sbi_active.design.design import Design
-from sbi_active.design.eligibility import Permission
+from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import eliminate
 from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.design.given import GivenGains
@@ -36,40 +35,32 @@ class Selection:
 
     Attributes:
         target: What to learn about.
-        permission: Of actions.
-        price: Cost of actions (n, action_dim), shape (n,); None for none.
+        limits: Of actions.
         search: For the candidates.
         num_samples: Simulations a candidate on average.
         early: Whether candidates begin with half of them.
         exponent: Of the choice.
         workers: Of the simulations.
-        least: Share of measurements that a choice needs.
         seed: Of everything random.
     """
 
     target: Target
-    permission: Permission
-    price: Callable[[Tensor], Tensor] | None
+    limits: DesignLimits
     search: Search
     num_samples: int
     early: bool
     exponent: float
     workers: Workers
-    least: float
     seed: int
 
     def by_simulation(self, others: Tensor, budget: int | None) -> Design:
-        """Return the design of one action.
-
-        Args:
-            others: Actions whose outcomes will be known as well, shape (p, action_dim).
-            budget: Simulations in all; None is ``num_samples`` a candidate.
+        """Return the design of one action, given others (p, action_dim) under way.
 
         Raises:
             ValueError: If the budget is too small.
         """
-        actions, target = self.permission.actions, self.target
-        listed, notes = self.permission.listed()
+        actions, target = self.limits.actions, self.target
+        listed, notes = self.limits.listed()
         if budget is None:
             size = self.search.size(actions) if listed is None else len(listed)
             budget = self.num_samples * size
@@ -87,28 +78,25 @@ class Selection:
         action = self.search.finalists(
             Objective(
                 actions=actions,
-                permitted=self.permission,
+                permitted=self.limits,
                 evaluate=lambda rows: self._evaluate(evaluator, rows, num_samples),
                 num_evaluations=self.search.num_evaluations(budget, num_samples),
                 seed=derive_seed(self.seed, "search"),
-                min_probability_valid=self.least,
+                min_probability_valid=self.limits.least,
             )
         )
-        cost = self._cost(action)
         estimates = eliminate(
             evaluator,
             action,
             num_samples=self.num_samples,
             early=self.early,
             budget=budget,
-            min_probability_valid=self.least,
-            weight=cost.mean() / cost,
+            limits=self.limits,
             seed=self.seed,
         )
         return choose(
             replace(estimates, notes=(*estimates.notes, *notes)),
-            actions,
-            cost=None if self.price is None else cost,
+            self.limits,
             exponent=self.exponent,
             estimator=type(evaluator.estimator).__name__,
             bound=evaluator.bound,
@@ -125,7 +113,7 @@ class Selection:
             ValueError: If they are of other actions, or the estimator cannot be made
                 from single rows.
         """
-        target, actions = self.target, self.permission.actions
+        target, actions = self.target, self.limits.actions
         if not isinstance(simulations, Simulations):
             raise TypeError(
                 "expected Simulations(theta, action, x) for simulations=; got "
@@ -136,29 +124,18 @@ class Selection:
                 f"expected simulations of actions (n, {actions.action_dim}); got "
                 f"{tuple(simulations.action.shape)}; do pass those of this space"
             )
-        listed, notes = self.permission.listed()
+        listed, notes = self.limits.listed()
         estimator = target.gain() or _by_model(target.model, simulations)
         assert target.belief is not None
         given = GivenGains(
-            simulations, estimator, target.model, target.belief, self.seed
+            simulations, estimator, target.model, target.belief, self.limits, self.seed
         )
-        if listed is None:
-            estimates = given.of_space(
-                actions,
-                self.search,
-                permitted=self.permission,
-                cost=self._cost,
-                min_probability_valid=self.least,
-            )
-        else:
-            estimates = given.of_list(
-                listed, min_probability_valid=self.least, cost=self._cost(listed)
-            )
-        cost = None if self.price is None else self.price(estimates.action)
+        estimates = (
+            given.of_space(self.search) if listed is None else given.of_list(listed)
+        )
         return choose(
             replace(estimates, notes=(*estimates.notes, *notes)),
-            actions,
-            cost=cost,
+            self.limits,
             exponent=self.exponent,
             estimator=type(estimator).__name__,
             bound="none",  # the model may have seen the rows
@@ -173,17 +150,12 @@ class Selection:
         """Estimate the utility at parameters that are the same from call to call."""
         evaluator.sampler.rewind()
         drawn = evaluator.draw(num_samples, evaluator.add(action))
-        gain, cost = evaluator(drawn), self._cost(action)
+        gain, cost = evaluator(drawn), self.limits.cost(action)
         valid, counted = drawn.num_valid()
         error = torch.stack([standard_error(row) for row in gain])
         return Evaluations(
             action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
         )
-
-    def _cost(self, action: Tensor) -> Tensor:
-        if self.price is None:
-            return torch.ones(len(action)).double()
-        return self.price(action)
 
 
 def _by_model(model: Any, simulations: Simulations) -> InformationGainEstimator:

@@ -53,14 +53,6 @@ class Target:
     ) -> Target:
         """Return the target, its belief that of the model where none is given.
 
-        Args:
-            name: As the attribute, with the next four.
-            estimator: Of the information.
-            model: For it.
-            simulator: Of outcomes.
-            belief: Of the parameters.
-            simulates: Whether outcomes are to be simulated.
-
         Raises:
             ValueError: If what the target needs is lacking.
         """
@@ -112,13 +104,7 @@ class Target:
     def sampler(
         self, action: Tensor, others: Tensor, seed: int, workers: Workers
     ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None]:
-        """Return what draws outcomes of candidates, and the estimator.
-
-        Args:
-            action: Candidates, shape (a, action_dim).
-            others: Whose outcomes will be known as well, shape (p, action_dim).
-            seed: Of everything drawn.
-            workers: Of the simulations.
+        """Return what draws outcomes of candidates (a, action_dim), and the estimator.
 
         Raises:
             ValueError: If other outcomes have no place in the target or the estimator.

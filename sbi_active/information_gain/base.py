@@ -135,7 +135,7 @@ class InformationGainEstimator(ABC):
         simulations: CandidateSimulations,
         belief: Distribution | None,
     ) -> Tensor:
-        r"""Return the contribution of every simulation; their mean is the estimate.
+        """Return the contribution of every simulation; their mean is the estimate.
 
         Args:
             model: What was learned, see the estimator.
@@ -171,37 +171,21 @@ class InformationGainEstimator(ABC):
     def bound_on(self, model: Any) -> Bound:
         """Return which side of the information the estimate's expectation lies on.
 
-        Args:
-            model: What the estimate is made with. With ``exact_likelihood = True`` its
-                likelihood is exact, otherwise learned.
+        A model with ``exact_likelihood = True`` has an exact likelihood, others a
+        learned one.
         """
         return self.bound
 
     def cautions(self, gain: Tensor) -> list[str]:
-        """Return what an estimate itself gives to know, as a limit that it is near.
-
-        Args:
-            gain: Contributions, shape (a, n).
-        """
+        """Say what contributions (a, n) give to know, as a limit that is near."""
         return []
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
-        """Return what speaks against the estimator on these simulations.
-
-        Args:
-            simulations: As in a call.
-
-        Returns:
-            Short sentences; none where every check passes.
-        """
+        """Say in short sentences what speaks against the estimator here."""
         return []
 
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
-        """Return what to know of an estimate from these simulations.
-
-        Args:
-            simulations: As in a call.
-        """
+        """Return what to know of an estimate from simulations."""
         return []
 
     @abstractmethod

@@ -71,13 +71,10 @@ class CandidateSampler:
     def draw(
         self, num_samples: int, candidates: Tensor, *, replicates: bool
     ) -> CandidateSimulations:
-        """Simulate candidates at fresh parameters, the same for all.
+        """Simulate candidates (k,) at fresh parameters, the same for all.
 
-        Args:
-            num_samples: Simulations a candidate.
-            candidates: Indices, shape (k,).
-            replicates: Whether half of them repeat the parameters of the others;
-                ignored where the noise is declared.
+        With replicates half of the simulations repeat the parameters of the others,
+        unless the noise is declared.
         """
         self._num_waves += 1
         paired = replicates and not self.declared
@@ -102,14 +99,8 @@ class CandidateSampler:
     ) -> CandidateSimulations | None:
         """Simulate actions (a, action_dim) at parameters (n, theta_dim).
 
-        Args:
-            theta: Parameters.
-            action: Actions.
-            paired: Whether to simulate every row twice.
-            label: Of the seeds: outcomes that are joined have noise of their own.
-
-        Returns:
-            None where the declared mean turns out to change from run to run.
+        Twice where paired; None where the declared mean turns out to change from run to
+        run. The label is the seeds': outcomes that are joined have noise of their own.
         """
         num = len(theta)
         rows = theta.repeat(len(action), 1), action.repeat_interleave(num, 0)

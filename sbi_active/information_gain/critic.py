@@ -66,15 +66,12 @@ class Critic:
             )
 
     def rows(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
-        """Return f of every row.
+        """Return f of every row, shape (n,), float64.
 
         Args:
             x: Outcomes, shape (n, *x_shape).
             theta: Parameters, shape (n, theta_dim).
             action: Shape (n, action_dim).
-
-        Returns:
-            Shape (n,), float64.
 
         Raises:
             ValueError: If the model cannot say of a row.
@@ -88,18 +85,12 @@ class Critic:
         return self._known(torch.cat(values))
 
     def table(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
-        """Return f of every outcome with every parameter set.
+        """Return f of every outcome with every parameter set, shape (n, m), float64.
 
         Args:
             x: Outcomes, shape (n, *x_shape).
             theta: Parameters, shape (m, theta_dim).
             action: One action, shape (action_dim,).
-
-        Returns:
-            Shape (n, m), float64.
-
-        Raises:
-            ValueError: If the model cannot say of a pair.
         """
         all_pairs = getattr(self.model, f"{self.method}_table", None)
         if all_pairs is not None:

@@ -75,17 +75,10 @@ def conditional_gain(
     *,
     action_dim: int,
 ) -> Tensor:
-    """Return contributions to what candidates tell beyond the others.
+    """Return contributions to what candidates tell beyond the others, (a, n).
 
-    Args:
-        estimator: Of the information.
-        model: For single outcomes, see the estimator; None for none.
-        simulations: From :func:`join_outcomes`.
-        belief: As for the estimator.
-        action_dim: Of one action.
-
-    Returns:
-        Shape (a, n), nats.
+    The simulations come from :func:`join_outcomes`; the model is for single outcomes,
+    of actions of ``action_dim`` numbers.
     """
     joint = None if model is None else JointLikelihood(model, action_dim)
     others = replace(
@@ -102,12 +95,7 @@ def conditional_gain(
 
 
 class JointLikelihood:
-    r"""Likelihood of several outcomes, :math:`\prod_k q(x_k | \theta, \xi_k)`.
-
-    Args:
-        model: Of one outcome.
-        action_dim: Of one action.
-    """
+    r"""Likelihood of several outcomes, :math:`\prod_k q(x_k | \theta, \xi_k)`."""
 
     def __init__(self, model: Any, action_dim: int) -> None:
         self.model, self.action_dim = model, action_dim
@@ -137,11 +125,7 @@ class JointLikelihood:
 
 
 class _JointNoise(NoiseModel):
-    """Noise that is independent from outcome to outcome.
-
-    Args:
-        each: Of one outcome.
-    """
+    """Noise that is independent from outcome to outcome, each of the same model."""
 
     def __init__(self, each: NoiseModel) -> None:
         self.each = each

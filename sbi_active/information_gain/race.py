@@ -41,12 +41,9 @@ class Race:
 
     @staticmethod
     def run(contributions: list[Tensor], seed: int) -> Race:
-        """Compare candidates.
+        """Compare candidates by contributions (n,) each, NaN where a row is missing.
 
-        Args:
-            contributions: One tensor a candidate, shape (n,), the first rows common;
-                NaN where a row is missing.
-            seed: Of the draws behind the probabilities.
+        Their first rows are common. The seed is that of the draws behind probabilities.
         """
         longest = max(map(len, contributions))
         generator = torch.Generator().manual_seed(derive_seed(seed, "best"))

@@ -123,7 +123,7 @@ def ascend(
     permitted: Callable[[Tensor], Tensor],
     repulsion: float,
 ) -> Tensor:
-    """Return points that rose from permitted starts, shape (s, dim).
+    """Return points that rose from permitted starts (s, dim), shape (s, dim).
 
     Args:
         score: Of points (s, dim), differentiable in the first entries, shape (s,).
@@ -186,14 +186,8 @@ def _batch(
 
     Each is chosen as if those before had been evaluated: what it may hope for falls
     with the variance that they leave (GP-BUCB). An evaluation beside another, on common
-    random numbers, tells nothing new.
-
-    Args:
-        point: Shape (m, dim).
-        score: With what may be hoped for, shape (m,).
-        covariance: Of the regression, shape (m, m).
-        num: Points to choose.
-        num_continuous: Entries in the unit cube.
+    random numbers, tells nothing new. Of points (m, dim) with scores (m,) that hold
+    what may be hoped for, and the regression's covariance (m, m).
     """
     c, least = num_continuous, 1e-6 * float(covariance.diagonal().amax())
     mean = score - OPTIMISM * covariance.diagonal().clamp_min(0.0).sqrt()

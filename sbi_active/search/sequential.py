@@ -114,11 +114,7 @@ class SequentialSearch(Search):
 def permitted_points(
     objective: Objective, coordinates: Coordinates, num: int, key: str
 ) -> Tensor:
-    """Return permitted points that fill the space, shape (num, dim).
-
-    Raises:
-        ValueError: If no more than a few of many are permitted.
-    """
+    """Return permitted points that fill the space, shape (num, dim)."""
     seed = derive_seed(objective.seed, key)
     point = coordinates.spread(num, seed)
     inside = objective.permitted(coordinates.actions(point))
@@ -138,14 +134,9 @@ def permitted_points(
 def spaced(
     point: Tensor, score: Tensor, num: int, *, num_continuous: int, apart: float
 ) -> Tensor:
-    """Return indices of the best points that are not close to better ones.
+    """Return indices of the best points (n, dim) that are not close to better ones.
 
-    Args:
-        point: Shape (n, dim).
-        score: Shape (n,).
-        num: At most so many.
-        num_continuous: Entries in the unit cube; points of other categories are apart.
-        apart: Least distance in the unit cube.
+    Points of other categories, the entries after the continuous ones, are apart.
     """
     chosen: list[int] = []
     for i in score.argsort(descending=True).tolist():

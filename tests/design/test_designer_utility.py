@@ -15,6 +15,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.design.choice import choose
+from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.simulation import Simulations
 from tests.design.test_designer import ACTIONS, VALUES
@@ -124,13 +125,14 @@ def test_chance_in_proportion_to_a_power_of_the_utility():
         notes=(),
     )
 
+    limits = DesignLimits(ACTIONS, None, torch.empty(0, 1))
+
     def share(exponent, num=1_000):
         chosen = torch.zeros(4).double()
         for seed in range(num):
             design = choose(
                 estimates,
-                ACTIONS,
-                cost=None,
+                limits,
                 exponent=exponent,
                 estimator="EntropyGain",
                 bound="none",

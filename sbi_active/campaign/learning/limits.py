@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.design.choice import pricing
-from sbi_active.design.eligibility import Permission
+from sbi_active.design.eligibility import DesignLimits
 
 __all__ = ["Limits"]
 
@@ -58,7 +58,7 @@ class Limits:
         if self.constraint is None and exclude is None:
             return self.actions
         none = torch.empty(0, self.actions.action_dim)
-        allowed = Permission(
+        allowed = DesignLimits(
             self.actions, self.constraint, none if exclude is None else exclude
         )
         values, _ = allowed.listed()

@@ -28,6 +28,14 @@ __all__ = [
     "require_width",
 ]
 
+#: Draws behind moments and a chained belief's normalizer: a hundredth of a deviation.
+NUM_DRAWS = 20_000
+#: Below this share of q inside the support, rejection is too wasteful.
+MINIMAL_ACCEPTANCE = 1e-3
+#: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
+FEWEST_STEPS = 64
+NUM_COMPARED = 5_000  # draws behind a realized information gain
+
 
 class Belief(Distribution, ABC):
     r"""Distribution over the parameters after zero or more trials.
@@ -74,14 +82,7 @@ class Belief(Distribution, ABC):
             return self._sample(shape.numel()).float().reshape(*shape, -1)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density; -inf outside the support.
-
-        Args:
-            value: Shape (..., theta_dim).
-
-        Returns:
-            Shape (...), float32.
-        """
+        """Return the log density, (..., theta_dim) -> (...); -inf off the support."""
         theta = torch.as_tensor(value, dtype=torch.float32)
         rows = theta.reshape(-1, theta.shape[-1])
         inside = within_support(self.prior, rows)
@@ -89,13 +90,9 @@ class Belief(Distribution, ABC):
         return log_prob.reshape(theta.shape[:-1])
 
     def smooth_log_prob(self, value: Tensor) -> Tensor:
-        """Return a log density that costs no simulations, for many places.
+        """Return a log density that costs no simulations, for many places (..., d).
 
-        Args:
-            value: Shape (..., theta_dim).
-
-        Returns:
-            Shape (...), float32; :meth:`log_prob` but for beliefs that simulate that.
+        It is :meth:`log_prob` but for beliefs that simulate that.
         """
         theta = torch.as_tensor(value, dtype=torch.float32)
         rows = theta.reshape(-1, theta.shape[-1])
@@ -109,7 +106,7 @@ class Belief(Distribution, ABC):
     @cached_property
     def _moments(self) -> tuple[Tensor, Tensor]:
         with forked_generators(0):  # the same belief, the same moments
-            draws = self.sample((20_000,)).double()
+            draws = self.sample((NUM_DRAWS,)).double()
         return draws.mean(0).float(), draws.var(0).float()
 
     @property
@@ -142,7 +139,6 @@ class ChainedBelief(Belief):
         condition: The observed (x_o, action), shape (1, condition_dim).
         prior: The original prior.
         previous: The belief before the trial.
-        num_samples: Draws behind the normalizer Z.
     """
 
     label = "chained approximation"
@@ -153,14 +149,12 @@ class ChainedBelief(Belief):
         condition: Tensor,
         prior: Distribution,
         previous: Distribution,
-        *,
-        num_samples: int = 20_000,
     ) -> None:
         super().__init__(prior)
         self._estimator = estimator.eval()
         self._condition = condition
         with torch.no_grad():
-            draws = estimator.sample(torch.Size([num_samples]), condition)[:, 0]
+            draws = estimator.sample(torch.Size([NUM_DRAWS]), condition)[:, 0]
             inside = within_support(prior, draws)
         acceptance = float(inside.double().mean())
         self.diagnostics = self.diagnostics.extended(mass_inside_prior=acceptance)
@@ -168,7 +162,7 @@ class ChainedBelief(Belief):
         if acceptance >= MINIMAL_ACCEPTANCE:
             self._log_normalizer = torch.tensor(acceptance).log()
         else:
-            self._resample(previous, num_samples)
+            self._resample(previous)
             warnings.warn(
                 f"only {acceptance:.2%} of the network's posterior lies within the "
                 "prior's support: the observation is unlike those simulated, or the "
@@ -177,15 +171,14 @@ class ChainedBelief(Belief):
                 stacklevel=4,
             )
 
-    def _resample(self, previous: Distribution, num_samples: int) -> None:
+    def _resample(self, previous: Distribution) -> None:
         """Represent the belief by weighted draws of the one before."""
-        draws = previous.sample((num_samples,))
+        draws = previous.sample((NUM_DRAWS,))
         log_q = self._log_density(draws)
         log_weight = log_q - previous.log_prob(draws)
-        self._log_normalizer = (
-            torch.logsumexp(log_weight, 0) - torch.tensor(float(num_samples)).log()
-        )
-        index = torch.multinomial(log_weight.softmax(0), num_samples, replacement=True)
+        log_number = torch.tensor(float(NUM_DRAWS)).log()
+        self._log_normalizer = torch.logsumexp(log_weight, 0) - log_number
+        index = torch.multinomial(log_weight.softmax(0), NUM_DRAWS, replacement=True)
         self._particles = draws[index]
 
     def _sample(self, num_samples: int) -> Tensor:
@@ -210,17 +203,8 @@ class ChainedBelief(Belief):
             return self._estimator.log_prob(theta[:, None], self._condition)[:, 0]
 
 
-#: Below this share of q inside the support, rejection is too wasteful.
-MINIMAL_ACCEPTANCE = 1e-3
-
-
 class UnchangedBelief(Belief):
-    """The belief before a trial that the network knows nothing of.
-
-    Args:
-        prior: The original prior.
-        previous: The belief before the trial.
-    """
+    """The belief before a trial that the network knows nothing of."""
 
     label = "unchanged"
 
@@ -236,22 +220,18 @@ class UnchangedBelief(Belief):
 
 
 def information_gained(
-    belief: Distribution, previous: Distribution, *, num_samples: int = 5_000, seed: int
+    belief: Distribution, previous: Distribution, *, seed: int
 ) -> float:
     r"""Return the realized information gain of a trial in nats.
 
     .. math::
         \mathrm{KL}(b \,\|\, p) \approx \frac{1}{n} \sum_i \log b(\theta_i)
-        - \log p(\theta_i), \qquad \theta_i \sim b.
+        - \log p(\theta_i), \qquad \theta_i \sim b,
 
-    Args:
-        belief: After the trial.
-        previous: Before it.
-        num_samples: Draws n.
-        seed: Of the draws.
+    with b the belief after the trial and p the one before.
     """
     with forked_generators(seed):
-        theta = belief.sample((num_samples,))
+        theta = belief.sample((NUM_COMPARED,))
     after, before = (
         getattr(b, "smooth_log_prob", b.log_prob)(theta) for b in (belief, previous)
     )
@@ -288,10 +268,6 @@ def require_support(prior: Distribution | None) -> Distribution:
     return prior
 
 
-#: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
-FEWEST_STEPS = 64
-
-
 def require_width(
     prior: Distribution, names: Sequence[str] | None = None, *, seed: int
 ) -> None:
@@ -299,12 +275,8 @@ def require_width(
 
     Args:
         prior: Of the parameters.
-        names: Of the parameters.
+        names: Of the parameters, for the error.
         seed: Of some draws.
-
-    Raises:
-        ValueError: If draws of a parameter are not in the support, or too few steps of
-            float32 apart.
     """
     with forked_generators(seed):
         draws = prior.sample(torch.Size([256])).reshape(256, -1).float()

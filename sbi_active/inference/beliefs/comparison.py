@@ -13,11 +13,10 @@ TOLERANCE = 0.5
 ORDER_TOLERANCE = 0.2
 #: No density in float32 is further below another than this.
 FLOOR = -60.0
+NUM_DRAWS = 2_000  # of each belief, whose mean is then known to .02 nat a parameter
 
 
-def compare(
-    refined: Belief, chained: ChainedBelief, *, num_samples: int = 2_000
-) -> None:
+def compare(refined: Belief, chained: ChainedBelief) -> None:
     r"""Add figures on the network's belief to the refined belief's diagnostics.
 
     A network can pass a calibration test and be nats blunter than the data allow, since
@@ -28,17 +27,12 @@ def compare(
         \mathrm{bluntness} = H(c) - H(r).
 
     A loss with a positive bluntness is under-confidence; a loss without it is
-    overconfidence or a wrong place. The loss is bounded by 60 nats.
-
-    Args:
-        refined: Its ``diagnostics`` gain refined_log_score, chained_log_score,
-            chained_loss, chained_bluntness and, beyond half a nat, a warning.
-        chained: The network's value at the same trial.
-        num_samples: Draws of each.
+    overconfidence or a wrong place. The loss is bounded by 60 nats; beyond half a nat
+    it is a warning.
     """
     with forked_generators(0, "compare"):
-        draws = refined.sample((num_samples,))
-        chained_draws = chained.sample((num_samples,))
+        draws = refined.sample((NUM_DRAWS,))
+        chained_draws = chained.sample((NUM_DRAWS,))
     refined_score = float(refined.log_prob(draws).double().mean())
     chained_log_prob = chained.log_prob(draws).double()
     score = float(chained_log_prob.clamp_min(refined_score + FLOOR).mean())
@@ -62,22 +56,18 @@ def compare(
     )
 
 
-def compare_orders(belief: Belief, other: Belief, *, num_samples: int = 2_000) -> None:
+def compare_orders(belief: Belief, other: Belief) -> None:
     r"""Add the divergence from a second refinement to a belief's diagnostics.
 
     .. math::
         \mathrm{KL}(b \,\|\, b') = E_b[\log b(\theta) - \log b'(\theta)],
 
-    with b' from the trials in another order and other simulations. The likelihood is
-    a product over trials, so anything beyond Monte Carlo error is an error.
-
-    Args:
-        belief: Its ``diagnostics`` gain order_swap_kl and, beyond .2 nat, a warning.
-        other: Of the same trials.
-        num_samples: Draws.
+    with b' from the trials in another order and other simulations. The likelihood is a
+    product over trials, so anything beyond Monte Carlo error is an error; beyond .2 nat
+    it is a warning.
     """
     with forked_generators(0, "orders"):
-        draws = belief.sample((num_samples,))
+        draws = belief.sample((NUM_DRAWS,))
     difference = (belief.log_prob(draws) - other.log_prob(draws)).double()
     divergence = float(difference.clamp_max(-FLOOR).mean())
     spent = belief.diagnostics.num_simulations + other.diagnostics.num_simulations

@@ -70,11 +70,7 @@ class Diagnostics:
         return replace(self, **own, figures={**self.figures, **further})
 
     def warned(self, *texts: str) -> Diagnostics:
-        """Return these with further warnings, no longer trustworthy if there are any.
-
-        Args:
-            *texts: A sentence each.
-        """
+        """Return these with further warnings, no longer trustworthy with any."""
         if not texts:
             return self
         return replace(self, trustworthy=False, warnings=(*self.warnings, *texts))

@@ -12,13 +12,10 @@ __all__ = ["ParticleDraws"]
 
 
 class ParticleDraws(Distribution):
-    """Parameters out of a finite set, each as likely.
+    """Parameters out of a finite set (p, theta_dim), each as likely.
 
     It has no density, only probabilities, so it is a belief to design with and none to
     train under.
-
-    Args:
-        particles: Shape (p, theta_dim).
     """
 
     arg_constraints = {}  # pyright: ignore

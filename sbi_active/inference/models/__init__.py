@@ -4,8 +4,7 @@ Here live posteriors, likelihoods and ratios. Beliefs, which have seen a trial, 
 ``beliefs``.
 """
 
-from sbi_active.inference.models.action_likelihood import ActionLikelihood
-from sbi_active.inference.models.action_ratio import ActionRatio
+from sbi_active.inference.models.factors import ActionLikelihood, ActionRatio
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.posterior import ActionPosterior
 

@@ -98,9 +98,6 @@ class LFIRE:
             own: Summaries of its outcomes, shape (n, q).
             marginal: Summaries of outcomes of the belief, shape (m, q).
             seed: Of the folds.
-
-        Raises:
-            ValueError: If there are too few rows for the folds.
         """
         fewest = FEWEST * self.num_folds
         if min(len(own), len(marginal)) < fewest:

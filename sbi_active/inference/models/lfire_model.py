@@ -43,18 +43,12 @@ class LFIREModel:
         return ParticleDraws(self.particles)
 
     def log_ratio(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        r"""Return :math:`\log p(x_i | \theta_i, \xi_i) / p(x_i | \xi_i)` row by row.
+        r"""Return :math:`\log p(x_i | \theta_i, \xi_i) / p(x_i | \xi_i)`, float64 (n,).
 
         Args:
             theta: Particles, shape (n, theta_dim).
             x: Shape (n, *x_shape); NaN where there was no measurement.
             action: Simulated ones, shape (n, action_dim).
-
-        Returns:
-            Shape (n,), float64.
-
-        Raises:
-            ValueError: If theta is no particle or the action was not simulated.
         """
         particle = _places(theta, self.particles, "theta", "particles")
         place = _places(action, self.action, "action", "simulated actions")
@@ -81,13 +75,8 @@ def fit_log_ratios(
 ) -> LFIREModel:
     """Fit the log ratio of every particle at every action.
 
-    Args:
-        settings: Of the regressions.
-        parts: Rows in which each particle occurs several times at each action.
-        seed: Of folds and of the marginal's rows.
-
-    Raises:
-        ValueError: If a particle has too few rows.
+    Each particle occurs several times at each action in the rows of all parts together;
+    the seed is that of folds and of the marginal's rows.
     """
     theta = torch.cat([part.theta for part in parts])
     x = torch.cat([part.x for part in parts])

@@ -84,16 +84,13 @@ class ActionPosterior:
         action: Tensor | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """Return draws given each of several outcomes.
+        """Return draws given each of b outcomes, shape (*sample_shape, b, theta_dim).
 
         Args:
             sample_shape: Any shape.
             x: Shape (b, *x_shape).
             action: Shape (b, action_dim), or (action_dim,) for all.
             kwargs: Passed to sbi's ``sample_batched``.
-
-        Returns:
-            Shape (*sample_shape, b, theta_dim).
         """
         kwargs.setdefault("show_progress_bars", False)
         posterior, condition = self._given(x, action)
@@ -128,16 +125,13 @@ class ActionPosterior:
         action: Tensor | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """Return log densities given each of several outcomes.
+        """Return log densities given each of several outcomes, shape (n, b).
 
         Args:
             theta: Shape (n, b, theta_dim).
             x: Shape (b, *x_shape).
             action: Shape (b, action_dim), or (action_dim,) for all.
             kwargs: Passed to sbi's ``log_prob_batched``.
-
-        Returns:
-            Shape (n, b).
         """
         self._direct()
         posterior, condition = self._given(x, action)
@@ -160,7 +154,7 @@ class ActionPosterior:
         return deepcopy(posterior).set_default_x(condition).map(**kwargs)
 
     def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        r"""Return :math:`\log q(\theta_i | x_i, \xi_i)` row by row.
+        r"""Return :math:`\log q(\theta_i | x_i, \xi_i)` row by row, shape (n,).
 
         Without leakage correction, which a bound on the information does not need.
 
@@ -168,9 +162,6 @@ class ActionPosterior:
             theta: Shape (n, theta_dim).
             x: Shape (n, *x_shape); NaN where there was no measurement.
             action: Shape (n, action_dim).
-
-        Returns:
-            Shape (n,).
         """
         condition = self._condition(x, action)
         return self._direct().posterior_estimator.log_prob(
@@ -182,11 +173,7 @@ class ActionPosterior:
         return self._packed
 
     def at(self, action: Tensor) -> DirectPosterior:
-        """Return sbi's own posterior over x at one action, for its diagnostics.
-
-        Args:
-            action: Shape (action_dim,) or (1, action_dim).
-        """
+        """Return sbi's posterior over x at an action (action_dim,), for diagnostics."""
         direct = self._direct()
         row = action_rows(action, self.action_dim, num_rows=1)
         estimator = _AtAction(direct.posterior_estimator, row, self.x_shape)
@@ -244,12 +231,7 @@ class ActionPosterior:
 
 
 class _Rewritten(ConditionalDensityEstimator):
-    """A packed estimator whose condition is made from another one.
-
-    Args:
-        packed: Takes packed (x, action).
-        condition_shape: Of what is given instead.
-    """
+    """A packed estimator whose condition is made from another one."""
 
     def __init__(
         self, packed: ConditionalDensityEstimator, condition_shape: torch.Size

@@ -10,7 +10,7 @@ from torch import Tensor
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.response import Response
 
-__all__ = ["Baseline", "Frames"]
+__all__ = ["Baseline", "Frames", "precision_factor"]
 
 BLOCK = 4_096  # rows held in memory at once
 NUM_CENTERS = 32
@@ -100,7 +100,7 @@ class Baseline(Response):
             misfit = misfit + 0.5 * (gradient * (mean - start)).sum(-1)
         else:
             mean, misfit, precision = self._minimize(y, beta)
-        factor = _cholesky(precision).mT
+        factor = precision_factor(precision).mT
         if self.residual_scaling is not None:
             location, scale = self.residual_scaling.location_and_scale(action)
             location = location[:, None, :, None]
@@ -166,7 +166,7 @@ class Baseline(Response):
         return misfit, gradient, eye + jacobian @ jacobian.mT
 
 
-def _cholesky(precision: Tensor) -> Tensor:
+def precision_factor(precision: Tensor) -> Tensor:
     """Return the lower factor of I + J J^T, which rounding may have made indefinite.
 
     That happens where noise is extrapolated to nearly nothing; a share of the largest

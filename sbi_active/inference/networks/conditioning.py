@@ -12,13 +12,23 @@ from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
 from sbi_active.inference.networks.response import STRAIGHT
 
-__all__ = ["BaselineKind", "Conditioning", "covariance_factor", "scale_of"]
+__all__ = [
+    "MAX_OUTCOMES",
+    "MIN_ROWS",
+    "BaselineKind",
+    "Conditioning",
+    "covariance_factor",
+    "log_normal",
+    "scale_of",
+    "whitened",
+]
 
 BaselineKind = Literal["none", "linear", "curved"]
 
-MAX_OUTCOMES = 32  # numbers in x beyond which no regression on the action is tried
-MIN_ROWS = 40
-LARGEST_MISFIT = 20.0
+#: Numbers in x beyond which no regression is tried: each has coefficients of its own.
+MAX_OUTCOMES = 32
+MIN_ROWS = 40  # with a measurement, of which a fifth is held out
+LARGEST_MISFIT = 20.0  # nats, beyond which a frame has no part in the posterior
 KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
 #: Nats by which a baseline must beat the simpler one: its frames and what the network
 #: sees of them are more to overfit.
@@ -114,7 +124,7 @@ class Conditioning(nn.Module):
         test = held_out(len(u))
         best = -math.inf
         if baseline == "best":
-            best = self.scores["none"] = float(_log_normal(u[test]).mean())
+            best = self.scores["none"] = float(log_normal(u[test]).mean())
         for kind in KINDS if baseline == "best" else (baseline,):
             bends = self.baseline is None or self.baseline.bend(u, y, action) > STRAIGHT
             if kind == "curved" and baseline == "best" and not bends:
@@ -133,10 +143,7 @@ class Conditioning(nn.Module):
 
     def whiten(self, theta: Tensor) -> Tensor:
         """Return u, (..., d) -> (..., d)."""
-        step = (theta.double() - self.theta_mean)[..., None]
-        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
-            ..., 0
-        ]
+        return whitened(theta.double() - self.theta_mean, self.theta_factor)
 
     def unwhiten(self, u: Tensor) -> Tensor:
         """Return theta, the inverse of :meth:`whiten`."""
@@ -192,13 +199,19 @@ def _with_global(frames: Frames) -> Frames:
     )
 
 
-def _log_normal(u: Tensor) -> Tensor:
+def whitened(step: Tensor, factor: Tensor) -> Tensor:
+    """Return steps (..., d) in units of a lower factor (d, d) of their covariance."""
+    return torch.linalg.solve_triangular(factor, step[..., None], upper=False)[..., 0]
+
+
+def log_normal(u: Tensor) -> Tensor:
+    """Return the log density of the standard normal, (..., d) -> (...)."""
     return -0.5 * u.square().sum(-1) - 0.5 * u.shape[-1] * math.log(2 * math.pi)
 
 
 def _log_mixture(u: Tensor, frames: Frames) -> Tensor:
     """Log density of the local frames, equally weighted, with 1 % of the global one."""
-    log_density = frames.log_det + _log_normal(local(u, frames))
+    log_density = frames.log_det + log_normal(local(u, frames))
     weight = torch.full((log_density.shape[1],), 0.99 / (log_density.shape[1] - 1))
     weight[-1] = 0.01
     return (log_density + weight.to(u).log()).logsumexp(-1)

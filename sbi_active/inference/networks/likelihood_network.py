@@ -11,15 +11,19 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
+from sbi_active.inference.networks.conditioning import (
+    MAX_OUTCOMES,
+    MIN_ROWS,
+    covariance_factor,
+    log_normal,
+    scale_of,
+    whitened,
+)
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.response import Response, exceeds_chance
 from sbi_active.inference.networks.validity_network import ValidityNetwork
 
 __all__ = ["LikelihoodNetwork"]
-
-MAX_OUTCOMES = 32  # numbers in x beyond which no regression is tried
-MIN_ROWS = 40
 
 
 class LikelihoodNetwork(ConditionalDensityEstimator):
@@ -98,28 +102,18 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return nn.Identity()
 
     def residual_rows(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the mixture is trained on: residuals and its conditions.
-
-        Args:
-            x: Outcomes, shape (n, x_dim); rows without a measurement are left out.
-            condition: Shape (n, condition_dim).
-        """
+        """Return what the mixture is trained on: residuals and their conditions."""
         valid = _valid(x)
         with torch.no_grad():
             z, _ = self._standardize(x[valid].double(), condition[valid])
             return z.float(), self._see(condition[valid])
 
     def choose(self, residual: Tensor, seen: Tensor) -> None:
-        """Take the standard normal density unless the mixture predicts better.
-
-        Args:
-            residual: Held-out, of :meth:`residual_rows`, shape (n, x_dim).
-            seen: Shape (n, p).
-        """
+        """Take the standard normal density unless the mixture does better held out."""
         if self.response is None or not len(residual):
             return
         with torch.no_grad():
-            gain = -self.mixture.loss(residual, seen) - _log_normal(residual)
+            gain = -self.mixture.loss(residual, seen) - log_normal(residual)
             self.is_gaussian.fill_(not exceeds_chance(gain.double()))
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
@@ -127,15 +121,12 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return -self._log_density(input[None], condition)[0]
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
-        """Return log q(input | condition).
+        """Return log q(input | condition), shape (sample_dim, batch_dim), float32.
 
         Args:
             input: Shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
             condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
             kwargs: Not used.
-
-        Returns:
-            Shape (sample_dim, batch_dim), float32.
         """
         self._check_condition_shape(condition)
         self._check_input_shape(input)
@@ -178,7 +169,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         z, log_det = self._standardize(known, condition)
         z, seen = z.to(torch.float32), self._see(condition)
         if bool(self.is_gaussian):
-            log_density = _log_normal(z)
+            log_density = log_normal(z)
         else:
             log_density = self.mixture.log_prob(z, seen)
         log_density = log_density + log_det.to(log_density)
@@ -212,15 +203,8 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return torch.cat([self._whiten(theta), action], 1).float()
 
     def _whiten(self, theta: Tensor) -> Tensor:
-        step = (theta - self.theta_mean)[..., None]
-        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
-            ..., 0
-        ]
+        return whitened(theta - self.theta_mean, self.theta_factor)
 
 
 def _valid(x: Tensor) -> Tensor:
     return x.isfinite().all(-1)
-
-
-def _log_normal(z: Tensor) -> Tensor:
-    return -0.5 * z.square().sum(-1) - 0.5 * z.shape[-1] * math.log(2 * math.pi)

@@ -102,27 +102,21 @@ class MixtureDensity:
         )
 
     def __call__(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:
-        """Build the network, its scales taken from the rows.
+        """Build the network on rows standardized number by number, as in sbi.
 
         Args:
             theta: Shape (n, theta_dim).
             x: Packed conditions, shape (n, condition_dim); NaN where a simulation gave
                 no measurement.
-
-        Returns:
-            A network on rows standardized number by number, as in sbi.
         """
         return self.build(theta, x, None)
 
     def build(
         self, theta: Tensor, condition: Tensor, action_dim: int | None
     ) -> MixtureDensityNetwork:
-        """Build the network, knowing which numbers of the condition are the action.
+        """Build the network, knowing how many numbers at the end are the action.
 
-        Args:
-            theta: Shape (n, theta_dim).
-            condition: Packed (x, action), shape (n, x_dim + action_dim).
-            action_dim: Numbers in an action; None leaves them unknown.
+        Theta (n, theta_dim) and packed (x, action), shape (n, x_dim + action_dim).
         """
         return MixtureDensityNetwork(
             theta,

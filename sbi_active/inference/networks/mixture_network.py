@@ -143,13 +143,10 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return self._embedding
 
     def knows(self, condition: Tensor) -> bool:
-        """Return whether training rows lacked what conditions lack.
+        """Return whether training rows lacked what conditions (n, c) lack.
 
         Each number that is missing must have been so in some row, and as many as are
         missing must have been so at once.
-
-        Args:
-            condition: Shape (n, condition_dim).
         """
         missing = ~condition.isfinite().cpu()
         unheard = missing & ~self._ever_missing
@@ -178,15 +175,12 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return -self._log_density(input, condition)
 
     def log_prob(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
-        """Return log q(input | condition).
+        """Return log q(input | condition), shape (sample_dim, batch_dim).
 
         Args:
             input: Shape (sample_dim, batch_dim, theta_dim) or (batch_dim, theta_dim).
             condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
             kwargs: Not used.
-
-        Returns:
-            Shape (sample_dim, batch_dim).
         """
         self._check_condition_shape(condition)
         self._check_input_shape(input)
@@ -279,11 +273,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return torch.cat([z, mask], -1), frames
 
     def _mixture(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the mixture's parameters.
-
-        Logits (n, K), means and log-diagonals (n, K, d), and the factors above their
-        diagonals (n, K, d, d).
-        """
+        """Return logits, means, log-diagonals and factors above them, (n, K, ...)."""
         logits, mean, log_diagonal, upper = self.net(seen).split(self._sections, -1)
         shape = (len(seen), self._num_components, self._dim)
         return (
@@ -297,10 +287,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
 class PreparedLoss(nn.Module):
     """The loss of a network on rows that went through its conditioning once.
 
-    Training visits a row several times, and only the layers change between visits.
-
-    Args:
-        network: With a conditioning and without an embedding net.
+    Training visits a row several times, and only the layers change between visits. The
+    network has a conditioning and no embedding net.
     """
 
     def __init__(self, network: MixtureDensityNetwork) -> None:

@@ -9,13 +9,17 @@ from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor, nn
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.conditioning import covariance_factor, scale_of
+from sbi_active.inference.networks.conditioning import (
+    MAX_OUTCOMES,
+    MIN_ROWS,
+    covariance_factor,
+    scale_of,
+    whitened,
+)
 from sbi_active.inference.networks.response import Response
 
 __all__ = ["RatioClassifier", "RatioNetwork"]
 
-MAX_OUTCOMES = 32  # numbers in x beyond which no regression is tried
-MIN_ROWS = 40
 FAR = 4.0  # noise deviations, beyond which a residual is squashed
 
 
@@ -125,15 +129,7 @@ class RatioNetwork(RatioEstimator):
             self.x_scaling = ActionScaling(y, action[valid])
 
     def unnormalized_log_ratio(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return log ratios.
-
-        Args:
-            theta: Shape (..., theta_dim).
-            x: Packed (x, action), shape (..., x_dim + action_dim).
-
-        Returns:
-            Shape (...), float32.
-        """
+        """Return log ratios of theta (..., d) and packed (x, action) (..., c)."""
         shape = self._get_shape_prefix(theta, x)
         rows = theta.reshape(-1, theta.shape[-1]), x.reshape(-1, x.shape[-1])
         return self._log_ratio(*rows).reshape(shape)
@@ -160,7 +156,4 @@ class RatioNetwork(RatioEstimator):
         return torch.where(valid, base, 0.0).float() + correction
 
     def _whiten(self, theta: Tensor) -> Tensor:
-        step = (theta - self.theta_mean)[..., None]
-        return torch.linalg.solve_triangular(self.theta_factor, step, upper=False)[
-            ..., 0
-        ]
+        return whitened(theta - self.theta_mean, self.theta_factor)

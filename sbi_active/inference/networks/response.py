@@ -113,11 +113,6 @@ class Response(nn.Module):
 
         The curved one has many more coefficients to be wrong about, so what it gains
         must be beyond chance.
-
-        Args:
-            u: As in the class.
-            y: As in the class.
-            action: As in the class.
         """
         linear = Response(u, y, action, kind="linear")
         if linear.bend(u, y, action) <= STRAIGHT:
@@ -131,12 +126,8 @@ class Response(nn.Module):
     def weights(self, action: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return what makes the noise of an action standard normal, and f's weights.
 
-        Args:
-            action: Shape (n, action_dim).
-
-        Returns:
-            A root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
-            :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).
+        A root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
+        :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).
         """
         phi = self.action_basis(action)
         log_sigma = phi[:, : len(self.gamma)] @ self.gamma
@@ -152,16 +143,7 @@ class Response(nn.Module):
     def standardize(
         self, u: Tensor, y: Tensor, action: Tensor
     ) -> tuple[Tensor, Tensor]:
-        r"""Return residuals in units of the noise and :math:`\log |dz / dy|`.
-
-        Args:
-            u: Shape (n, d).
-            y: Shape (n, m).
-            action: Shape (n, action_dim).
-
-        Returns:
-            Shapes (n, m) and (n,).
-        """
+        """Return residuals over the noise (n, m) and their log |dz / dy| (n,)."""
         mean, whitener = self.mean_and_whitener(u, action)
         z = (whitener @ (y - mean)[..., None])[..., 0]
         return z, whitener.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -173,13 +155,7 @@ class Response(nn.Module):
         return log_det - 0.5 * z.square().sum(1) - constant
 
     def bend(self, u: Tensor, y: Tensor, action: Tensor) -> float:
-        """Return the fraction of the held-out residual that u's powers explain.
-
-        Args:
-            u: Shape (n, d), as in the fit.
-            y: Shape (n, m), as in the fit.
-            action: Shape (n, action_dim), as in the fit.
-        """
+        """Return the fraction of the held-out residual that u's powers explain."""
         test = held_out(len(u))
         phi = self.action_basis(action)
         predicted = torch.einsum(

@@ -67,12 +67,7 @@ class MarkovChainBelief(Belief):
 
 
 class ProductPotential(BasePotential):
-    """Log prior plus the log factors of all trials, as sbi's samplers take it.
-
-    Args:
-        prior: The original prior.
-        factors: The learned likelihood of all trials.
-    """
+    """Log prior plus the log factors of all trials, as sbi's samplers take it."""
 
     def __init__(self, prior: Distribution, factors: Product) -> None:
         super().__init__(prior)

@@ -65,17 +65,11 @@ class TrainedRegion:
 def widened(
     z: Array, num_samples: int, coordinates: PriorCoordinates, rng: np.random.Generator
 ) -> Array:
-    """Return draws spread up to twice as wide as a belief, within the support.
+    """Return draws spread up to twice as wide as those of a belief, within the support.
 
     A belief may be off by as much as it is wide; a likelihood can be learned from
-    parameters of any distribution. Each component of a Gaussian mixture is doubled, so
-    that modes stay apart.
-
-    Args:
-        z: Draws of the belief, coordinates of shape (n, d).
-        num_samples: How many to return.
-        coordinates: Of the prior.
-        rng: Source of randomness.
+    parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
+    d), is doubled, so that modes stay apart.
     """
     mixture = GaussianMixture.fit(z[:NUM_FITTED], NUM_COMPONENTS, rng)
     factor = mixture.factor[mixture.assign(z)]

@@ -45,7 +45,7 @@ Array = NDArray[Any]
 NEGLIGIBLE = 25.0  # nats below the best draw, beyond which a draw is given up
 FEWEST = 60.0  # effective draws, below which the likelihood is tempered
 BROAD = 150.0  # effective draws that shape the wide half of a proposal
-MAX_STAGES = 40
+MAX_STAGES = 40  # the budget ends sooner unless draws repeat, which cost nothing
 
 
 @dataclass

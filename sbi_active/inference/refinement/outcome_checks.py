@@ -26,16 +26,10 @@ def check_outcomes(
     r"""Return a belief's diagnostics with figures on trials without a measurement.
 
     ``probability_of_outcome`` is :math:`E_b[P(\text{as observed} | \theta)]` of each
-    trial. Near zero, the trial did what simulations near the belief do not do: the
-    simulator lacks a way of failing, or a fault was told as "invalid". The assumption
-    "outcomes_followed" compares repeated simulations: where those agree and the
-    regression expects them to differ, it misses an edge.
-
-    Args:
-        diagnostics: Without them.
-        surrogate: The final one.
-        draws: Of the belief, shape (n, d).
-        pool: All simulations.
+    trial, over draws of the belief (n, d). Near zero, the trial did what simulations
+    near the belief do not do: the simulator lacks a way of failing, or a fault was told
+    as "invalid". The assumption "outcomes_followed" compares repeated simulations:
+    where those agree and the regression expects them to differ, it misses an edge.
     """
     share = pool.agrees.mean(0) if len(pool) else np.ones(0)
     # A trial in which simulations all agree, or none does, was not regressed.

@@ -49,12 +49,9 @@ def expected_error(
 ) -> float:
     """Return the expected divergence from the belief of endless simulations, in nats.
 
-    Args:
-        surrogate: The likelihood.
-        draws: Of the belief, shape (n, d).
-        rng: Source of the coefficients' errors.
-        explained: Whether observations that lie further out than simulations are moved
-            to where those lie, so that the error is that of the simulations alone.
+    Over draws of the belief (n, d). Where they shall be ``explained``, observations
+    that lie further out than simulations are moved to where those lie, so that the
+    error is that of the simulations alone.
     """
     draws = draws[:: max(len(draws) // NUM_PLACES, 1)]
     label = surrogate.assign(draws)
@@ -75,16 +72,8 @@ def widened(
 ) -> tuple[Surrogate, float]:
     """Return the surrogate of more distant simulations that agree, which errs least.
 
-    Args:
-        histories: All simulations.
-        surrogate: Of those in its regions.
-        error: Its expected error in nats.
-        draws: Of its belief, shape (n, d).
-        rng: Source of randomness.
-
-    Returns:
-        The surrogate, or the one given, and what it may err beyond its expected error,
-        in nats, as it differs from the one given by more than that one's error.
+    Beside it, what it may err beyond its expected error, in nats, as it differs from
+    the one given by more than that one's error. Draws of its belief have shape (n, d).
     """
     best, least, bias = surrogate, error, 0.0
     # The difference from a better surrogate is chi-squared, of as many degrees as there

@@ -98,15 +98,8 @@ def refine_exactly(
 ) -> SimulatedBelief | None:
     """Return the posterior by importance sampling; None where too few draws count.
 
-    Args:
-        prior: The original prior.
-        likelihood: Of all trials.
-        coordinates: Of the prior.
-        first: Numbers of draws and proposals to begin with, where there is no pool.
-        histories: Simulated before, for the record.
-        pool: Draws of the first of these trials.
-        settings: Budget, draws, and the prior's share in the belief.
-        seed: Of everything random here.
+    It begins at the pool of the first of these trials, or at the ``first`` numbers of
+    draws and proposals. Histories simulated before are kept for the record.
     """
     table = likelihood.table
     before = table.num_simulations, table.num_missing
@@ -137,7 +130,7 @@ def refine_exactly(
             f"{num_missing} of {num_simulations} simulations of the refinement are "
             "missing, by faults of the simulator; their draws were left out",
             MissingRowsWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     return belief
 

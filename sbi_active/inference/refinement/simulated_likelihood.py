@@ -22,7 +22,7 @@ Array = NDArray[Any]
 
 BATCH = 64  # rows a call: the same ones whatever the number of workers
 DEEP = 30.0  # nats below the peak that count as any more do
-FORGETTING = 0.3
+FORGETTING = 0.3  # share of the latest call in the mean that orders trials
 
 
 def declares_noise(
@@ -30,10 +30,7 @@ def declares_noise(
 ) -> TypeGuard[SimulatorModel]:
     """Return whether the simulator is a noise-free function beside positive noise.
 
-    Args:
-        simulator: Any simulator.
-        theta: A few parameters to try, shape (n, d).
-        action: Actions, shape (n, action_dim).
+    It is tried at a few parameters (n, d) and actions (n, action_dim).
     """
     if not isinstance(simulator, SimulatorModel) or simulator.noise is None:
         return False
@@ -43,11 +40,7 @@ def declares_noise(
 
 
 class MeanTable:
-    """Noise-free outcomes of a simulator, each simulated once.
-
-    Args:
-        simulator: With declared noise.
-        workers: Of the simulations.
+    """Noise-free outcomes of a simulator with declared noise, each simulated once.
 
     Attributes:
         num_simulations: Rows simulated so far.
@@ -64,12 +57,8 @@ class MeanTable:
     def mean(self, theta: Tensor, action: Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return noise-free outcomes at one action, and which rows are lost to faults.
 
-        Args:
-            theta: Shape (n, d), float32.
-            action: Shape (action_dim,), float32.
-
-        Returns:
-            Shapes (n, *x_shape), NaN where there is no measurement, and (n,).
+        Float32 parameters (n, d) and action (action_dim,) give shapes (n, *x_shape),
+        NaN where there is no measurement, and (n,).
         """
 
         def simulated(rows: NDArray[np.int64]) -> list[Array | None]:

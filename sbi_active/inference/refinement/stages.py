@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,13 +35,12 @@ from sbi_active.inference.refinement.trust import (
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import (
     PriorProposal,
-    Region,
     RegionsProposal,
     around,
     cover,
     whole_space,
 )
-from sbi_active.inference.regression.surrogate import Surrogate
+from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import (
@@ -51,6 +50,7 @@ from sbi_active.inference.sampling.population import (
 from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.outcomes import MissingRowsWarning
 from sbi_active.threads import single_thread
 
@@ -60,6 +60,7 @@ Array = NDArray[Any]
 
 HALF = 0.5  # of the budget, after which misfit is taken to stay
 MANY = 6  # parameters beyond which each covariance needs more particles
+MOST_FORCED = 32  # regions that split misfit, as many as the options allow
 MIN_STAGE = 60  # histories below which another stage adds nothing; more by dimension
 
 
@@ -132,6 +133,7 @@ def refine(
     action, outcome = _trials(action, x)
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
+    task = _Task(simulator, prior, action, outcome, [*hints], settings)
     with single_thread():
         belief = None
         if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
@@ -147,237 +149,239 @@ def refine(
                 seed=seed,
             )
         if belief is None:
-            belief = _refine(
-                simulator, prior, action, outcome, hints, past, settings, seed
-            )
+            belief = _Stages(task, past, seed).run()
         if settings.check_order and isinstance(belief, LearnedBelief):
-            other_seed = derive_seed(seed, "reversed")
-            other = _refine(
-                simulator,
-                prior,
-                action.flip(0),
-                outcome.flip(0),
-                hints,
-                None,
-                settings,
-                other_seed,
+            other = replace(task, action=action.flip(0), outcome=outcome.flip(0))
+            compare_orders(
+                belief, _Stages(other, None, derive_seed(seed, "reversed")).run()
             )
-            compare_orders(belief, other)
     return belief
 
 
-def _refine(
-    simulator: Callable[..., Any],
-    prior: Distribution,
-    action: Tensor,
-    outcome: Tensor,
-    hints: Sequence[Distribution],
-    past: HistoryRecord | None,
-    settings: RefinementOptions,
-    seed: int,
-) -> LearnedBelief | SimulatedBelief:
-    rng = np.random.default_rng(derive_seed(seed, "refine"))
-    coordinates = PriorCoordinates(prior, rng)
-    observed, workers = outcome.numpy().reshape(len(outcome), -1), settings.workers
-    histories = Histories(simulator, action, observed, coordinates, seed, past, workers)
+@dataclass(frozen=True)
+class _Task:
+    """What is to be refined, as in :func:`refine`."""
 
-    regions = [whole_space(coordinates.dim)]
-    for hint in hints:
-        with forked_generators(derive_seed(seed, "start")):
-            draws = coordinates.to_z(hint.sample(torch.Size([1_000])).float())
-        regions.append(around(draws[coordinates.inside(draws)]))
-    base: Proposal = PriorProposal(coordinates)
-    first: Proposal | None = None
-    course = Course()
-    num_forced = 1
-    least = max(MIN_STAGE, 2 * (coordinates.dim + 21))
-    while True:
-        stage_size = _stage_size(settings, histories.num_drawn, least)
-        _simulate_stage(histories, regions, stage_size, settings, rng)
-        next_size = _stage_size(settings, histories.num_drawn, least)
-        is_last = next_size < least
-        fits = [histories.regress(region) for region in regions]
-        regressions = [fit for fit in fits if fit is not None]
-        if not regressions:
-            # It is not the outcomes that lack.
-            if 2 * histories.valid.sum() > len(histories.valid):
-                raise ValueError(
-                    f"expected at least {least} histories for {coordinates.dim} "
-                    f"parameters; got {histories.num_drawn}; raise num_histories"
-                )
-            raise UnexplainedOutcomeError(
-                "expected simulations with a measurement, since trials had one; got "
-                f"none or NaN in {histories.num_drawn - int(histories.valid.sum())} of "
-                f"{histories.num_drawn} histories; do check the simulator at the "
-                "executed actions, or the prior"
-            )
-        surrogate = Surrogate(coordinates, regressions, not is_last)
-        stage = _sampled(surrogate, base, first, settings, rng)
-        if stage.error > SMALL and len(course.stages) > 0:
-            stage = _with_more(stage, histories, base, settings, rng)
-        regressions, particles = stage.surrogate.regressions, stage.particles
-        course.append(stage)
-        if is_last or course.is_settled:
-            break
-        is_rough = stage.excess > SERIOUS_MISFIT
-        if is_rough and histories.num_drawn >= HALF * settings.num_histories:
-            few = coordinates.to_theta(stage.draws[:8])
-            if declares_noise(simulator, few, action[:1].expand(8, -1)):
-                break
-        num_forced = (
-            min(2 * max(num_forced, len(regions)), 32)
-            if (course.is_stuck)
-            else max(1, num_forced // 2)
+    simulator: Callable[..., Any]
+    prior: Distribution
+    action: Tensor
+    outcome: Tensor
+    hints: list[Distribution]
+    settings: RefinementOptions
+
+    def jumps(self, stage: Stage) -> bool:
+        """Return whether misfit is serious and the likelihood can be simulated."""
+        if stage.excess <= SERIOUS_MISFIT:
+            return False
+        few = stage.surrogate.coordinates.to_theta(stage.draws[:8])
+        return declares_noise(self.simulator, few, self.action[:1].expand(8, -1))
+
+
+class _Stages:
+    """The stages of one refinement: propose, simulate, fit, sample, judge."""
+
+    def __init__(self, task: _Task, past: HistoryRecord | None, seed: int) -> None:
+        self.task, self.settings, self.seed = task, task.settings, seed
+        self.rng = np.random.default_rng(derive_seed(seed, "refine"))
+        self.coordinates = PriorCoordinates(task.prior, self.rng)
+        observed = task.outcome.numpy().reshape(len(task.outcome), -1)
+        self.histories = Histories(
+            *(task.simulator, task.action, observed, self.coordinates),
+            *(seed, past, self.settings.workers),
         )
-        limit = max(1, int(next_size / (1.2 * (coordinates.dim + 21))))
-        regions = cover(
-            particles,
-            rng,
-            min_regions=min(num_forced, limit),
-            max_regions=min(max(settings.max_regions, num_forced), limit),
+        self.regions = [whole_space(self.coordinates.dim)]
+        for hint in task.hints:
+            with forked_generators(derive_seed(seed, "start")):
+                draws = hint.sample(torch.Size([1_000])).float()
+            z = self.coordinates.to_z(draws)
+            self.regions.append(around(z[self.coordinates.inside(z)]))
+        self.base: Proposal = PriorProposal(self.coordinates)
+        self.first: Proposal | None = None
+        self.course, self.num_forced = Course(), 1
+        self.least = max(MIN_STAGE, 2 * fewest_rows(self.coordinates.dim))
+
+    def run(self) -> LearnedBelief | SimulatedBelief:
+        while True:
+            self._simulate(self._size())
+            next_size = self._size()
+            is_last = next_size < self.least
+            fitted = self._fit(is_cautious=not is_last)
+            stage = self._sample(fitted, self.first)
+            if stage.error > SMALL and self.course.stages:
+                stage = self._with_more(stage)
+            self.course.append(stage)
+            enough = self.histories.num_drawn >= HALF * self.settings.num_histories
+            is_settled = is_last or self.course.is_settled
+            if is_settled or (enough and self.task.jumps(stage)):
+                break
+            self._propose(stage, next_size)
+        exact = self._simulated(stage) if self.task.jumps(stage) else None
+        return self._learned(stage, fitted) if exact is None else exact
+
+    def _size(self) -> int:
+        """Return the histories of the next stage."""
+        settings, used = self.settings, self.histories.num_drawn
+        share = settings.first_share if used == 0 else settings.stage_share
+        size = max(int(share * settings.num_histories), self.least)
+        left = settings.num_histories - used
+        # A remainder too small for a stage of its own goes to the one before.
+        return left if left < size + self.least else size
+
+    def _propose(self, stage: Stage, size: int) -> None:
+        """Put the next stage's regions around what is still plausible."""
+        many = 2 * max(self.num_forced, len(self.regions))
+        fewer = max(1, self.num_forced // 2)
+        self.num_forced = min(many, MOST_FORCED) if self.course.is_stuck else fewer
+        limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
+        self.regions = cover(
+            stage.particles,
+            self.rng,
+            min_regions=min(self.num_forced, limit),
+            max_regions=min(max(self.settings.max_regions, self.num_forced), limit),
             generous=stage.excess < 3,
         )
-        base = RegionsProposal(regions)
-        points, line = particles.resample(800, rng), _unbounding(coordinates)
-        first = StudentProposal.fit(points, 6, base, rng, line)
+        self.base = RegionsProposal(self.regions)
+        points = stage.particles.resample(800, self.rng)
+        line = _unbounding(self.coordinates)
+        self.first = StudentProposal.fit(points, 6, self.base, self.rng, line)
 
-    if stage.excess > SERIOUS_MISFIT:
-        few = coordinates.to_theta(stage.draws[:8])
-        if declares_noise(simulator, few, action[:1].expand(8, -1)):
-            table = MeanTable(simulator, workers)
-            count = settings.num_histories // 4
-            exact = refine_exactly(
-                prior,
-                SimulatedLikelihood(table, action, outcome),
-                coordinates,
-                first=[
-                    (count, PriorProposal(coordinates)),
-                    (count, particles.proposal),
-                ],
-                histories=histories.record(),
-                pool=None,
-                settings=settings,
-                seed=seed,
+    def _simulate(self, size: int) -> None:
+        """Bring the stage's regions to their numbers, past histories first."""
+        histories, regions = self.histories, self.regions
+        is_first = histories.num_drawn == 0
+        num_places = size - max(int(self.settings.replicate_share * size), 12)
+        shares = np.full(len(regions), 1 / len(regions))
+        if is_first and len(regions) > 2:  # the overview keeps half of the stage
+            shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
+        bounds = num_places * np.concatenate([[0.0], shares.cumsum()])
+        counts = np.diff(np.round(bounds, 6).astype(int))
+        for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
+            # The first stage's first region is the whole space, seen from the prior.
+            is_overview = is_first and k == 0
+            before = len(histories) - len(histories.second)
+            histories.reuse(region, int(count), is_overview=is_overview)
+            missing = int(count) - (len(histories) - len(histories.second) - before)
+            if missing <= 0:
+                continue
+            z = region.sample_inside(missing, self.coordinates, self.rng)
+            z = self.rng.permutation(z)
+            if len(z) == 0:  # it lies beside the support, as of an outcome far away
+                z = self.coordinates.sample_prior(missing, self.rng)
+            num_replicates = missing * (size - num_places) // num_places
+            histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
+
+    def _fit(self, *, is_cautious: bool) -> Surrogate:
+        """Return the regressions of the regions that have simulations enough."""
+        histories = self.histories
+        fits = [histories.regress(region) for region in self.regions]
+        regressions = [fit for fit in fits if fit is not None]
+        if regressions:
+            return Surrogate(self.coordinates, regressions, is_cautious)
+        num_valid, num = int(histories.valid.sum()), histories.num_drawn
+        if 2 * num_valid > len(histories.valid):  # it is not the outcomes that lack
+            raise ValueError(
+                f"expected at least {self.least} histories for "
+                f"{self.coordinates.dim} parameters; got {num}; raise num_histories"
             )
-            if exact is not None:
-                spent = exact.diagnostics.num_simulations + histories.num_simulations
-                exact.diagnostics = exact.diagnostics.extended(num_simulations=spent)
-                return exact
-
-    diagnostics = diagnose(
-        course,
-        num_simulations=histories.num_simulations,
-        share_invalid=histories.share_invalid,
-        num_trials=len(action),
-        rng=rng,
-    )
-    diagnostics = check_outcomes(diagnostics, surrogate, stage.draws, histories)
-    # The residuals have served the diagnostics and would only weigh on the pickle.
-    empty = np.zeros((0, observed.size))
-    slim = [replace(r, residual=empty, standardized=empty) for r in regressions]
-    surrogate = Surrogate(coordinates, slim)
-    belief = LearnedBelief(prior, surrogate, particles, defensive=settings.defensive)
-    belief.diagnostics = diagnostics
-    belief.histories = histories.record()
-    if histories.num_missing:
-        warnings.warn(
-            f"{histories.num_missing} of {histories.num_simulations} simulations of "
-            "the refinement are missing, by faults of the simulator; the histories "
-            "they belong to were left out",
-            MissingRowsWarning,
-            stacklevel=3,
-        )
-    return belief
-
-
-def _stage_size(settings: RefinementOptions, used: int, least: int) -> int:
-    share = settings.first_share if used == 0 else settings.stage_share
-    size = max(int(share * settings.num_histories), least)
-    left = settings.num_histories - used
-    # A remainder too small for a stage of its own goes to the one before.
-    return left if left < size + least else size
-
-
-def _sampled(
-    surrogate: Surrogate,
-    base: Proposal,
-    first: Proposal | None,
-    settings: RefinementOptions,
-    rng: np.random.Generator,
-) -> Stage:
-    """Return the stage of a surrogate, its density sampled.
-
-    Raises:
-        UnexplainedOutcomeError: If no parameters have a likelihood.
-    """
-    many = max(1.0, surrogate.coordinates.dim / MANY)
-    num_components = 6 if len(surrogate.regressions) <= 4 else 10
-    particles, _ = population_monte_carlo(
-        surrogate.log_joint,
-        base,
-        rng,
-        num_particles=int(many * settings.num_particles),
-        first=first,
-        num_components=num_components if many == 1 else num_components // 2,
-        unbounding=_unbounding(surrogate.coordinates),
-    )
-    if not np.isfinite(particles.log_normalizer):
         raise UnexplainedOutcomeError(
-            "expected outcomes that some parameters may explain; got none with a "
-            "likelihood; correct the outcome, or leave the trial out"
+            "expected simulations with a measurement, since trials had one; got none "
+            f"or NaN in {num - num_valid} of {num} histories; check the simulator at "
+            "the executed actions, or the prior"
         )
-    return Stage.of(surrogate, particles, settings.defensive, rng)
+
+    def _sample(self, surrogate: Surrogate, first: Proposal | None) -> Stage:
+        """Return the stage of a surrogate, its density sampled."""
+        many = max(1.0, self.coordinates.dim / MANY)
+        num_components = 6 if len(surrogate.regressions) <= 4 else 10
+        particles, _ = population_monte_carlo(
+            surrogate.log_joint,
+            self.base,
+            self.rng,
+            num_particles=int(many * self.settings.num_particles),
+            first=first,
+            num_components=num_components if many == 1 else num_components // 2,
+            unbounding=_unbounding(self.coordinates),
+        )
+        if not np.isfinite(particles.log_normalizer):
+            raise UnexplainedOutcomeError(
+                "expected outcomes that some parameters may explain; got none with a "
+                "likelihood; correct the outcome, or leave the trial out"
+            )
+        return Stage.of(surrogate, particles, self.settings.defensive, self.rng)
+
+    def _with_more(self, stage: Stage) -> Stage:
+        """Return the stage with simulations from further off, where they are of use."""
+        surrogate, bias = widened(
+            self.histories, stage.surrogate, stage.error, stage.draws, self.rng
+        )
+        if surrogate is stage.surrogate:
+            return stage
+        wide = self._sample(surrogate, stage.particles.proposal)
+        return replace(wide, error=wide.error + bias)
+
+    def _simulated(self, stage: Stage) -> SimulatedBelief | None:
+        """Return the belief of the likelihood itself; None where few draws count."""
+        task, count = self.task, self.settings.num_histories // 4
+        assert isinstance(task.simulator, SimulatorModel)
+        table = MeanTable(task.simulator, self.settings.workers)
+        prior = PriorProposal(self.coordinates)
+        exact = refine_exactly(
+            task.prior,
+            SimulatedLikelihood(table, task.action, task.outcome),
+            self.coordinates,
+            first=[(count, prior), (count, stage.particles.proposal)],
+            histories=self.histories.record(),
+            pool=None,
+            settings=self.settings,
+            seed=self.seed,
+        )
+        if exact is not None:
+            spent = exact.diagnostics.num_simulations + self.histories.num_simulations
+            exact.diagnostics = exact.diagnostics.extended(num_simulations=spent)
+        return exact
+
+    def _learned(self, stage: Stage, fitted: Surrogate) -> LearnedBelief:
+        """Return the belief of the last stage, and judge it.
+
+        Measurements are judged by what was fitted before simulations from further off.
+        """
+        histories = self.histories
+        diagnostics = diagnose(
+            self.course,
+            num_simulations=histories.num_simulations,
+            share_invalid=histories.share_invalid,
+            num_trials=len(self.task.action),
+            rng=self.rng,
+        )
+        # The residuals have served the diagnostics and would only weigh on the pickle.
+        empty = np.zeros((0, len(histories.used)))
+        slim = [
+            replace(fit, residual=empty, standardized=empty)
+            for fit in stage.surrogate.regressions
+        ]
+        belief = LearnedBelief(
+            self.task.prior,
+            Surrogate(self.coordinates, slim),
+            stage.particles,
+            defensive=self.settings.defensive,
+        )
+        belief.diagnostics = check_outcomes(diagnostics, fitted, stage.draws, histories)
+        belief.histories = histories.record()
+        if histories.num_missing:
+            warnings.warn(
+                f"{histories.num_missing} of {histories.num_simulations} simulations "
+                "of the refinement are missing, by faults of the simulator; the "
+                "histories they belong to were left out",
+                MissingRowsWarning,
+                stacklevel=4,
+            )
+        return belief
 
 
 def _unbounding(coordinates: PriorCoordinates) -> Unbounding | None:
     """Return the map to where edges are no concern, which a few edges are not."""
     is_needed = coordinates.bounded.sum() > MANY
     return Unbounding(coordinates.bounded) if is_needed else None
-
-
-def _with_more(
-    stage: Stage,
-    histories: Histories,
-    base: Proposal,
-    settings: RefinementOptions,
-    rng: np.random.Generator,
-) -> Stage:
-    """Return the stage with simulations from further off, where they are of use."""
-    surrogate, bias = widened(histories, stage.surrogate, stage.error, stage.draws, rng)
-    if surrogate is stage.surrogate:
-        return stage
-    wide = _sampled(surrogate, base, stage.particles.proposal, settings, rng)
-    return replace(wide, error=wide.error + bias)
-
-
-def _simulate_stage(
-    histories: Histories,
-    regions: list[Region],
-    size: int,
-    settings: RefinementOptions,
-    rng: np.random.Generator,
-) -> None:
-    """Bring a stage's regions to their numbers, past histories first."""
-    is_first = histories.num_drawn == 0
-    num_places = size - max(int(settings.replicate_share * size), 12)
-    shares = np.full(len(regions), 1 / len(regions))
-    if is_first and len(regions) > 2:  # the overview keeps half of the stage
-        shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
-    bounds = num_places * np.concatenate([[0.0], shares.cumsum()])
-    counts = np.diff(np.round(bounds, 6).astype(int))
-    for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
-        # The first stage's first region is the whole space, seen from the prior.
-        is_overview = is_first and k == 0
-        before = len(histories) - len(histories.second)
-        histories.reuse(region, int(count), is_overview=is_overview)
-        missing = int(count) - (len(histories) - len(histories.second) - before)
-        if missing <= 0:
-            continue
-        z = rng.permutation(region.sample_inside(missing, histories.coordinates, rng))
-        if len(z) == 0:  # it lies beside the support, as of an outcome far away
-            z = histories.coordinates.sample_prior(missing, rng)
-        num_replicates = missing * (size - num_places) // num_places
-        histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
 
 
 def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

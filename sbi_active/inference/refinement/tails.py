@@ -25,13 +25,8 @@ def tail_probability(
         P\big(D(x, \theta) \ge D(x_o, \theta)\big), \quad \theta \sim b,\;
         x \sim p(x | \theta), \quad D = |L^{-1} (x - B^\top f)|^2,
 
-    a trial and for all trials. The simulations' x are their residuals by a fit without
-    them, since reality was not fitted to either.
-
-    Args:
-        surrogate: With the residuals of its regressions.
-        draws: From the belief b, in the prior's coordinates, shape (m, d).
-        num_trials: Trials t.
+    a trial and for all trials, with draws (m, d) of the belief b. The simulations' x
+    are their residuals by a fit without them, since reality was not fitted to either.
 
     References:
         Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
@@ -57,8 +52,8 @@ def tail_probability(
 def _exceedance(known: Array, value: Array) -> Array:
     r"""Return the probability that a further draw is as large, shape (m,).
 
-    Among n draws it is a rank. Ranks end at 1 / (n + 1), so that beyond the largest k
-    the excess y over a threshold is taken for generalized Pareto,
+    Among n known draws it is a rank. Ranks end at 1 / (n + 1), so that beyond the
+    largest k the excess y over a threshold is taken for generalized Pareto,
 
     .. math::
         P(y) = (1 + \xi y / \bar y)^{-1 / \xi}, \qquad
@@ -66,10 +61,6 @@ def _exceedance(known: Array, value: Array) -> Array:
 
     of their mean and variance. The least :math:`\xi` allows for a mean of k alone,
     exactly so where the tail is exponential.
-
-    Args:
-        known: Draws, shape (n,).
-        value: Shape (m,).
 
     References:
         Hosking & Wallis, Technometrics 1987 (moments); Knijnenburg et al.,

@@ -143,15 +143,7 @@ def diagnose(
     num_trials: int,
     rng: np.random.Generator,
 ) -> Diagnostics:
-    """Return figures about the last stage, its assumptions and warnings in words.
-
-    Args:
-        course: All stages.
-        num_simulations: Rows simulated.
-        share_invalid: Share of histories without a measurement in some trial.
-        num_trials: Trials t.
-        rng: Source of randomness.
-    """
+    """Return figures about the last stage, its assumptions and warnings in words."""
     last = course.stages[-1]
     fits = last.surrogate.regressions
     live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
@@ -252,10 +244,8 @@ def diagnose(
 def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
     """Return warnings of a belief that may be far from the truth.
 
-    Args:
-        tail: Tail probability of each trial.
-        joint: Of all trials.
-        edge_mass: Of the belief, near the edge of one parameter.
+    By the tail probability of each trial and of all, and the belief's mass near the
+    edge of one parameter.
     """
     warnings = []
     if joint < RARE or min(tail) < RARE / len(tail):

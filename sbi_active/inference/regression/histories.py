@@ -14,7 +14,11 @@ from torch import Tensor
 
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
-from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
+from sbi_active.inference.regression.surrogate import (
+    LocalRegression,
+    estimate_noise,
+    fewest_rows,
+)
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.model import require_noise
@@ -127,10 +131,7 @@ class Histories:
     def add(self, z: Array, num_replicates: int, *, is_overview: bool = False) -> None:
         """Simulate at z, shape (n, d), and again at the first few of them.
 
-        Args:
-            z: Coordinates of the parameters.
-            num_replicates: How many of them to simulate twice.
-            is_overview: Whether z is drawn from the whole prior.
+        Overview rows are those drawn from the whole prior.
         """
         theta = self.coordinates.to_theta(np.concatenate([z, z[:num_replicates]]))
         x, present = self._simulate(theta, 0)
@@ -143,14 +144,9 @@ class Histories:
     def reuse(self, region: Region, count: int, *, is_overview: bool = False) -> int:
         """Take past histories in a region, simulated at the further actions only.
 
-        Args:
-            region: Where they must lie.
-            count: How many parameter sets at most.
-            is_overview: Take those drawn from the whole prior instead, so that a first
-                stage keeps its distribution.
-
-        Returns:
-            How many rows were added, replicates included.
+        At most ``count``; for an overview those drawn from the whole prior instead, so
+        that a first stage keeps its distribution. Returns how many rows were added,
+        replicates included.
         """
         past = self._past
         if past is None or count <= 0:
@@ -203,9 +199,7 @@ class Histories:
     def _simulate(self, theta: Tensor, first: int) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes at each theta of the trials from ``first`` on.
 
-        Returns:
-            Outcomes, and which of them were there at the first attempt, both of shape
-            (n, t * q).
+        And which of them were there at the first attempt, both of shape (n, t * q).
         """
         n, t = len(theta), len(self.action) - first
         seed = derive_seed(self.seed, "histories", self.num_simulations)
@@ -236,12 +230,9 @@ class Histories:
         return x, present
 
     def _rows(self, theta: Tensor, trial: Tensor, seed: int) -> Array:
-        """Return one outcome a row, shape (n, q); NaN for no number, LOST for faults.
+        """Return outcomes (n, q) of theta (n, d) at the actions of trials (n,).
 
-        Args:
-            theta: Shape (n, d).
-            trial: Whose action to simulate, shape (n,).
-            seed: Of these rows.
+        NaN stands for no number, LOST for faults.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
@@ -331,7 +322,7 @@ class Histories:
     def regress(self, region: Region) -> LocalRegression | None:
         """Regress the histories in a region, or the nearest where it holds few."""
         distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
-        needed = 2 * (self.coordinates.dim + 21)
+        needed = 2 * fewest_rows(self.coordinates.dim)
         rows = _nearest(np.where(valid, distance, np.inf), needed)
         first, second = np.array(self.first, int), np.array(self.second, int)
         both = valid[first] & valid[second]

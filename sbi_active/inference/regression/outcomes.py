@@ -137,13 +137,8 @@ def outcomes_of(
 ) -> tuple[TrialOutcome, ...]:
     """Return the regressions of trials in a region.
 
-    Args:
-        region: Gives the coordinates.
-        z: Of simulations, shape (n, d).
-        agrees: Whether their outcomes are what was observed, shape (n, t).
-        first: The same of simulations that were repeated, shape (r, t).
-        second: Of their repetitions, shape (r, t).
-        trials: The trials to regress.
+    Simulations z (n, d), whether their outcomes are what was observed (n, t), and the
+    same of simulations that were repeated and of their repetitions, both (r, t).
     """
     known: dict[bytes, TrialOutcome] = {}  # with hard edges, many trials agree
     outcomes = []

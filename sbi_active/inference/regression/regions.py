@@ -33,6 +33,7 @@ COVERED = 0.9997
 SPREAD = 2.2
 #: Nats a dimension that more clusters must save.
 WORTH = 0.1
+NUM_POINTS = 1_000  # particles to cluster
 
 
 @dataclass(frozen=True)
@@ -175,23 +176,15 @@ def cover(
     min_regions: int,
     max_regions: int,
     generous: bool,
-    num_points: int = 1_000,
 ) -> list[Region]:
     """Return ellipsoids around the clusters of a sample.
 
     More clusters are taken only where that makes the sample denser by a factor, since
-    each needs simulations of its own.
-
-    Args:
-        particles: The sample.
-        rng: Source of randomness.
-        min_regions: At least this many clusters, where the sample allows.
-        max_regions: At most this many.
-        generous: Whether to reach four deviations of each cluster; else the ellipsoid
-            just holds its particles, which a surrogate with misfit has spread already.
-        num_points: Particles to cluster.
+    each needs simulations of its own. Generous ones reach four deviations of each
+    cluster; else an ellipsoid just holds its particles, which a surrogate with misfit
+    has spread already.
     """
-    points = particles.resample(num_points, rng)
+    points = particles.resample(NUM_POINTS, rng)
     d = points.shape[1]
     counts = sorted(
         {min(max(k, min_regions), max_regions) for k in (1, 2, 3, 4, 6, 8, min_regions)}

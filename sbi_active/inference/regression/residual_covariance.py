@@ -53,10 +53,10 @@ class ResidualCovariance:
         *,
         independent: bool,
     ) -> ResidualCovariance:
-        """Return the covariance of residuals.
+        """Return the covariance of residuals over their deviations, shape (n, q).
 
         Args:
-            standardized: Residuals over their deviations, shape (n, q).
+            standardized: The residuals.
             deviation: Shape (q,).
             freedom: Rows less coefficients.
             trial: Of each outcome, shape (q,).
@@ -105,11 +105,7 @@ class ResidualCovariance:
 def alike(standardized: Array, freedom: int) -> float:
     r"""Return how many outcomes vary as one, :math:`\sum_{ij} r_{ij}^2 / q`.
 
-    Less what chance adds to it.
-
-    Args:
-        standardized: Residuals over their deviations, shape (n, q).
-        freedom: Rows less coefficients.
+    Less what chance adds to it, of residuals over their deviations, shape (n, q).
     """
     n, q = standardized.shape
     # Both products have the same sum of squares.

@@ -37,11 +37,18 @@ from sbi_active.inference.regression.residual_covariance import (
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
-__all__ = ["LocalRegression", "NoiseEstimate", "Surrogate", "estimate_noise"]
+__all__ = [
+    "LocalRegression",
+    "NoiseEstimate",
+    "Surrogate",
+    "estimate_noise",
+    "fewest_rows",
+]
 
 Array = NDArray[Any]
 
 CAUTION = 2.0  # at least, under misfit
+FREEDOM = 20  # degrees at least, which know a variance to a third
 MISFIT = 1.12  # residual over noise variance above which the basis misses something
 MANY = 6  # parameters beyond which bases without products are tried too
 CHANCE = 0.03  # that the largest ratio is taken for misfit where there is none
@@ -67,10 +74,7 @@ class NoiseEstimate:
 def estimate_noise(first: Array, second: Array, scale: Array) -> NoiseEstimate:
     """Return the noise of pairs of outcomes, each of shape (r, q).
 
-    Args:
-        first: Outcomes.
-        second: Outcomes at the same parameters.
-        scale: Largest size of each outcome, shape (q,), whose rounding is a floor.
+    The rounding of the largest size of each outcome, shape (q,), is a floor.
     """
     variance = 0.5 * ((first - second) ** 2).mean(0)
     return NoiseEstimate(variance + (FLOAT32 * scale) ** 2 + 1e-300, len(first))
@@ -155,7 +159,7 @@ class LocalRegression:
             if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
                 break  # a cubic will do, or another stage makes it do
             p = basis.num_features
-            if n < p + max(20, p // 2):
+            if n < p + max(FREEDOM, p // 2):
                 continue
             features = basis(u)
             ridge = np.diag(np.full(p, 1e-4 if is_wave else 1e-9))
@@ -198,14 +202,7 @@ class LocalRegression:
         )
 
     def whitened(self, z: Array) -> tuple[Array, Array]:
-        """Return the whitened prediction less the observation, and 1 + h.
-
-        Args:
-            z: Shape (n, d).
-
-        Returns:
-            Shapes (n, q) and (n,).
-        """
+        """Return the whitened prediction less the observed (n, q), and 1 + h (n,)."""
         features = self.basis(self.region.scaled(z))
         leverage = ((features @ self.root) ** 2).sum(1)
         return features @ self.coefficient, 1 + leverage
@@ -235,12 +232,7 @@ class LocalRegression:
         return float(max(CAUTION, square.max() / chi2.ppf(0.9, self.used.sum())))
 
     def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
-        """Return the log likelihood of the observation, shape (n,).
-
-        Args:
-            z: Shape (n, d).
-            caution: Factor of the variance.
-        """
+        """Return the log likelihood of the observation, (n, d) -> (n,)."""
         features = self.basis(self.region.scaled(z))
         widening = 1 + ((features @ self.root) ** 2).sum(1)
         q = int(self.used.sum())
@@ -293,6 +285,11 @@ class Surrogate:
         return nearest_region([r.region for r in self.regressions], z)
 
 
+def fewest_rows(dim: int) -> int:
+    """Return the rows that a linear regression on so many parameters takes."""
+    return 1 + dim + FREEDOM
+
+
 def _candidates(dim: int, num_rows: int) -> list[Basis]:
     polynomials = [Basis.polynomial(degree, dim) for degree in (1, 2, 3)]
     if dim > MANY:  # products of two parameters each would need too many rows
@@ -308,17 +305,11 @@ def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
 
 
 def _excess(ratio: Array, num_alike: float, freedom: int, num_pairs: int) -> float:
-    """Return the misfit, residual over noise variance, with chance removed.
+    """Return the misfit, residual over noise variance (q,), with chance removed.
 
-    The mean over outcomes is sharp where all are missed a little, the maximum where
-    one is missed; each less what chance alone reaches: ratios are F distributed and
+    The mean over outcomes is sharp where all are missed a little, the maximum where one
+    is missed; each less what chance alone reaches: ratios are F distributed and
     correlate as the squares of the residuals' correlations.
-
-    Args:
-        ratio: Of the outcomes, shape (q,).
-        num_alike: Outcomes that vary as one, by their correlations.
-        freedom: Rows less coefficients.
-        num_pairs: That the noise is known from.
     """
     q = len(ratio)
     if q == 0:

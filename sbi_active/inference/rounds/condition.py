@@ -18,15 +18,7 @@ __all__ = ["ActionEmbedding", "action_rows", "outcome_rows", "pack", "unpack"]
 
 
 def pack(x: Tensor, action: Tensor) -> Tensor:
-    """Return the condition (x, action).
-
-    Args:
-        x: Outcomes, shape (n, *x_shape).
-        action: Shape (n, action_dim).
-
-    Returns:
-        Shape (n, x_dim + action_dim).
-    """
+    """Return the condition (x, action), (n, *x_shape) and (n, a) -> (n, x_dim + a)."""
     return torch.cat([x.flatten(1), action], dim=-1)
 
 

@@ -6,10 +6,11 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
-__all__ = ["NEVER", "given_arguments", "require_likelihood_loss", "takes"]
+__all__ = ["NEVER", "extends", "given_arguments", "require_likelihood_loss", "takes"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Ours = TypeVar("Ours", bound=Callable[..., Any])
 
 #: As many epochs as sbi's own default allows.
 NEVER = 2**31 - 1
@@ -18,11 +19,7 @@ _NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_at
 
 
 def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
-    """Give a method of ours the signature of sbi's, which is then written once.
-
-    Args:
-        theirs: A method of one of sbi's trainers.
-    """
+    """Give a method of ours the signature of sbi's, which is then written once."""
 
     def decorate(ours: Callable[..., Any]) -> Callable[P, R]:
         ours.__signature__ = inspect.signature(theirs)  # pyright: ignore
@@ -31,17 +28,25 @@ def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, 
     return decorate
 
 
+def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
+    """Give a method the signature of sbi's, with keywords of its own after that."""
+
+    def decorate(ours: Ours) -> Ours:
+        further = inspect.signature(ours).parameters.values()
+        own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
+        known = inspect.signature(theirs).parameters.values()
+        ours.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
+        return ours
+
+    return decorate
+
+
 def given_arguments(
     method: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return by name the arguments that a call of sbi's ``train`` was given.
+    """Return by name the arguments that a call of a method of sbi's was given.
 
     None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
-
-    Args:
-        method: sbi's, bound.
-        args: By position.
-        kwargs: By name.
     """
     given = inspect.signature(method).bind(*args, **kwargs).arguments
     return {
@@ -54,11 +59,7 @@ def given_arguments(
 def require_likelihood_loss(
     method: Callable[..., Any], given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the arguments without those of the losses of several rounds.
-
-    Args:
-        method: ``NPE_C.train``.
-        given: By the caller.
+    """Return arguments without those of the losses of several rounds.
 
     Raises:
         ValueError: If one of these was given another value than its default.

@@ -6,11 +6,7 @@ __all__ = ["scott", "silverman"]
 
 
 def scott(num: float, dim: int) -> float:
-    r"""Return Scott's width, :math:`n^{-1 / (d + 4)}`.
-
-    Args:
-        num: n, the number of draws that count.
-        dim: d.
+    """Return Scott's width, :math:`n^{-1 / (d + 4)}`, of n draws that count.
 
     References:
         Scott, *Multivariate Density Estimation*, 1992.
@@ -22,10 +18,6 @@ def silverman(num: float, dim: int) -> float:
     r"""Return Silverman's width, :math:`(4 / ((d + 2)\, n))^{1 / (d + 4)}`.
 
     It has the least mean integrated squared error where the draws are normal.
-
-    Args:
-        num: n, the number of draws that count.
-        dim: d.
 
     References:
         Silverman, *Density Estimation for Statistics and Data Analysis*, 1986.

@@ -78,12 +78,9 @@ class PriorCoordinates:
         return (finite & inside).numpy()
 
     def pulled_inside(self, center: Array, z: Array, rng: np.random.Generator) -> Array:
-        """Return z, drawn towards a center where bounded axes would be left, (n, d).
+        """Return z (n, d), drawn towards a center where bounded axes would be left.
 
-        Args:
-            center: Within the bounds, shape (d,).
-            z: Shape (n, d).
-            rng: Source of the place on the way, uniform in volume up to the bound.
+        The place on the way is uniform in volume up to the bound.
         """
         step = z - center
         with np.errstate(divide="ignore"):
@@ -120,15 +117,7 @@ class PriorCoordinates:
 
 
 def support_bounds(support: Any, dim: int) -> tuple[Array, Array]:
-    """Return the bounds of each number of a support, infinite where there are none.
-
-    Args:
-        support: A torch constraint.
-        dim: Numbers that it constrains.
-
-    Returns:
-        Lower and upper bounds, shapes (dim,).
-    """
+    """Return the bounds of each number of a torch constraint, shapes (dim,)."""
     if hasattr(support, "base_constraint"):
         return support_bounds(support.base_constraint, dim)
     if hasattr(support, "cseq"):  # constraints.cat

@@ -86,12 +86,7 @@ class KernelProposal(Defended):
 
 @dataclass(frozen=True)
 class EitherProposal(Proposal):
-    """Two proposals, each as likely.
-
-    Attributes:
-        first: One of them.
-        second: The other.
-    """
+    """Two proposals, each as likely."""
 
     first: Proposal
     second: Proposal

@@ -37,6 +37,7 @@ INFLATION = 1.4  # of the covariance of Student components
 SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
 SHARE_OF_STEP = 0.2  # particles that stay effective in a step
 MAX_COMPONENTS = 12
+MAX_STEPS = 40  # four times those that a peak of 1e-8 of the base's volume takes
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
 FITTED = 8  # of them for each number in a covariance
 
@@ -99,13 +100,10 @@ class GaussianMixture:
         *,
         num_iterations: int = 25,
     ) -> GaussianMixture:
-        """Fit by expectation-maximization from seeds spread over the points.
+        """Fit by expectation-maximization from seeds spread over points (n, d).
 
-        Args:
-            points: Shape (n, d); repeated points count as often as they occur.
-            num_components: At most this many; fewer where points are few.
-            rng: Source of the starting points.
-            num_iterations: At most this many.
+        Repeated points count as often as they occur; where points are few, components
+        are fewer.
         """
         center = points.mean(0)
         # A relative floor: a cluster may be 1e-5 of the cloud wide, or one point.
@@ -199,10 +197,7 @@ class WidenedMixture:
 class StudentProposal(Defended):
     """Student mixture over fitted Gaussian components, with a share of a base.
 
-    Args:
-        mixture: The components.
-        base: The defensive proposal.
-        unbounding: Where the components were fitted; None is in z itself.
+    Where there is an unbounding, the components were fitted on its line.
     """
 
     def __init__(
@@ -235,7 +230,6 @@ def population_monte_carlo(
     num_particles: int,
     first: Proposal | None = None,
     num_components: int = 6,
-    max_iterations: int = 40,
     unbounding: Unbounding | None = None,
 ) -> tuple[Particles, int]:
     r"""Sample a density by importance sampling from mixtures fitted to it.
@@ -255,7 +249,6 @@ def population_monte_carlo(
         num_particles: At the last steps; half as many on the way.
         first: A guess at the target to begin with; None begins at the base.
         num_components: Of the fitted mixtures.
-        max_iterations: Steps at most.
         unbounding: Where mixtures are fitted; None is in z itself.
 
     Returns:
@@ -267,7 +260,7 @@ def population_monte_carlo(
     beta, at_target, share = 0.0, 0, SHARE_OF_STEP
     proposal = base if first is None else first
     best: Particles | None = None
-    for step in range(max_iterations):
+    for step in range(MAX_STEPS):
         num = num_particles if beta == 1 or step == 0 else num_particles // 2
         z = proposal.sample(num, rng)
         log_q = proposal.log_prob(z)

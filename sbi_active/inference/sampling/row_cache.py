@@ -18,10 +18,8 @@ class RowCache(Generic[T]):
     """What was simulated once, so that no parameters are simulated twice.
 
     A search returns to its best point, draws of a weighted sample repeat, and rivals
-    that differ in their errors alone ask for the same parameters.
-
-    Args:
-        most: Numbers to keep; beyond that all are forgotten.
+    that differ in their errors alone ask for the same parameters. Beyond ``most``
+    numbers all are forgotten.
     """
 
     def __init__(self, most: float = np.inf) -> None:

@@ -34,15 +34,11 @@ class ActionRounds(ActiveInference):
     round's rows, a network built anew, plain maximum likelihood.
 
     Args:
-        prior: The prior over parameters. Rounds with actions need one with a support.
-        estimator: What is trained: a name or a builder of sbi's, or this library's
-            settings. None is sbi's default without actions and the default settings
-            with them.
-        device: Of the network, for example "cpu" or "cuda".
-        logging_level: As in sbi.
-        summary_writer: As in sbi (deprecated there).
-        tracker: As in sbi; None tracks nothing, so that no folder appears.
-        show_progress_bars: Whether sbi's training loop shows its epochs.
+        args: Of sbi's trainer. Rounds with actions need a prior with a support. What
+            is trained is a name or a builder of sbi's, or this library's settings; None
+            is sbi's default without actions and the default settings with them. Without
+            a tracker nothing is tracked, so that no folder appears.
+        kwargs: Alike, by name.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331.
@@ -50,7 +46,8 @@ class ActionRounds(ActiveInference):
 
     #: This library's settings, the default where actions are given.
     _settings: ClassVar[type]
-    #: sbi's default, and what makes a builder of a name of sbi's.
+    #: sbi's name of the estimator, its default, and what makes a builder of a name.
+    _sbi_name: ClassVar[str]
     _sbi_default: ClassVar[str]
     _sbi_builder: ClassVar[Callable[..., Any]]
 
@@ -63,28 +60,14 @@ class ActionRounds(ActiveInference):
     _prior_masks: list[Tensor]
     _data_round_index: list[int]
 
-    def __init__(
-        self,
-        prior: Distribution | None,
-        estimator: Any,
-        device: str,
-        logging_level: int | str,
-        summary_writer: Any,
-        tracker: Tracker | None,
-        show_progress_bars: bool,
-    ) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        sbi_trainer: Any = super()
+        given = given_arguments(sbi_trainer.__init__, args, kwargs)
+        estimator = given.pop(self._sbi_name, None)
         ours = isinstance(estimator, self._settings)
         sbi_takes = estimator is not None and (callable(estimator) or not ours)
-        sbi_trainer: Any = super()
-        sbi_trainer.__init__(
-            prior,
-            estimator if sbi_takes else self._sbi_default,
-            device,
-            logging_level,
-            summary_writer,
-            tracker,
-            show_progress_bars,
-        )
+        given[self._sbi_name] = estimator if sbi_takes else self._sbi_default
+        sbi_trainer.__init__(**given)
         # A name stays one: the builder that sbi makes of it cannot be pickled.
         self._action_estimator = self._settings() if estimator is None else estimator
         self._trained_round: int | None = None
@@ -170,8 +153,26 @@ class ActionRounds(ActiveInference):
         sbi_trainer: Any = super()
         return sbi_trainer._resolve_estimator(estimator)
 
+    @abstractmethod
+    def _model(self, estimator: Any, *arguments: Any) -> Any:
+        """Return what was learned, of the arguments of ``_create_posterior``."""
+
+    def _create_posterior(
+        self,
+        estimator: Any,
+        prior: Any,
+        sample_with: Any,
+        device: Any,
+        posterior_parameters: Any,
+    ) -> Any:
+        """Return sbi's posterior, with actions this library's model; sbi's hook."""
+        arguments = (estimator, prior, sample_with, device, posterior_parameters)
+        if self.has_actions:
+            return self._model(*arguments)
+        sbi_trainer: Any = super()
+        return sbi_trainer._create_posterior(*arguments)
+
     def _forget_round(self) -> None:
-        """Have the next update do without this round's network."""
         self._trained_round = None
 
     def _is_round(self, action: Tensor | None, belief: Distribution | None) -> bool:
@@ -186,15 +187,11 @@ class ActionRounds(ActiveInference):
                 )
             return True
         if self.has_actions or belief is not None:
+            earlier = "earlier rounds of this trainer have actions"
+            since = earlier if self.has_actions else "belief= was given"
             raise ValueError(
-                "expected action=, since "
-                + (
-                    "belief= was given"
-                    if not self.has_actions
-                    else "earlier rounds of this trainer have actions"
-                )
-                + "; got none; do pass the action of each row, or start a new "
-                "trainer for rounds without actions"
+                f"expected action=, since {since}; got none; pass the action of each "
+                "row, or start a new trainer for rounds without actions"
             )
         return False
 

@@ -8,12 +8,10 @@ import torch
 from sbi.inference import NLE_A
 from sbi.inference.trainers._contracts import TrainConfig
 from sbi.neural_nets import likelihood_nn
-from sbi.sbi_types import Tracker
 from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
-from sbi_active.inference.models.action_likelihood import ActionLikelihood
+from sbi_active.inference.models.factors import ActionLikelihood
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.training import (
@@ -21,12 +19,8 @@ from sbi_active.inference.networks.training import (
     train_mixture_density,
 )
 from sbi_active.inference.rounds.rows import RoundRows
-from sbi_active.inference.rounds.sbi_arguments import takes
-from sbi_active.inference.trainers.mixture_rounds import (
-    DensityEstimator,
-    MixtureRounds,
-    training_budget,
-)
+from sbi_active.inference.rounds.sbi_arguments import extends, takes
+from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 
 __all__ = ["ALHI"]
@@ -55,13 +49,9 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
             regression of x on (theta, action), and a mixture density network on what
             it leaves.
             ``MixtureDensity.faithful()`` is the paper's.
-        device: As in sbi.
-        logging_level: As in sbi.
-        summary_writer: As in sbi (deprecated there).
-        tracker: As in sbi; None tracks nothing.
-        show_progress_bars: As in sbi.
-        posterior: How beliefs are sampled, see
-            :class:`.ProductRounds`; "kde" is the
+        args: Further ones of sbi's; without a tracker nothing is tracked.
+        kwargs: Alike, by name.
+        posterior: How beliefs are sampled, see :class:`.ProductRounds`; "kde" is the
             paper's.
         bandwidth: Of "kde".
 
@@ -87,25 +77,15 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
     _factor = ActionLikelihood
     _sbi_builder = staticmethod(likelihood_nn)
 
+    @extends(NLE_A.__init__)
     def __init__(
         self,
-        prior: Distribution | None = None,
-        density_estimator: DensityEstimator | None = None,
-        device: str = "cpu",
-        logging_level: int | str = "WARNING",
-        summary_writer: Any = None,
-        tracker: Tracker | None = None,
-        show_progress_bars: bool = True,
-        *,
+        *args: Any,
         posterior: str = "importance",
         bandwidth: Bandwidth = "scott",
+        **kwargs: Any,
     ) -> None:
-        super().__init__(
-            *(prior, density_estimator, device, logging_level),
-            *(summary_writer, tracker, show_progress_bars),
-            posterior=posterior,
-            bandwidth=bandwidth,
-        )
+        super().__init__(*args, posterior=posterior, bandwidth=bandwidth, **kwargs)
 
     def _stored(self, rows: RoundRows) -> tuple[Tensor, Tensor]:
         return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1)

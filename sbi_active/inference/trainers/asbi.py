@@ -13,7 +13,6 @@ from sbi.inference.trainers._contracts import TrainConfig
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
 from sbi.neural_nets import posterior_nn
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
-from sbi.sbi_types import Tracker
 from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
@@ -38,11 +37,7 @@ from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
 from sbi_active.inference.trainers.base import Told
-from sbi_active.inference.trainers.mixture_rounds import (
-    DensityEstimator,
-    MixtureRounds,
-    training_budget,
-)
+from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.seeding import forked_generators, kept_generators
 
 __all__ = ["ASBI"]
@@ -83,11 +78,8 @@ class ASBI(MixtureRounds, NPE_C):
         prior: The prior over parameters. Rounds with actions need one with a support.
         density_estimator: An sbi string or builder, or :class:`MixtureDensity`. None is
             sbi's default ("maf") without actions and ``MixtureDensity()`` with them.
-        device: Of the network, for example "cpu" or "cuda".
-        logging_level: As in sbi.
-        summary_writer: As in sbi (deprecated there).
-        tracker: As in sbi; None tracks nothing, so that no folder appears.
-        show_progress_bars: Whether sbi's training loop shows its epochs.
+        args: Further ones of sbi's; without a tracker nothing is tracked.
+        kwargs: Alike, by name.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331; Greenberg et al.,
@@ -112,20 +104,9 @@ class ASBI(MixtureRounds, NPE_C):
     _fused = True
     network_serves = ("start", "diagnostics")
 
-    def __init__(
-        self,
-        prior: Distribution | None = None,
-        density_estimator: DensityEstimator | None = None,
-        device: str = "cpu",
-        logging_level: int | str = "WARNING",
-        summary_writer: Any = None,
-        tracker: Tracker | None = None,
-        show_progress_bars: bool = True,
-    ) -> None:
-        super().__init__(
-            *(prior, density_estimator, device, logging_level),
-            *(summary_writer, tracker, show_progress_bars),
-        )
+    @takes(NPE_C.__init__)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
 
     def append_simulations(
         self,
@@ -222,20 +203,9 @@ class ASBI(MixtureRounds, NPE_C):
         with kept_generators():  # sbi draws from the prior to look at it
             return super()._resolve_prior(prior, sample_with)
 
-    def _create_posterior(
-        self,
-        estimator: Any,
-        prior: Any,
-        sample_with: Any,
-        device: Any,
-        posterior_parameters: Any,
-    ) -> Any:
-        """Return sbi's posterior, with actions an :class:`.ActionPosterior`."""
-        arguments = (estimator, prior, sample_with, device, posterior_parameters)
-        if not self.has_actions:
-            return super()._create_posterior(*arguments)
+    def _model(self, estimator: Any, *arguments: Any) -> ActionPosterior:
         with kept_generators():
-            packed = super()._create_posterior(*arguments)
+            packed = NPE_C._create_posterior(self, estimator, *arguments)
         assert self._action_dim is not None
         assert self._outcome_shape is not None
         return ActionPosterior(packed, self._outcome_shape, self._action_dim)

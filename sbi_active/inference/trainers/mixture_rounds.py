@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from sbi.inference.trainers._contracts import LossArgs, TrainConfig
-from sbi.neural_nets.estimators.base import (
-    ConditionalDensityEstimator,
-    ConditionalEstimatorBuilder,
-)
 from torch import Tensor
 from torch.nn import Parameter
 from torch.utils.data import DataLoader
@@ -21,13 +17,7 @@ from sbi_active.inference.networks.training import TrainingBudget, TrainingRecor
 from sbi_active.inference.rounds.sbi_arguments import NEVER
 from sbi_active.inference.trainers.action_rounds import ActionRounds
 
-__all__ = ["DensityEstimator", "MixtureRounds", "training_budget"]
-
-#: What sbi takes where it asks for a density estimator.
-DensityEstimator = (
-    Literal["nsf", "maf", "mdn", "made"]
-    | ConditionalEstimatorBuilder[ConditionalDensityEstimator]
-)
+__all__ = ["MixtureRounds", "training_budget"]
 
 
 class MixtureRounds(ActionRounds):
@@ -38,7 +28,7 @@ class MixtureRounds(ActionRounds):
     """
 
     _settings = MixtureDensity
-    _sbi_default = "maf"
+    _sbi_name, _sbi_default = "density_estimator", "maf"
     _action_estimator: Any
     _fused: bool | None = None  # whether Adam is one kernel
 

@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import Belief, require_support
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
-from sbi_active.inference.models.action_factor import ActionFactor
+from sbi_active.inference.models.factors import ActionFactor
 from sbi_active.inference.products.belief import sample_product
 from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, MarkovChainBelief
 from sbi_active.inference.products.product import (
@@ -38,8 +38,8 @@ SAMPLERS = ("importance", "kde", *MARKOV_CHAINS)
 #: Shares of the budget by stage, by what they begin at: this round's network, the
 #: belief before, or the prior.
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
-NUM_KERNELS = 2_000
-NUM_HINTS = 1_000
+NUM_KERNELS = 2_000  # draws behind a kernel density estimate
+NUM_HINTS = 1_000  # rows that the importance sampling begins around
 NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 
 
@@ -61,12 +61,13 @@ class ProductRounds(ActionRounds):
     two stages or, from the prior, four; the options' ``num_histories`` is their sum.
 
     Args:
-        arguments: Of :class:`.ActionRounds`.
+        args: Of :class:`.ActionRounds`.
         posterior: How the belief is sampled: "importance", annealed importance
             sampling; one of sbi's Markov chains, for example "slice_np_vectorized" or
             "nuts_pyro"; or "kde", the paper's: draws of the belief before times the
             last trial's factor, as a kernel density estimate.
         bandwidth: Of "kde", see :class:`.KernelBelief`.
+        kwargs: Of :class:`.ActionRounds`.
 
     References:
         Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
@@ -78,17 +79,14 @@ class ProductRounds(ActionRounds):
     _factor: ClassVar[type[ActionFactor]]
 
     def __init__(
-        self,
-        *arguments: Any,
-        posterior: str,
-        bandwidth: Bandwidth,
+        self, *args: Any, posterior: str, bandwidth: Bandwidth, **kwargs: Any
     ) -> None:
         if posterior not in SAMPLERS:
             raise ValueError(
                 f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
                 f"{posterior!r}; do choose one of these"
             )
-        super().__init__(*arguments)
+        super().__init__(*args, **kwargs)
         self._sampler = posterior
         self._bandwidth: Bandwidth = bandwidth
 
@@ -144,23 +142,7 @@ class ProductRounds(ActionRounds):
             theta, x, action, belief, exclude_invalid_x, data_device
         )
 
-    def _create_posterior(
-        self,
-        estimator: Any,
-        prior: Any,
-        sample_with: Any,
-        device: Any,
-        posterior_parameters: Any,
-    ) -> Any:
-        """Return sbi's posterior, with actions what was learned of a trial."""
-        if self.has_actions:
-            return self._learned(estimator)
-        sbi_trainer: Any = super()
-        return sbi_trainer._create_posterior(
-            estimator, prior, sample_with, device, posterior_parameters
-        )
-
-    def _learned(self, estimator: Any) -> ActionFactor:
+    def _model(self, estimator: Any, *arguments: Any) -> ActionFactor:
         assert self._outcome_shape is not None
         assert self._action_dim is not None
         return self._factor(
@@ -272,7 +254,7 @@ class ProductRounds(ActionRounds):
             hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
         chained = self._sampler == "kde"
         self._require_trained()
-        learned = self._learned(deepcopy(self._neural_net))
+        learned = self._model(deepcopy(self._neural_net))
         used = trials[-1:] if chained else trials
         counted = [t for t in used if _says_something(learned, t, prior)]
         product = Product(

@@ -8,21 +8,16 @@ from typing import Any
 from sbi.inference import NRE_B, NRE_C
 from sbi.inference.trainers.nre.nre_base import RatioEstimatorTrainer
 from sbi.neural_nets import classifier_nn
-from sbi.neural_nets.estimators.base import ConditionalEstimatorBuilder
 from sbi.neural_nets.ratio_estimators import RatioEstimator
-from sbi.sbi_types import Tracker
 from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
-from sbi_active.inference.models.action_ratio import ActionRatio
+from sbi_active.inference.models.factors import ActionRatio
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
-from sbi_active.inference.rounds.sbi_arguments import takes
+from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 
 __all__ = ["SeqBED_B", "SeqBED_C"]
-
-Classifier = str | ConditionalEstimatorBuilder[RatioEstimator] | RatioClassifier
 
 HELD_OUT = 0.1  # share of the rows, sbi's default
 
@@ -47,41 +42,27 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
         prior: The prior over parameters. Rounds with actions need one with a support.
         classifier: An sbi string or builder, or :class:`RatioClassifier`. None is sbi's
             default ("resnet") without actions and ``RatioClassifier()`` with them.
-        device: As in sbi.
-        logging_level: As in sbi.
-        summary_writer: As in sbi (deprecated there).
-        tracker: As in sbi; None tracks nothing.
-        show_progress_bars: As in sbi.
-        posterior: How beliefs are sampled, see
-            :class:`.ProductRounds`.
+        args: Further ones of sbi's; without a tracker nothing is tracked.
+        kwargs: Alike, by name.
+        posterior: How beliefs are sampled, see :class:`.ProductRounds`.
         bandwidth: Of "kde".
     """
 
     _factor = ActionRatio
     _settings = RatioClassifier
-    _sbi_default = "resnet"
+    _sbi_name, _sbi_default = "classifier", "resnet"
     _sbi_builder = staticmethod(classifier_nn)
     _action_estimator: Any
 
+    @extends(RatioEstimatorTrainer.__init__)
     def __init__(
         self,
-        prior: Distribution | None = None,
-        classifier: Classifier | None = None,
-        device: str = "cpu",
-        logging_level: int | str = "warning",
-        summary_writer: Any = None,
-        tracker: Tracker | None = None,
-        show_progress_bars: bool = True,
-        *,
+        *args: Any,
         posterior: str = "importance",
         bandwidth: Bandwidth = "scott",
+        **kwargs: Any,
     ) -> None:
-        super().__init__(
-            *(prior, classifier, device, logging_level),
-            *(summary_writer, tracker, show_progress_bars),
-            posterior=posterior,
-            bandwidth=bandwidth,
-        )
+        super().__init__(*args, posterior=posterior, bandwidth=bandwidth, **kwargs)
 
     def _network(self, theta: Tensor, x: Tensor) -> RatioNetwork:
         assert self._action_dim is not None

@@ -150,9 +150,6 @@ class SeqBED(ActiveInference):
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             action: Shape (n, action_dim).
             belief: The distribution of the particles; None is the current belief.
-
-        Raises:
-            ValueError: If there are no actions, or shapes do not fit.
         """
         if action is None:
             raise ValueError(
@@ -208,7 +205,6 @@ class SeqBED(ActiveInference):
         return self._model
 
     def _forget_round(self) -> None:
-        """Have the next update do without what was learned in this round."""
         self._model, self._rows = None, []
 
     def _infer(self, told: Told) -> Belief:

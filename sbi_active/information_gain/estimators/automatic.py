@@ -73,19 +73,12 @@ def choose_estimator(
 ) -> tuple[InformationGainEstimator, list[str]]:
     """Return the first estimator whose assumptions pass their checks.
 
-    With declared noise: entropies where x is one number, else nested Monte Carlo.
-    With replicates: entropies for one or two numbers, else nested Monte Carlo on the
+    With declared noise: entropies where x is one number, else nested Monte Carlo. With
+    replicates: entropies for one or two numbers, else nested Monte Carlo on the
     smoothed outcomes. Where checks fail, what the model can say: the bound of a
     posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
     normalization of it can fool, but the mean log ratio where that is near its largest
-    value.
-
-    Args:
-        model: What was learned, or None.
-        simulations: Of the candidates.
-
-    Returns:
-        The estimator, and why others were not taken.
+    value. Beside it, why others were not taken.
     """
     options: list[InformationGainEstimator] = []
     num_outcomes = simulations.x[0, 0].numel()
@@ -122,15 +115,7 @@ def disagreements(
 ) -> list[str]:
     """Say what an estimate gives to know, and compare it with others that apply.
 
-    Args:
-        estimator: The one used.
-        model: What was learned, or None.
-        simulations: Of the candidates.
-        belief: Density of theta in the simulations.
-        gain: The estimator's contributions, shape (a, n).
-
-    Returns:
-        Short sentences, one a disagreement.
+    In short sentences, one a disagreement, by the estimator's contributions (a, n).
     """
     others: list[InformationGainEstimator] = []
     num_outcomes = simulations.x[0, 0].numel()

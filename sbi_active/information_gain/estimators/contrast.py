@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -59,14 +60,9 @@ class Contrast(InformationGainEstimator):
 
     @abstractmethod
     def _terms(self, own: Tensor, contrastive: Tensor) -> Tensor:
-        """Return the log likelihoods whose mean is the evidence.
+        """Return the log likelihoods whose mean is the evidence, (n, L) or (n, L + 1).
 
-        Args:
-            own: log q(x_i | theta_i), shape (n,).
-            contrastive: log q(x_i | theta'_l), shape (n, L).
-
-        Returns:
-            Shape (n, L) or, with the own one in front, (n, L + 1).
+        Of log q(x_i | theta_i), shape (n,), and log q(x_i | theta'_l), shape (n, L).
         """
 
     def _contributions(
@@ -126,17 +122,18 @@ def log_mean(terms: Tensor) -> Tensor:
     return terms.logsumexp(1) - math.log(terms.shape[1])
 
 
-def near_limit(gain: Tensor, limit: float) -> Tensor:
-    """Return where estimates are near a limit or above it.
+def near_limit(gain: Tensor, limits: Sequence[float], text: str) -> list[str]:
+    """Return a caution where estimates are near a limit or above it; none elsewhere.
 
     Args:
         gain: Contributions, shape (a, n).
-        limit: Nats.
-
-    Returns:
-        Shape (a,), bool.
+        limits: Of each action, nats.
+        text: The caution, with {limit} and {where}.
     """
-    return gain.nanmean(1) > limit - NEAR
+    mean = gain.nanmean(1)
+    near = int((mean > torch.tensor(limits, dtype=mean.dtype) - NEAR).sum())
+    where = f"{near} of {len(gain)} actions"
+    return [text.format(limit=f"{max(limits):.1f} nats", where=where)] if near else []
 
 
 def at_least(value: int, least: int, name: str) -> int:

@@ -46,12 +46,9 @@ class ContrastiveGain(Contrast):
 
     @override
     def cautions(self, gain: Tensor) -> list[str]:
-        limit = math.log(self.num_contrastive + 1)
-        near = near_limit(gain, limit)
-        if not bool(near.any()):
-            return []
-        return [
-            "ContrastiveGain is near its largest value, log(L + 1) = "
-            f"{limit:.1f} nats, at {int(near.sum())} of {len(near)} actions: it is too "
-            "small there and does not rank; do raise num_contrastive"
-        ]
+        return near_limit(
+            gain,
+            [math.log(self.num_contrastive + 1)] * len(gain),
+            "ContrastiveGain is near its largest value, log(L + 1) = {limit}, at "
+            "{where}: it is too small there and does not rank; raise num_contrastive",
+        )

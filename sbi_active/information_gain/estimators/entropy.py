@@ -136,13 +136,8 @@ def conditional_entropy(simulations: CandidateSimulations) -> tuple[Tensor, Tens
     r"""Return the noise's entropy and surprise, :math:`-\log p(x_i | \theta_i)`.
 
     Without declared noise both are the entropy, :math:`H(x | \theta_i)`, with what the
-    pair i adds to its estimate; NaN where pairs are too few.
-
-    Args:
-        simulations: With declared noise or replicates.
-
-    Returns:
-        Shapes (a, n), nats; meaningful where outcomes are complete.
+    pair i adds to its estimate; NaN where pairs are too few. Both have shape (a, n), in
+    nats, and a meaning where outcomes are complete.
     """
     mean, noise = simulations.mean, simulations.noise
     shape = simulations.x.shape[:2]
@@ -169,19 +164,11 @@ def conditional_entropy(simulations: CandidateSimulations) -> tuple[Tensor, Tens
 def standardized_pairs(
     simulations: CandidateSimulations, index: int, rows: Tensor
 ) -> tuple[Tensor, Tensor]:
-    r"""Fit Gaussian noise to pairs of outcomes of one candidate.
+    r"""Fit Gaussian noise to pairs of outcomes of one candidate, those of rows (n,).
 
     :math:`\log \sigma_c^2(\theta)` is quadratic where a regression of the log squares
-    on theta is significant, else constant.
-
-    Args:
-        simulations: With replicates.
-        index: Of the candidate.
-        rows: Pairs to fit to, shape (n,), bool.
-
-    Returns:
-        Standardized differences of the pairs, and the entropies at all parameters,
-        shape (n,).
+    on theta is significant, else constant. Returns standardized differences of the
+    pairs, and the entropies at all parameters, shape (n,).
     """
     assert simulations.replicate is not None
     difference = simulations.x[index, rows] - simulations.replicate[index, rows]
@@ -211,11 +198,9 @@ def standardized_pairs(
 
 
 def with_control(gain: Tensor, excess: Tensor) -> Tensor:
-    """Return contributions less their regression on an excess of known mean, zero.
+    """Return contributions (n,) less their regression on an excess (n,) of mean zero.
 
-    Args:
-        gain: Contributions, shape (n,).
-        excess: Surprise of the noise less its entropy, shape (n,).
+    The excess is the surprise of the noise less its entropy.
     """
     variance = excess.var()
     if len(gain) < 10 or not float(variance) > 1e-12:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,34 +24,31 @@ CLOSER = 0.2  # ... at this share of the posterior's width, lest all others miss
 BLOCK = 256  # rows at once
 
 
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
     """The log evidence of outcomes of one candidate, log p(x_i)."""
 
-    def __init__(
-        self,
-        *,
-        emulator: MeanEmulator,
-        columns: slice,
-        mean: Tensor,
-        scale: Tensor,
-        complete: Completeness,
-        noise: NoiseModel,
-        belief: Distribution,
-        log_belief: Tensor,
-    ) -> None:
-        self.emulator, self.columns = emulator, columns
-        self.mean, self.scale, self.complete = mean, scale, complete
-        self.noise, self.belief, self.log_belief = noise, belief, log_belief
-        self.knots = emulator.knots
+    emulator: MeanEmulator
+    columns: slice
+    mean: Tensor
+    scale: Tensor
+    complete: Completeness
+    noise: NoiseModel
+    belief: Distribution
+    log_belief: Tensor
+
+    @property
+    def knots(self) -> Tensor:
+        """Coordinates of the simulations, shape (n, d)."""
+        return self.emulator.knots
 
     def __call__(
         self, x: Tensor, slope: Tensor, rows: Tensor, num_local: int
     ) -> tuple[Tensor, Tensor]:
-        """Return log evidences with Jensen's bias removed, and what they rest on.
+        """Return log evidences without Jensen's bias, and what they rest on.
 
-        Returns:
-            The log evidences, shape (rows,), and the share of each simulation in them,
-            summed over the outcomes, shape (n,). Local draws have the rest.
+        That is the share of each simulation in them, summed over the outcomes, shape
+        (n,); local draws have the rest.
         """
         m = int(self.complete.counted.sum()) - 1
         parts = []

@@ -92,20 +92,12 @@ class InfoNCEGain(InformationGainEstimator):
             min((len(block) for block in self._blocks(row.isfinite())), default=1)
             for row in gain
         ]
-        near = torch.stack(
-            [
-                near_limit(row[None], math.log(size))[0]
-                for row, size in zip(gain, smallest, strict=True)
-            ]
+        return near_limit(
+            gain,
+            [math.log(size) for size in smallest],
+            "InfoNCEGain is near its largest value, log K = {limit}, at {where}: it is "
+            "too small there and does not rank; raise num_contrastive",
         )
-        if not bool(near.any()):
-            return []
-        limit = math.log(max(smallest))
-        return [
-            f"InfoNCEGain is near its largest value, log K = {limit:.1f} nats, at "
-            f"{int(near.sum())} of {len(near)} actions: it is too small there and does "
-            "not rank; do raise num_contrastive"
-        ]
 
     def _blocks(self, counted: Tensor) -> tuple[Tensor, ...]:
         """Return the rows of each block, none larger than K."""

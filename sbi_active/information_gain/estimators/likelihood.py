@@ -68,13 +68,10 @@ class LikelihoodGain(Contrast):
 
     @override
     def cautions(self, gain: Tensor) -> list[str]:
-        limit = math.log(self.num_contrastive)
-        near = near_limit(gain, limit)
-        if not bool(near.any()):
-            return []
-        return [
-            f"LikelihoodGain is near log L = {limit:.1f} nats or above at "
-            f"{int(near.sum())} of {len(near)} actions: few of the L = "
-            f"{self.num_contrastive} draws explain an outcome, and it is too large "
-            "there; do raise num_contrastive"
-        ]
+        return near_limit(
+            gain,
+            [math.log(self.num_contrastive)] * len(gain),
+            "LikelihoodGain is near log L = {limit} or above at {where}: few of the "
+            "draws explain an outcome, and it is too large there; raise "
+            "num_contrastive",
+        )

@@ -80,11 +80,7 @@ class NoisyRivalPredictive(RivalPredictive, Protocol):
 
 @dataclass(frozen=True)
 class RivalSimulations(CandidateSimulations):
-    """Outcomes of rivals.
-
-    Attributes:
-        sd: Standard deviations of the noise around the mean, as x; None for unknown.
-    """
+    """Outcomes of rivals, and standard deviations of their noise, as x."""
 
     sd: Tensor | None = None
 
@@ -173,7 +169,7 @@ class RivalSampler:
         self._num_waves = 0
 
     def _predict(self, k: int, action: Tensor, num: int, seed: int) -> Tensor:
-        """Return outcomes, and where all rivals know them their means and deviations.
+        """Return outcomes, and where all rivals know them means and deviations.
 
         Shape (1 or 3, n, *x_shape).
         """

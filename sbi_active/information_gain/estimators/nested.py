@@ -214,7 +214,7 @@ def _enough(simulations: CandidateSimulations) -> Tensor:
 def _of_sharing(
     influence: Tensor, share: Tensor, chance: Tensor, counted: Tensor
 ) -> Tensor:
-    r"""Return what simulations add to the error by being in the evidence of others.
+    r"""Return what simulations add to the error by being in others' evidence, (n,).
 
     Simulation j, of completeness :math:`v_j`, changes :math:`- \sum_i \log \hat p(x_i)`
     by minus its share in the evidences. Without local draws that is :math:`v_j` but for
@@ -225,14 +225,8 @@ def _of_sharing(
     .. math::
         (1 - \lambda) v_j + \lambda \pi(\theta_j) - \sum_i v_i w_{ij}
 
-    Args:
-        influence: The last sum, shape (n,).
-        share: v, shape (n,).
-        chance: :math:`\pi(\theta)`, shape (n,).
-        counted: Rows that are not missing, shape (n,), bool.
-
-    Returns:
-        Shape (n,), of mean zero; it adds to errors and leaves the estimate.
+    with the last sum the influence. It is of mean zero over the rows that count: it
+    adds to errors and leaves the estimate.
     """
     local = 1 - influence.sum() / share.sum()
     effect = (1 - local) * share + local * chance - influence

@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from sbi_active.information_gain.fits.cross_fitting import NUM_FOLDS
 from sbi_active.information_gain.fits.emulator import kernel, whitening
 
 __all__ = ["ParameterFeatures", "cross_fitted", "fit_logistic", "probability"]
 
-NUM_FOLDS = 4
 NUM_KNOTS = 12  # of the radial features
 NUM_STEPS = 25  # of Newton's method at most
 MAX_MOVE = 4.0  # of a logit in one step, lest separable labels run away
-CONVERGED = 1e-6
+CONVERGED = 1e-6  # of a logit in one step
 #: Features and precision of the coefficients' Gaussian prior; held-out rows choose.
 OPTIONS = (
     ("linear", 0.01),
@@ -51,11 +51,9 @@ class ParameterFeatures:
         )
 
     def __call__(self, theta: Tensor, kind: str) -> Tensor:
-        """Return features with a leading one, shape (n, p).
+        """Return features with a leading one, (n, d) -> (n, p).
 
-        Args:
-            theta: Shape (n, d).
-            kind: "linear", "quadratic", or "radial", each with those before it.
+        They are "linear", "quadratic", or "radial", each with those before it.
         """
         z = (theta - self.center) @ self.transform
         parts = [torch.ones(len(z), 1, dtype=z.dtype), z]
@@ -119,15 +117,9 @@ def cross_fitted(
 def probability(
     theta: Tensor, label: Tensor, weight: Tensor
 ) -> Callable[[Tensor], Tensor]:
-    """Return a smooth probability of a label as a function of the parameters.
+    """Return a smooth log probability of a label, of parameters (k, d) -> (k,).
 
-    Args:
-        theta: Parameters, shape (n, d).
-        label: 0 or 1, shape (c, n).
-        weight: 0 leaves a row out, shape (c, n).
-
-    Returns:
-        A function of parameters (k, d) that gives log probabilities, shape (k,).
+    By parameters (n, d) and labels 0 or 1, shape (c, n); weight 0 leaves a row out.
     """
     nothing = torch.zeros(1, *label.shape, 0, dtype=label.dtype)
     _, (best,) = cross_fitted(theta, label[None], nothing, weight[None])
@@ -141,20 +133,14 @@ def probability(
 
 
 def fit_logistic(phi: Tensor, label: Tensor, weight: Tensor, ridge: float) -> Tensor:
-    r"""Return the penalized maximum of the logistic likelihood by Newton's method.
+    r"""Return the penalized maximum of the logistic likelihood, (a, p), by Newton.
 
     .. math::
         \sum_i w_i \log \sigma((2 y_i - 1)\, \beta^\top \phi_i)
         - \tfrac\lambda2 \sum_{j > 0} \beta_j^2
 
-    Args:
-        phi: Features, the first a one, shape (a, r, p).
-        label: y, 0 or 1, shape (a, r).
-        weight: w, shape (a, r).
-        ridge: :math:`\lambda`.
-
-    Returns:
-        Shape (a, p).
+    with features phi (a, r, p), the first a one, labels y of 0 or 1 and weights w (a,
+    r).
 
     References:
         Bishop, Pattern Recognition and Machine Learning, 2006, section 4.3.3.

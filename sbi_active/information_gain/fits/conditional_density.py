@@ -27,19 +27,13 @@ Density = Callable[[Tensor, Tensor], Tensor]
 
 
 def conditional_members(u: Tensor, x: Tensor) -> list[Density]:
-    r"""Fit conditional densities of u, which is close to standard normal, given x.
+    """Fit conditional densities of u (n, s), close to standard normal, given x (n, q).
 
     In this order: a Gaussian without x; Gaussians around a linear, a quadratic and a
     kernel regression, each with a constant covariance and with one that is scaled by a
     log-linear function of x; a mixture of Gaussians of (u, x), conditioned on x. Each
-    has a share of the standard normal, so that no row costs more than a few nats.
-
-    Args:
-        u: Shape (n, s).
-        x: Shape (n, q), q may be 0.
-
-    Returns:
-        Functions of u (k, s) and x (k, q) that give log densities, shape (k,).
+    has a share of the standard normal, so that no row costs more than a few nats. They
+    are functions of u (k, s) and x (k, q), which may have no numbers, -> (k,).
     """
     members: list[Density] = [_Residual.fit(u, None).density()]
     if x.shape[1] == 0:

@@ -15,17 +15,14 @@ NUM_FOLDS = 4
 def cross_fit(
     score: Callable[[Tensor, Tensor], Tensor], block: Tensor, weight: Tensor
 ) -> Tensor:
-    r"""Return scores of every row by members fitted and chosen without it.
+    """Return scores of every row (n,) by members fitted and chosen without it.
 
     Args:
         score: ``score(train, test)``, both of rows, gives the scores of the test rows
             by each member fitted to the training rows, shape (members, test).
         block: Number of the block that a row belongs to, shape (n,): rows of a block
-            share a fold.
+            share a fold, which the member scores that is the best on the others.
         weight: Of rows in the choice, shape (n,).
-
-    Returns:
-        Shape (n,). The member that scores a fold is the best on the other folds.
     """
     fold = block % NUM_FOLDS
     held_out: Tensor | None = None
@@ -48,16 +45,10 @@ def cross_fit(
 def patterns_of_numbers(
     x: Tensor, counted: Tensor, smallest: int
 ) -> list[tuple[Tensor, Tensor]]:
-    """Group outcomes by which of their numbers are present.
+    """Group counted outcomes (n, q) by which of their numbers are present.
 
-    Args:
-        x: Shape (n, q), NaN where there is no number.
-        counted: Rows to group, shape (n,), bool.
-        smallest: Rows below which a pattern joins those without a number.
-
-    Returns:
-        Rows, shape (k,), and the numbers present, shape (p,), of each group; the groups
-        cover all counted rows.
+    Returns rows, shape (k,), and the numbers present, shape (p,), of each group;
+    patterns of fewer rows than the smallest join those without a number.
     """
     rows = torch.nonzero(counted)[:, 0]
     present = x[rows].isfinite()

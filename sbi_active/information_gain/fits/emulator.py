@@ -52,12 +52,7 @@ class MeanEmulator:
 
     @staticmethod
     def fit(theta: Tensor, f: Tensor) -> MeanEmulator:
-        """Interpolate outcomes.
-
-        Args:
-            theta: Parameters, shape (n, d).
-            f: Outcomes in units of what is negligible, shape (n, q).
-        """
+        """Interpolate outcomes (n, q) over parameters (n, d), in negligible units."""
         d = theta.shape[1]
         center, white = whitening(theta)
 
@@ -97,12 +92,7 @@ class MeanEmulator:
         return z @ torch.linalg.inv(self.transform) + self.center
 
     def __call__(self, z: Tensor, columns: slice = slice(None)) -> Tensor:
-        """Return outcomes at coordinates, shape (n, d) -> (n, q).
-
-        Args:
-            z: Coordinates.
-            columns: Which outcomes.
-        """
+        """Return some of the outcomes at coordinates, shape (n, d) -> (n, q)."""
         trend, weight = self.trend[:, columns], self.weight[:, columns].contiguous()
         blocks = z.split(max(1, BLOCK // len(self.knots)))
         return torch.cat(

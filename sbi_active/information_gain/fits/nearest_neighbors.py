@@ -19,12 +19,7 @@ SHARED = 0.27
 
 
 def nearest_neighbor_entropy(x: Tensor, num_neighbors: int) -> Tensor:
-    """Return each outcome's contribution to the entropy of x, nats, shape (n,).
-
-    Args:
-        x: Outcomes, shape (n, d).
-        num_neighbors: k.
-    """
+    """Return each outcome's contribution to the entropy, (n, d) -> (n,), nats."""
     n, d = x.shape
     center = x.mean(0)
     scale = x.std(0).clamp_min(1e-30)

@@ -62,13 +62,7 @@ def noise_members(
 
 
 class _NoiseKernels:
-    """The density of one class.
-
-    Args:
-        mean: Shape (n, q).
-        sd: Shape (n, q).
-        factor: Of the width by Silverman's rule.
-    """
+    """The density of one class, by means and deviations (n, q)."""
 
     def __init__(self, mean: Tensor, sd: Tensor, factor: float) -> None:
         n, q = mean.shape

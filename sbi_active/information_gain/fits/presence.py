@@ -20,7 +20,7 @@ MAX_PATTERNS = 6  # of a random presence; rarer ones are one pattern
 
 
 def presence_information(simulations: CandidateSimulations) -> Tensor:
-    r"""Return contributions to the information in which numbers of x are present.
+    r"""Return contributions to what the presence of numbers tells, (a, n), nats.
 
     With v the pattern of NaN in x. Where v is a function of theta, as it is of a
     noise-free simulator with declared noise, :math:`I(\theta; v) = H(v)`, from shares.
@@ -33,12 +33,6 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
     is independent of v. It is a lower bound for any q, at least as tight as
     :math:`I(v'; v)` for a q that learned it; the slack is the held-out divergence of q
     from :math:`p(v | \theta)`.
-
-    Args:
-        simulations: With replicates or noise-free outcomes.
-
-    Returns:
-        Shape (a, n), nats; zero where nothing is missing.
     """
     patterns = _patterns(simulations)
     counted = simulations.counted

@@ -42,7 +42,7 @@ class Learned:
 
 
 def declare(simulations: CandidateSimulations) -> Learned:
-    r"""Return simulations of the learned model, whose noise is declared.
+    r"""Return simulations of a model learned from pairs, whose noise is declared.
 
     The noise of a candidate is Gaussian with the covariance of the pairs' differences,
 
@@ -59,12 +59,6 @@ def declare(simulations: CandidateSimulations) -> Learned:
     with a ridge for each number of x and a metric for all, by leave-one-out errors.
     Outcomes are drawn anew, :math:`\hat f(\theta_i) + \epsilon_i`, so that none had a
     part in its own mean.
-
-    Args:
-        simulations: With replicates.
-
-    Returns:
-        The simulations of the learned model.
     """
     assert simulations.replicate is not None
     theta, complete = simulations.theta.double(), simulations.complete
@@ -99,12 +93,7 @@ def declare(simulations: CandidateSimulations) -> Learned:
 
 
 def fill(theta: Tensor, x: Tensor) -> Tensor:
-    """Return outcomes (a, n, q), incomplete ones taken from the nearest complete one.
-
-    Args:
-        theta: Parameters, shape (n, d).
-        x: Outcomes, NaN where missing.
-    """
+    """Return outcomes (a, n, q), incomplete ones from the nearest complete one."""
     missing = ~x.isfinite().all(-1)
     if not bool(missing.any()):
         return x

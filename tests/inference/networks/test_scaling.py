@@ -12,7 +12,7 @@ from sbi_active.inference.networks import (
     Response,
     exponents_of,
 )
-from sbi_active.inference.networks.baseline import _cholesky
+from sbi_active.inference.networks.baseline import precision_factor
 
 
 @pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])
@@ -124,4 +124,4 @@ def test_isolated_actions_leave_a_finite_noise(seed):
 def test_a_precision_that_is_not_finite_is_an_error():
     precision = torch.tensor([[[[1.0, 0.0], [0.0, torch.nan]]]], dtype=torch.float64)
     with pytest.raises(ValueError, match="expected a regression of the outcomes"):
-        _cholesky(precision)
+        precision_factor(precision)
