@@ -18,7 +18,6 @@ from sbi_active.criticism.effects.summaries import MANY, MOST, can_summarize, su
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
-    CATCH_ALLS,
     NONE,
     UNEXPLAINED,
     Detection,
@@ -266,9 +265,7 @@ class Criticism:
         space = self.actions if plan else None
         after = None
         if tracing.verdict != NONE:
-            error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
-            names = tracing.chosen or tracing.beside
-            after = find_residuals(self.rivals, names=names, error=error)
+            after = find_residuals(self.rivals, tracing.key)
         return build_report(
             trials=self.trials,
             residuals=self.residuals(),

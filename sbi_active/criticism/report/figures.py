@@ -88,7 +88,7 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
     kept = [
         (name, p)
         for name, p in tracing.probabilities.items()
-        if p >= 0.01 or " + " not in name
+        if p >= 0.01 or not tracing.has_several(name)
     ]
     order = sorted(kept, key=lambda item: -item[1])[:at_most]
     names = [name for name, _ in order][::-1]

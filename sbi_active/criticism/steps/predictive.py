@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
@@ -68,8 +69,7 @@ def predict(
     rivals: RivalSet,
     trials: Trials | None = None,
     *,
-    names: tuple[str, ...] = (),
-    error: str | None = None,
+    key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
     num_draws: int = NUM_DRAWS,
     seed: int | None = None,
     scored: bool = True,
@@ -80,16 +80,14 @@ def predict(
         rivals: The models; the rival is fitted to their trials.
         trials: Trials to predict, taken as unseen; None takes those that were fitted,
             with the residual process of "unexplained" conditioned on them.
-        names: Effects of the rival.
-        error: None, "unexplained", "scatter" or "outlier".
+        key: Which of the models.
         num_draws: From the posterior, n.
         seed: Of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
     """
-    name = rivals.evidence(names, error=error).name
-    rival, sample = rivals.rivals[name], rivals.samples[name]
+    rival, sample = rivals.fit(key).rival, rivals.fit(key).sample
     seed = rivals.seed if seed is None else seed
-    rng = np.random.default_rng(derive_seed(seed, "predictive", name))
+    rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
     u = sample.draws(num_draws, rng)
     own_residual = rival.residual(u, penalized=False)[0]
     target = rivals.trials if trials is None else trials
