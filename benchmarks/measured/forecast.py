@@ -14,7 +14,6 @@ from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence import RivalSet
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.rivals import (
-    NoiseGrid,
     ResidualProcess,
     TrialSimulator,
     declared_noise,
@@ -84,14 +83,7 @@ def forecast(
             own, m, rivals.scaled_actions(whole), order=rivals.scaled_order(whole)
         )
         mean = mean + shift
-        cells, scales = rival.error.noise_posterior(own, rng)
-    else:
-        assert isinstance(rival.error, NoiseGrid)
-        joint = rival.error.joint(own)
-        flat = joint.reshape(len(own), -1)
-        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
-        cells, which = np.unravel_index(best, joint.shape[1:])
-        scales = rival.error.scales[which]
+    cells, scales = rival.error.noise_posterior(own, rng)
     noise = declared_noise(rivals.model.noise, m)
     # The last sample of the beginning, and all that follow it.
     first = int((cut.trial == trial).sum())

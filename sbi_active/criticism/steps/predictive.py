@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
-from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -127,7 +125,7 @@ def predict(
             spread=spread,
         )
         mean = mean + shift
-    cells, scales = _drawn_cells(rival, own_residual, rng)
+    cells, scales = rival.error.noise_posterior(own_residual, rng)
     errors, sd = _errors(noise, cells, scales, mean.shape, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
@@ -152,22 +150,6 @@ def predict(
         rng.uniform(size=probability.shape) < probability,
         probability,
     )
-
-
-def _drawn_cells(
-    rival: Rival, residual: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return a cell and a scale of the noise for each draw, given its residual."""
-    grid = rival.error
-    if not isinstance(grid, NoiseGrid):
-        assert isinstance(grid, ResidualProcess | OneOutlier)
-        return grid.noise_posterior(residual, rng)
-    joint = grid.joint(residual)
-    flat = joint.reshape(len(residual), -1)
-    gumbel = rng.gumbel(size=flat.shape)  # the maximum is a draw from softmax
-    best = np.argmax(flat + gumbel, axis=1)
-    cell, scale = np.unravel_index(best, joint.shape[1:])
-    return cell, grid.scales[scale]
 
 
 def _errors(
