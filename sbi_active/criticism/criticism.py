@@ -312,17 +312,7 @@ def close_loop(
 ) -> Report:
     """Find the residual, trace it to an effect, add it, and report the error.
 
-    Args:
-        model: As in :class:`Criticism`, like all others.
-        prior: Of the simulator's parameters.
-        trials: Measured trials.
-        effects: What the simulator may lack.
-        actions: The permitted actions.
-        summaries: As in :class:`Criticism`.
-        seed: Of all draws.
-        evaluate: As in :meth:`Criticism.report`.
-        plan: As in :meth:`Criticism.report`.
-        designed: As in :meth:`Criticism.report`.
+    Arguments are those of :class:`Criticism` and of :meth:`Criticism.report`.
     """
     return Criticism(
         model,
