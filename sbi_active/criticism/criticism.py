@@ -14,7 +14,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
-from sbi_active.criticism.effects.summaries import MANY, MOST, can_summarize, summarize
+from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
@@ -104,7 +104,7 @@ class Criticism:
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
         if summaries is None:
-            many = trials.x[0].numel() > MANY and can_summarize(*self._parts)
+            many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
         #: Of x, that are compared in its place; 0 for all of its numbers.
         self.num_summaries = summaries
