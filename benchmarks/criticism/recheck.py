@@ -23,6 +23,7 @@ from benchmarks.criticism.cases import KINDS, draw_case
 from benchmarks.criticism.worlds import get_world
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.results import ModelKey
 
 WIDER = 4.0  # covariance of the proposal by that of the posterior
 BLOCK = 1_000  # parameters simulated at a time
@@ -38,8 +39,8 @@ def evidence_again(
         names: Of the effects.
         num_draws: A third of them from the prior.
     """
-    evidence = rivals.evidence(names)
-    rival, sample = rivals.rivals[evidence.name], rivals.samples[evidence.name]
+    fit = rivals.fit(ModelKey((*names,)))
+    rival, sample, evidence = fit.rival, fit.sample, fit.evidence
     weight = sample.weights / sample.weights.sum()
     center = weight @ sample.u
     covariance = WIDER * np.cov(sample.u.T, aweights=weight, ddof=0)

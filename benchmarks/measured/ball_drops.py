@@ -28,7 +28,7 @@ from benchmarks.measured.fall_least_squares import (
 )
 from benchmarks.measured.forecast import Forecast, aligned_error, forecast
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.results import NONE, Tracing
+from sbi_active.criticism.results import NONE, ModelKey, Tracing
 from sbi_active.tasks.ball_drops import (  # pyright: ignore
     DRAG,
     Drop,
@@ -57,9 +57,9 @@ def judge(drops: Sequence[Drop], *, seed: int = 0) -> dict[str, Any]:
     begin = time.process_time()
     loop = _criticism(trials_of([*drops]), seed)
     detection, tracing = loop.detect(), loop.trace()
-    power = loop.rivals.evidence(("power-law drag",))
+    power = loop.rivals.fit(ModelKey(("power-law drag",))).evidence
     linear, quadratic = (
-        loop.rivals.evidence((name,)).log_evidence
+        loop.rivals.fit(ModelKey((name,))).evidence.log_evidence
         for name in ("linear drag", "quadratic drag")
     )
     return {

@@ -12,9 +12,8 @@ from scipy.optimize import least_squares
 
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence import RivalSet
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.rivals import (
-    NoiseGrid,
     ResidualProcess,
     TrialSimulator,
     declared_noise,
@@ -71,10 +70,9 @@ def forecast(
         trial: Position of the one that was cut.
         seed: Of the draws.
     """
-    names, error = _parts(rivals, verdict)
-    name = rivals.evidence(names, error=error).name
-    rival, rng = rivals.rivals[name], np.random.default_rng(seed)
-    u = rivals.samples[name].draws(NUM_DRAWS, rng)
+    key = _key(rivals, verdict)
+    fit, rng = rivals.fit(key), np.random.default_rng(seed)
+    rival, u = fit.rival, fit.sample.draws(NUM_DRAWS, rng)
     simulator = TrialSimulator(rivals.simulator.model, whole)
     mean = simulator.predict(*rival.coordinates.split(u))[0]
     m, cut = simulator.measurements, rivals.measurements
@@ -85,14 +83,7 @@ def forecast(
             own, m, rivals.scaled_actions(whole), order=rivals.scaled_order(whole)
         )
         mean = mean + shift
-        cells, scales = rival.error.noise_posterior(own, rng)
-    else:
-        assert isinstance(rival.error, NoiseGrid)
-        joint = rival.error.joint(own)
-        flat = joint.reshape(len(own), -1)
-        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
-        cells, which = np.unravel_index(best, joint.shape[1:])
-        scales = rival.error.scales[which]
+    cells, scales = rival.error.noise_posterior(own, rng)
     noise = declared_noise(rivals.model.noise, m)
     # The last sample of the beginning, and all that follow it.
     first = int((cut.trial == trial).sum())
@@ -124,10 +115,8 @@ def aligned_error(
         verdict: As there; a catch-all adds nothing.
         trial: Position of the trial.
     """
-    names, _ = _parts(rivals, verdict)
-    name = rivals.evidence(names).name
-    rival = rivals.rivals[name]
-    draws = rivals.samples[name].draws(NUM_DRAWS, np.random.default_rng(0))
+    fit = rivals.fit(ModelKey(_key(rivals, verdict).effects))
+    rival, draws = fit.rival, fit.sample.draws(NUM_DRAWS, np.random.default_rng(0))
     theta, phi = rival.coordinates.split(draws)
     start = [phi[e.name][:, trial].mean(0).numpy() for e in rivals.nuisances]
     sizes = np.cumsum([len(part) for part in start])[:-1]
@@ -147,8 +136,8 @@ def aligned_error(
     )
 
 
-def _parts(rivals: RivalSet, verdict: str) -> tuple[tuple[str, ...], str | None]:
-    """Return the effects and the catch-all that a verdict names."""
+def _key(rivals: RivalSet, verdict: str) -> ModelKey:
+    """Return the model that a verdict names."""
     if verdict in (UNEXPLAINED, SCATTER):
-        return (), verdict
-    return tuple(n for n in verdict.split(" + ") if n in rivals.effects), None
+        return ModelKey(error=verdict)
+    return ModelKey(tuple(n for n in verdict.split(" + ") if n in rivals.effects))

@@ -34,7 +34,7 @@ from benchmarks.measured.servo_least_squares import FRICTIONS, Fit, fit
 from benchmarks.measured.servo_rates import RATES, by_rate
 from benchmarks.measured.servo_tables import tables
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Tracing
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, ModelKey, Tracing
 from sbi_active.criticism.steps import predict
 from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
@@ -164,7 +164,7 @@ def _predicted(loop: Criticism, held_out: Any) -> dict[str, Any]:
     error = tracing.verdict if tracing.verdict in CATCH_ALLS[1:] else None
     kinds = {"before": ((), None), "after": (tracing.chosen, error)}
     for when, (names, err) in kinds.items():
-        p = predict(loop.rivals, held_out, names=names, error=err)
+        p = predict(loop.rivals, held_out, key=ModelKey(names, err))
         mean = p.mean.reshape(len(p.mean), *x.shape)
         rmse = np.sqrt(((mean - x) ** 2).mean((1, 2)))
         found[when] = {

@@ -56,7 +56,7 @@ def criticize(arguments: argparse.Namespace) -> int:
         designed=arguments.designed,
     )
     print(report)
-    if table.is_long or any(table.columns.units.values()):
+    if table.columns.time is not None or any(table.columns.units.values()):
         print(f"\n{_described(arguments.trials, table, trials)}")
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
@@ -103,7 +103,7 @@ def _described(path: Path, table: TrialTable, trials: Trials) -> str:
     columns, num = table.columns, len(trials)
     action, x = (map(columns.label, names) for names in (columns.action, columns.x))
     what = f"{num} trials of {path}: action {', '.join(action)}; x {', '.join(x)}"
-    if not table.is_long:
+    if columns.time is None:
         return what
     counts = trials.mask.flatten(2).any(-1) if trials.x.ndim > 2 else trials.mask
     few, many = int(counts.sum(1).min()), int(counts.sum(1).max())

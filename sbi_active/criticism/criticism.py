@@ -14,11 +14,10 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
-from sbi_active.criticism.effects.summaries import MANY, MOST, can_summarize, summarize
+from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
-    CATCH_ALLS,
     NONE,
     UNEXPLAINED,
     Detection,
@@ -105,7 +104,7 @@ class Criticism:
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
         if summaries is None:
-            many = trials.x[0].numel() > MANY and can_summarize(*self._parts)
+            many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
         #: Of x, that are compared in its place; 0 for all of its numbers.
         self.num_summaries = summaries
@@ -266,9 +265,7 @@ class Criticism:
         space = self.actions if plan else None
         after = None
         if tracing.verdict != NONE:
-            error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
-            names = tracing.chosen or tracing.beside
-            after = find_residuals(self.rivals, names=names, error=error)
+            after = find_residuals(self.rivals, tracing.key)
         return build_report(
             trials=self.trials,
             residuals=self.residuals(),
@@ -315,17 +312,7 @@ def close_loop(
 ) -> Report:
     """Find the residual, trace it to an effect, add it, and report the error.
 
-    Args:
-        model: As in :class:`Criticism`, like all others.
-        prior: Of the simulator's parameters.
-        trials: Measured trials.
-        effects: What the simulator may lack.
-        actions: The permitted actions.
-        summaries: As in :class:`Criticism`.
-        seed: Of all draws.
-        evaluate: As in :meth:`Criticism.report`.
-        plan: As in :meth:`Criticism.report`.
-        designed: As in :meth:`Criticism.report`.
+    Arguments are those of :class:`Criticism` and of :meth:`Criticism.report`.
     """
     return Criticism(
         model,

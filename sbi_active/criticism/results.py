@@ -14,6 +14,7 @@ __all__ = [
     "Estimate",
     "Evaluation",
     "Evidence",
+    "ModelKey",
     "NextAction",
     "Residuals",
     "SevereTest",
@@ -26,6 +27,38 @@ Array = NDArray[Any]
 #: error of one trial.
 NONE, UNEXPLAINED, SCATTER, OUTLIER = "none", "unexplained", "scatter", "outlier"
 CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
+
+
+@dataclass(frozen=True)
+class ModelKey:
+    """Which model of the trials, as ``rivals.fit(key)`` takes it.
+
+    ``str(key)`` is what reports and results call it.
+
+    Attributes:
+        effects: Their names, in the order of the library.
+        error: A catch-all; None for the noise alone.
+
+    Example:
+        >>> str(ModelKey()), str(ModelKey(("drag", "bias")))
+        ('none', 'drag + bias')
+        >>> ModelKey.of("scatter")
+        ModelKey(effects=(), error='scatter')
+    """
+
+    effects: tuple[str, ...] = ()
+    error: str | None = None
+
+    @classmethod
+    def of(cls, name: str) -> ModelKey:
+        """Return the key of "none", a catch-all or one effect."""
+        if name in CATCH_ALLS:
+            return cls(error=name)
+        return cls(() if name == NONE else (name,))
+
+    def __str__(self) -> str:
+        error = () if self.error is None else (self.error,)
+        return " + ".join((*self.effects, *error)) or NONE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +105,7 @@ class Evidence:
     r"""Marginal likelihood of one model, :math:`\log Z = \log \int p(x|z) p(z) dz`.
 
     Attributes:
-        name: "none", effects joined by " + ", "unexplained", "scatter" or "outlier".
+        key: Of the model.
         log_evidence: log Z, nats.
         standard_error: Of log Z, Monte Carlo, nats.
         effective_sample_size: Of the importance weights; the particles' number for
@@ -84,7 +117,7 @@ class Evidence:
         best_chi_square: Smallest whitened residual sum of squares among the draws.
     """
 
-    name: str
+    key: ModelKey
     log_evidence: float
     standard_error: float
     effective_sample_size: float
@@ -93,6 +126,11 @@ class Evidence:
     names: tuple[str, ...]
     draws: Array
     best_chi_square: float
+
+    @property
+    def name(self) -> str:
+        """What reports call the model."""
+        return str(self.key)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,6 +284,16 @@ class Tracing:
     needed: tuple[float, ...] = ()
     instead_of: str = ""
     refuted: tuple[float, float] | None = None
+
+    @property
+    def key(self) -> ModelKey:
+        """The model of the verdict, of "unexplained" with the effects beside it."""
+        error = self.verdict if self.verdict in CATCH_ALLS else None
+        return ModelKey(self.chosen or self.beside, error)
+
+    def has_several(self, name: str) -> bool:
+        """Return whether a name in ``probabilities`` is that of several effects."""
+        return name not in (NONE, *CATCH_ALLS, *self.inclusion)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -293,8 +293,8 @@ def test_outcomes_that_disagree_are_a_residual():
     # The real system keeps all, up to the largest action.
     criticism = Criticism(model, PRIOR, trials, effects=[edge])
     agree = Criticism(MODEL, PRIOR, trials, effects=[edge])
-    lost = criticism.rivals.evidence().log_evidence
-    assert lost < agree.rivals.evidence().log_evidence - 3
+    lost = criticism.rivals.fit().evidence.log_evidence
+    assert lost < agree.rivals.fit().evidence.log_evidence - 3
 
 
 def test_the_next_action_separates_what_is_left():

@@ -18,6 +18,7 @@ from sbi_active.criticism import (
     close_loop,
 )
 from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import (
     DISAGREEMENT,
     NUM_REPLICATES,
@@ -96,7 +97,7 @@ def test_flags_have_the_probability_of_the_rates():
 def test_a_trial_without_a_measurement_costs_its_flag():
     x = X.clone()
     x[2] = torch.nan
-    found = rivals(line, Trials(ACTION, x)).evidence()
+    found = rivals(line, Trials(ACTION, x)).fit().evidence
     keep = x[:, 0].isfinite()
     expected = exact(ACTION[keep], X[keep, 0])
     expected += math.log(DISAGREEMENT / (1 - DISAGREEMENT))
@@ -106,7 +107,7 @@ def test_a_trial_without_a_measurement_costs_its_flag():
 def test_a_measurement_where_there_should_be_none_has_the_prior_predictive():
     trials = Trials(ACTION, X)
     models = rivals(ending, trials)
-    found = models.evidence()
+    found = models.fit().evidence
     keep = ACTION[:, 0] <= 1
     lost = ~keep.numpy()
     expected = exact(ACTION[keep], X[keep, 0])
@@ -167,7 +168,7 @@ def test_masked_numbers_are_left_out():
 
     x = torch.cat([X, torch.full_like(X, torch.nan)], 1)
     x[3] = x[3].flip(0)
-    found = rivals(two, Trials(ACTION, x)).evidence()
+    found = rivals(two, Trials(ACTION, x)).fit().evidence
     expected = exact(ACTION, X[:, 0])
     assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
 
@@ -176,7 +177,7 @@ def test_masked_numbers_are_left_out():
 
 
 def test_a_nuisance_of_each_trial_is_integrated_out():
-    found = rivals(line, Trials(ACTION, X), [START]).evidence()
+    found = rivals(line, Trials(ACTION, X), [START]).fit().evidence
     expected = exact(ACTION, X[:, 0], extra=0.8)
     assert found.standard_error < 0.2
     assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
@@ -309,7 +310,8 @@ def test_summaries_of_a_linear_model_are_sufficient():
         loop = Criticism(
             model, PRIOR, Trials(ACTION, x), effects=[STAIN], summaries=num
         )
-        null, stain = loop.rivals.evidence(), loop.rivals.evidence(("stain",))
+        null = loop.rivals.fit().evidence
+        stain = loop.rivals.fit(ModelKey(("stain",))).evidence
         factors.append(stain.log_evidence - null.log_evidence)
         errors.append(math.hypot(stain.standard_error, null.standard_error))
     assert loop.num_summaries == 3  # two patterns of the parameters, one of the effect

@@ -8,6 +8,7 @@ import torch
 from benchmarks.measured.servo_pendulum import main
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.data import Measurements
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import declared_noise
 from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks import get_task  # pyright: ignore
@@ -337,6 +338,10 @@ def test_dry_friction_is_what_the_recorded_servo_has():
     loop = Criticism(task.simulator, task.prior, trials, effects=task.effects())
     assert loop.detect().alarm
     found = loop.rivals
-    dry = max(found.evidence((n,)).log_evidence for n in ("Coulomb", "load-dependent"))
-    assert dry > found.evidence(("torque-dependent",)).log_evidence + 20
-    assert dry > found.evidence(("viscous",)).log_evidence + 20
+
+    def log_z(name):
+        return found.fit(ModelKey((name,))).evidence.log_evidence
+
+    dry = max(log_z(n) for n in ("Coulomb", "load-dependent"))
+    assert dry > log_z("torque-dependent") + 20
+    assert dry > log_z("viscous") + 20

@@ -7,6 +7,8 @@ A wide table has columns "action_\*" and "x_\*". A long one has besides them "tr
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,20 +18,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sbi_active.criticism.data.table_checks import (
-    note_empty,
-    note_scales,
-    require_constant,
-    require_distinct,
-    require_distinct_trials,
-    require_order,
-)
 from sbi_active.criticism.data.table_columns import Columns, find_columns
-from sbi_active.criticism.data.table_rows import Rows, read_csv
 
 __all__ = ["TrialTable", "read_table"]
 
 Array = NDArray[Any]
+
+EMPTY = ("", "nan", "none", "na", "<na>")
+#: Decades between the sizes of two groups of trials that look like two units, and those
+#: within each.
+GAP, WITHIN = 1.7, 1.0
+SHOWN = 5  # places that a message lists
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,17 +38,10 @@ class TrialTable:
     Attributes:
         arguments: Of :class:`.Trials`, by name.
         columns: What its columns are.
-        names: What the table calls the trials.
     """
 
     arguments: dict[str, Any]
     columns: Columns
-    names: list[str]
-
-    @property
-    def is_long(self) -> bool:
-        """Whether it has one row a sample."""
-        return self.columns.time is not None
 
 
 def read_table(
@@ -74,7 +66,7 @@ def read_table(
             sample or a trial is there twice. The text says where.
     """
     source = "the table" if isinstance(table, pd.DataFrame) else str(table)
-    frame = table if isinstance(table, pd.DataFrame) else read_csv(Path(table))
+    frame = table if isinstance(table, pd.DataFrame) else _read_csv(Path(table))
     frame = frame.set_axis([str(c).strip() for c in frame.columns], axis=1)
     found = find_columns([*frame.columns], columns=columns, units=units, source=source)
     if frame.empty:
@@ -82,107 +74,255 @@ def read_table(
             f"expected a header and one row a trial or sample; got 0 rows in {source}; "
             "do write, say, action_speed,x_distance"
         )
-    rows = Rows(frame, found, source)
-    return _long(rows) if found.time is not None else _wide(rows)
+    return TrialTable(arguments=_Rows(frame, found, source).trials(), columns=found)
 
 
-def _wide(rows: Rows) -> TrialTable:
-    columns = rows.columns
-    action = rows.numbers(columns.action, empty=False)
-    x = rows.numbers(columns.x, empty=True)
-    names = [str(i + 1) for i in range(len(x))]
-    index = np.arange(len(x), dtype=float)
-    if "index" in columns.optional:
-        index = rows.numbers([columns.optional["index"]], empty=False)[:, 0]
-        require_distinct(index[:, None], "index", rows)
-    else:
-        require_distinct(np.concatenate([action, x], 1), None, rows)
-    note_empty(x, rows)
-    for j, column in enumerate(columns.action):
-        note_scales(np.abs(action[:, j : j + 1]), names, column, rows)
-    found: dict[str, Any] = {"action": action, "x": x, "index": index}
-    return _finished(rows, found, names, np.arange(len(x)))
+class _Rows:
+    """The rows of a table; where a row is a trial, each is a trial of one sample."""
 
-
-def _long(rows: Rows) -> TrialTable:
-    columns, labels = rows.columns, rows.trial
-    assert labels is not None
-    assert columns.time is not None
-    names = [*dict.fromkeys(labels)]
-    number = {name: t for t, name in enumerate(names)}
-    trial = np.array([number[label] for label in labels])
-    time = rows.numbers([columns.time], empty=False)[:, 0] * columns.seconds
-    members = [np.flatnonzero(trial == t) for t in range(len(names))]
-    require_order(time, members, rows)
-    first = np.array([at[0] for at in members])
-    action = rows.numbers(columns.action, empty=False)
-    for j, column in enumerate(columns.action):
-        require_constant(action[:, j], column, members, rows)
-    x = rows.numbers(columns.x, empty=True)
-    samples = [np.column_stack([time[at], x[at]]) for at in members]
-    require_distinct_trials(samples, action[first], names, rows)
-    note_empty(x, rows)
-    for j, column in enumerate(columns.action):
-        note_scales(np.abs(action[first, j : j + 1]), names, column, rows)
-    note_scales([np.diff(s[:, 0]) for s in samples], names, columns.time, rows)
-    for j, column in enumerate(columns.x):
-        note_scales([np.abs(s[:, 1 + j]) for s in samples], names, column, rows)
-    found: dict[str, Any] = {
-        "action": action[first],
-        "x": [s[:, 1] if len(columns.x) == 1 else s[:, 1:] for s in samples],
-        "sample_times": [s[:, 0] for s in samples],
-        "index": np.arange(len(names), dtype=float),
-    }
-    if "index" in columns.optional:
-        column = columns.optional["index"]
-        index = rows.numbers([column], empty=False)[:, 0]
-        require_constant(index, column, members, rows)
-        found["index"] = index[first]
-        require_distinct(found["index"][:, None], "index", rows, first)
-    for key in ("role", "repeat_of"):
-        if key in columns.optional:
-            column = columns.optional[key]
-            words = np.array(rows.words(column), dtype=object)
-            require_constant(words, column, members, rows)
-    return _finished(rows, found, names, first)
-
-
-def _finished(
-    rows: Rows, found: dict[str, Any], names: list[str], first: Array
-) -> TrialTable:
-    """Return the table with what is optional, from the first row of each trial."""
-    columns = rows.columns
-    optional = columns.optional
-    if "role" in optional:
-        words = rows.words(optional["role"])
-        found["role"] = [words[i] or "fit" for i in first]
-        for i, role in zip(first, found["role"], strict=True):
-            if role not in ("fit", "held out"):
+    def __init__(self, frame: pd.DataFrame, columns: Columns, source: str) -> None:
+        self.frame, self.columns, self.source = frame, columns, source
+        parts = [self.words(column) for column in columns.trial]
+        for column, part in zip(columns.trial, parts, strict=True):
+            for i in np.flatnonzero(part == ""):
                 raise ValueError(
-                    f"expected a role 'fit' or 'held out' in column "
-                    f"{optional['role']}, {rows.place(int(i))}; got {role!r} in "
-                    f"{rows.source}; do write one of them, or leave it empty for fit"
+                    f"expected the name of a trial in column {column}, row {i + 1}; "
+                    f"got an empty cell in {source}; do fill it in"
                 )
-    if "repeat_of" in optional:
-        repeated = rows.numbers([optional["repeat_of"]], empty=True)[first, 0]
-        found["repeat_of"] = _positions(repeated, found["index"], first, rows)
-    found["action_labels"] = [columns.label(c) for c in columns.action]
-    found["channel_labels"] = [columns.label(c) for c in columns.x]
-    return TrialTable(arguments=found, columns=columns, names=names)
+        labels = [" ".join(words) for words in zip(*parts, strict=True)]
+        if not columns.trial:
+            labels = [str(i + 1) for i in range(len(frame))]
+        self.code, names = pd.factorize(np.array(labels, dtype=object))
+        self.names: list[str] = [*names]
+        num = len(names)
+        self.members = [np.flatnonzero(self.code == t) for t in range(num)]
+        self.first = np.array([at[0] for at in self.members])
 
-
-def _positions(repeated: Array, index: Array, first: Array, rows: Rows) -> Array:
-    """Return the position of each repeated trial, -1 for none."""
-    place = {float(value): i for i, value in enumerate(index)}
-    found = np.full(len(index), -1.0)
-    for i, value in enumerate(repeated):
-        if np.isnan(value) or value < 0:
-            continue
-        if float(value) not in place:
+    def trials(self) -> dict[str, Any]:
+        """Return the arguments of the trials."""
+        columns, optional, first = self.columns, self.columns.optional, self.first
+        time = np.zeros(len(self.frame))
+        if columns.time is not None:
+            time = self.numbers(columns.time) * columns.seconds
+            self._require_order(time, columns.time)
+        action = np.stack([self._constant(c) for c in columns.action], 1)
+        x = np.stack([self.numbers(c, empty=True) for c in columns.x], 1)
+        samples = [np.column_stack([time[at], x[at]]) for at in self.members]
+        index = np.arange(len(first), dtype=float)
+        if "index" in optional:
+            index = self._constant(optional["index"])
+        if columns.time is not None or "index" not in optional:
+            self._require_distinct(action, samples)
+        for t in np.flatnonzero(pd.Series(index).duplicated()):
+            one = first[np.flatnonzero(index == index[t])[0]]
             raise ValueError(
-                f"expected in repeat_of an index of the table; got {value:g} in "
-                f"{rows.place(int(first[i]))} of {rows.source}; do give that of the "
+                f"expected each trial once; got index {index[t]:g} in rows {one + 1} "
+                f"and {first[t] + 1} of {self.source}; do remove one, or give each its "
+                "own index where both were executed"
+            )
+        found: dict[str, Any] = {"action": action, "x": x, "index": index}
+        if columns.time is not None:
+            each = [s[:, 1] if len(columns.x) == 1 else s[:, 1:] for s in samples]
+            found |= {"x": each, "sample_times": [s[:, 0] for s in samples]}
+        if "role" in optional:
+            words = self._constant(optional["role"], self.words(optional["role"]))
+            found["role"] = [self._role(t, word) for t, word in enumerate(words)]
+        if "repeat_of" in optional:
+            column = optional["repeat_of"]
+            self._constant(column, self.words(column))
+            repeated = self.numbers(column, empty=True)[first]
+            found["repeat_of"] = self._positions(repeated, index)
+        self._note_empty(x)
+        for j, column in enumerate(columns.action):
+            self._note_scales(np.abs(action[:, [j]]), column)
+        if columns.time is not None:
+            self._note_scales([np.diff(s[:, 0]) for s in samples], columns.time)
+            for j, column in enumerate(columns.x, 1):
+                self._note_scales([np.abs(s[:, j]) for s in samples], column)
+        found["action_labels"] = [columns.label(c) for c in columns.action]
+        found["channel_labels"] = [columns.label(c) for c in columns.x]
+        return found
+
+    def place(self, i: Any) -> str:
+        """Return what a message calls a row."""
+        trial = f" (trial {self.names[self.code[i]]})" if self.columns.trial else ""
+        return f"row {i + 1}{trial}"
+
+    def words(self, column: str) -> Array:
+        """Return a column as text, shape (n,), "" where it is empty."""
+        cells = self.frame[column]
+        if pd.api.types.is_float_dtype(cells):  # 1.0 and 1 name one trial
+            text = [f"{value:g}" for value in cells]
+        else:
+            text = [str(value).strip() for value in cells]
+        words = ["" if word.lower() in EMPTY else word for word in text]
+        return np.array(words, dtype=object)
+
+    def numbers(self, column: str, *, empty: bool = False) -> Array:
+        """Return a column as numbers, shape (n,), NaN where cells may be empty."""
+        cells = self.frame[column]
+        text = cells.map(lambda cell: str(cell).strip())
+        blank = text.str.lower().isin(EMPTY).to_numpy()
+        is_number = pd.api.types.is_numeric_dtype(cells)
+        parsed: Any = pd.to_numeric(cells if is_number else text, errors="coerce")
+        values = parsed.to_numpy(dtype=float, na_value=np.nan)
+        leave = "leave what was not measured empty"
+        for i in np.flatnonzero(np.isnan(values) & ~blank):
+            raise ValueError(
+                f"expected a number in column {column}, {self.place(i)}; got "
+                f"{text.iloc[i]!r} in {self.source}; do "
+                + (_remedy(column, text.iloc[i]) or leave)
+            )
+        for i in np.flatnonzero(np.isinf(values) if empty else ~np.isfinite(values)):
+            raise ValueError(
+                f"expected a finite number in column {column}, {self.place(i)}; got "
+                f"{text.iloc[i] or 'an empty cell'} in {self.source}; do "
+                + (leave if empty else "fill it in")
+            )
+        return values
+
+    def _constant(self, column: str, values: Array | None = None) -> Array:
+        """Return what each trial has in a column, which must not vary within it."""
+        values = self.numbers(column) if values is None else values
+        own = values[self.first]
+        for i in np.flatnonzero(values != own[self.code]):
+            one = self.first[self.code[i]]
+            raise ValueError(
+                f"expected one value of {column} in each trial; got {values[one]} in "
+                f"row {one + 1} and {values[i]} in {self.place(i)} of {self.source}; "
+                "do give each trial its own name, or x_* to what varies"
+            )
+        return own
+
+    def _require_order(self, time: Array, column: str) -> None:
+        """Raise where a sample is there twice, or time runs backward in a trial."""
+        for at, name in zip(self.members, self.names, strict=True):
+            order = at[np.argsort(time[at], kind="stable")]
+            for k in np.flatnonzero(np.diff(time[order]) == 0):
+                one, two = sorted(order[k : k + 2] + 1)
+                raise ValueError(
+                    f"expected each sample once; got {column} = {time[order[k]]:g} s "
+                    f"in rows {one} and {two} of {self.source}, both of trial {name}; "
+                    "do remove one, or give each trial its own name"
+                )
+            for k in np.flatnonzero(np.diff(time[at]) < 0):
+                raise ValueError(
+                    "expected times that increase within a trial; got "
+                    f"{time[at[k + 1]]:g} s in {self.place(at[k + 1])} after "
+                    f"{time[at[k]]:g} s in row {at[k] + 1} of {self.source}; do sort "
+                    "its rows, or give each trial its own name"
+                )
+
+    def _require_distinct(self, action: Array, samples: list[Array]) -> None:
+        """Raise where two trials are the same number for number."""
+        is_long, seen = self.columns.time is not None, {}
+        what = "trials" if is_long else "rows"
+        for t, own in enumerate(samples):
+            # Repeated trials without a measurement are alike, and yet two trials.
+            has = np.isfinite(own[:, 1:])
+            if not (has.any() if is_long else has.all()):
+                continue
+            one = seen.setdefault(np.append(action[t], own).tobytes(), t)
+            if one != t:
+                raise ValueError(
+                    f"expected each trial once; got the same numbers in {what} "
+                    f"{self.names[one]} and {self.names[t]} of {self.source}; do "
+                    "remove one, or give each its own index where both were executed"
+                )
+
+    def _role(self, t: int, role: str) -> str:
+        if role not in ("", "fit", "held out"):
+            raise ValueError(
+                "expected a role 'fit' or 'held out' in column "
+                f"{self.columns.optional['role']}, {self.place(self.first[t])}; got "
+                f"{role!r} in {self.source}; do write one of them, or leave it empty "
+                "for fit"
+            )
+        return role or "fit"
+
+    def _positions(self, repeated: Array, index: Array) -> list[int]:
+        """Return the position of each repeated trial, -1 for none."""
+        place = {value: i for i, value in enumerate(index)}
+        for t in np.flatnonzero((repeated >= 0) & ~np.isin(repeated, index)):
+            raise ValueError(
+                f"expected in repeat_of an index of the table; got {repeated[t]:g} in "
+                f"{self.place(self.first[t])} of {self.source}; do give that of the "
                 "first trial of this action"
             )
-        found[i] = place[float(value)]
-    return found
+        return [place[value] if value >= 0 else -1 for value in repeated]
+
+    def _note_empty(self, x: Array) -> None:
+        """Warn of what counts as not measured."""
+        for column, values in zip(self.columns.x, x.T, strict=True):
+            at = np.flatnonzero(np.isnan(values))
+            if len(at):
+                some = ", ".join(map(self.place, at[:SHOWN]))
+                more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""
+                warnings.warn(
+                    f"{len(at)} of {len(x)} cells of column {column} in {self.source} "
+                    f"hold no number: {some}{more}; they count as not measured",
+                    stacklevel=5,
+                )
+
+    def _note_scales(self, sizes: Sequence[Array] | Array, column: str) -> None:
+        """Warn where some trials' numbers are larger by as much as another unit."""
+        middle = [np.nanmedian(s) if np.isfinite(s).any() else 0 for s in sizes]
+        some = np.flatnonzero(np.array(middle) > 0)
+        if len(some) < 3:
+            return
+        decades = np.log10(np.array(middle)[some])
+        order = np.argsort(decades)
+        k = int(np.argmax(np.diff(decades[order]))) + 1
+        low, high = decades[order[:k]], decades[order[k:]]
+        if high[0] - low[-1] < GAP or max(np.ptp(low), np.ptp(high)) > WITHIN:
+            return
+        fewer, word = order[k:], "larger"
+        if len(low) < len(high):
+            fewer, word = order[:k], "smaller"
+        which = ", ".join(self.names[some[i]] for i in sorted(fewer)[:SHOWN])
+        factor = 10 ** abs(np.median(high) - np.median(low))
+        warnings.warn(
+            f"{column} of {'trials' if self.columns.trial else 'rows'} {which} in "
+            f"{self.source} is about {factor:.0f} times {word} than that of the "
+            "others: do check that all are in one unit",
+            stacklevel=5,
+        )
+
+
+def _remedy(column: str, text: str) -> str:
+    """Return what to do about a cell that is no number; "" where it says nothing."""
+    if re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?\s*[^\d\s,;].*", text):
+        name = f"{column.split('[')[0]}[unit]"
+        return f"write the unit once, in the header as {name}, with all numbers in it"
+    return "write decimals with a point" if re.fullmatch(r"[-+]?\d+,\d+", text) else ""
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    """Return a CSV file as text, its first row as the names of the columns."""
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"expected a CSV file; got none at {path}; do check the path"
+        )
+    try:
+        table = pd.read_csv(
+            path,
+            header=None,
+            dtype=str,
+            keep_default_na=False,
+            comment="#",
+            encoding="utf-8-sig",
+        )
+    except pd.errors.EmptyDataError:
+        table = pd.DataFrame([[""]])
+    except pd.errors.ParserError as error:
+        raise ValueError(
+            f"expected a CSV file with as many cells in each row as in the first; got "
+            f"{error} in {path}; do check the commas"
+        ) from error
+    header = [str(c).strip() for c in table.iloc[0]]
+    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+        raise ValueError(
+            f"expected cells separated by commas; got {header[0]!r} in {path}; do save "
+            "the table with commas"
+        )
+    return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)

@@ -114,28 +114,23 @@ def find_columns(
 
 
 def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
-    found: dict[str, list[str]] = {key: [] for key in KEYS}
-    unknown = []
+    found: dict[str, list[str]] = {key: [] for key in (*KEYS, "")}
     for name in names:
         bare = _bare(name)
-        if bare.startswith(ACTION):
-            found["action"].append(name)
-        elif bare.startswith(OBSERVATION):
-            found["x"].append(name)
-        elif bare in KEYS:
-            found[bare].append(name)
-        elif bare.startswith(f"{TIME}_") and _suffix(bare):
-            found[TIME].append(name)
-        else:
-            unknown.append(name)
+        key = bare if bare in (TRIAL, TIME, *OPTIONAL) else ""
+        for prefix, kind in ((ACTION, "action"), (OBSERVATION, "x")):
+            key = kind if bare.startswith(prefix) else key
+        if bare.startswith(f"{TIME}_") and _suffix(bare):
+            key = TIME
+        found[key].append(name)
     for key in (TRIAL, TIME, *OPTIONAL):
         if len(found[key]) > 1:
             raise ValueError(
                 f"expected one column {key}; got {', '.join(found[key])} in {source}; "
                 "do keep one"
             )
-    missing = not (found["action"] and found["x"])
-    if unknown and not missing:
+    unknown = found.pop("")
+    if unknown and found["action"] and found["x"]:
         raise ValueError(
             f"expected columns {ACTION}*, {OBSERVATION}*, {TRIAL}, {TIME}, "
             f"{', '.join(OPTIONAL)}; got {', '.join(unknown)} in {source}; do rename "
@@ -153,36 +148,36 @@ def _as_told(
             f"expected columns of {', '.join(KEYS)}; got {', '.join(wrong)}; do say "
             "which columns are these"
         )
-    by_bare = {_bare(name): name for name in names}
+    of = {_bare(name): name for name in names} | {name: name for name in names}
     found: dict[str, tuple[str, ...]] = dict.fromkeys(KEYS, ())
     for key, value in columns.items():
         told = [value] if isinstance(value, str) else [*value]
-        for name in told:
-            if name not in names and name not in by_bare:
-                near = difflib.get_close_matches(name, names, n=1)
-                hint = f"; {near[0]} is close" if near else ""
-                raise ValueError(
-                    f"expected a column {name} for {key}; got {', '.join(names)} in "
-                    f"{source}{hint}; do correct the name"
-                )
+        for name in [name for name in told if name not in of]:
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"; {near[0]} is close" if near else ""
+            raise ValueError(
+                f"expected a column {name} for {key}; got {', '.join(names)} in "
+                f"{source}{hint}; do correct the name"
+            )
         if key in (TIME, *OPTIONAL) and len(told) > 1:
             raise ValueError(
                 f"expected one column for {key}; got {', '.join(told)}; do keep one"
             )
-        found[key] = tuple(n if n in names else by_bare[n] for n in told)
+        found[key] = tuple(of[name] for name in told)
     return found
 
 
 def _units(
     used: Sequence[str], names: Sequence[str], units: Mapping[str, str], source: str
 ) -> dict[str, str]:
-    unknown = [u for u in units if u not in names and u not in map(_bare, names)]
+    unknown = {*units} - {*names, *map(_bare, names)}
     if unknown:
         raise ValueError(
             f"expected units of columns {', '.join(names)}; got one of "
-            f"{', '.join(unknown)}; do correct the name"
+            f"{', '.join(sorted(unknown))}; do correct the name"
         )
-    found = {}
+    found: dict[str, str] = {}
+    seen: dict[str, str] = {}
     for name in used:
         match = re.search(r"\[(.*)\]\s*$", name)
         header = match.group(1).strip() if match else ""
@@ -193,20 +188,13 @@ def _units(
                 f"{source} and {given} in units; do convert the numbers, or correct one"
             )
         found[name] = header or given
-    _require_one_unit(found, source)
-    return found
-
-
-def _require_one_unit(units: Mapping[str, str], source: str) -> None:
-    """Raise where one quantity has columns of two units."""
-    seen: dict[str, str] = {}
-    for name in units:
         other = seen.setdefault(_bare(name), name)
         if other != name:
             raise ValueError(
                 f"expected each quantity in one unit; got {other} and {name} in "
                 f"{source}; do convert one and merge them"
             )
+    return found
 
 
 def _bare(name: str) -> str:

@@ -42,11 +42,9 @@ class Trials:
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
-        performed_at: When each trial was executed, in any unit, shape (n,).
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
             none; None takes trials of equal actions as repeats of the first. A repeat
             of a repeat is one of the first.
-        covariates: Further numbers by name, shape (n,) each.
         action_labels: What reports call each entry of the action, with its unit.
         channel_labels: The same of each entry of x's last axis.
 
@@ -69,9 +67,7 @@ class Trials:
         mask: Any = None,
         index: Any = None,
         sample_times: Any = None,
-        performed_at: Any = None,
         repeat_of: Any = None,
-        covariates: Mapping[str, Any] | None = None,
         action_labels: Sequence[str] | None = None,
         channel_labels: Sequence[str] | None = None,
     ) -> None:
@@ -102,27 +98,18 @@ class Trials:
             self.x = self.x.where(self._kept(mask), torch.nan)
         self.x = _without_inf(self.x)
         self.role = _roles(role, n)
-        self.index = self._rows("index", index, torch.arange(n))
+        self.index = self._rows("index", torch.arange(n) if index is None else index)
         if not bool(self.index.isfinite().all()):
             raise ValueError(
                 f"expected finite places in index; got {self.index.tolist()}; pass the "
                 "place of each trial in the order of execution, or leave index out"
             )
-        self.performed_at = (
-            None
-            if performed_at is None
-            else self._rows("performed_at", performed_at, None)
-        )
         self.sample_times = self._times(sample_times)
         self.repeat_of = (
             repeated(self.action)
             if repeat_of is None
-            else root(self._rows("repeat_of", repeat_of, None))
+            else root(self._rows("repeat_of", repeat_of))
         )
-        self.covariates = {
-            name: self._rows(name, value, None)
-            for name, value in (covariates or {}).items()
-        }
         self.action_labels = require_labels(
             "action_labels", action_labels, [self.action.shape[1]]
         )
@@ -183,11 +170,6 @@ class Trials:
         units: Mapping[str, str] | None = None,
     ) -> Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
-
-        Args:
-            frame: With one row a trial or one row a sample.
-            columns: As in :meth:`from_csv`.
-            units: As there.
 
         Example:
             >>> frame = pd.DataFrame(
@@ -278,9 +260,7 @@ class Trials:
             role=[self.role[i] for i in at],
             index=self.index[at],
             sample_times=times if times is None or times.ndim == 1 else times[at],
-            performed_at=None if self.performed_at is None else self.performed_at[at],
             repeat_of=repeat_of,
-            covariates={name: v[at] for name, v in self.covariates.items()},
             action_labels=self.action_labels,
             channel_labels=self.channel_labels,
         )
@@ -294,8 +274,8 @@ class Trials:
             )
         return self.select(positions)
 
-    def _rows(self, name: str, value: Any, default: Tensor | None) -> Tensor:
-        tensor = copied(default if value is None else value)
+    def _rows(self, name: str, value: Any) -> Tensor:
+        tensor = copied(value)
         if tensor.shape != (len(self),):
             raise ValueError(
                 f"expected {name} of shape ({len(self)},), one a trial; got "

@@ -36,7 +36,12 @@ def applied(
     own = Context(context.index.clone(), times)
     changed = effect.apply(_copied(value), phi.clone(), action.clone(), own)
     if effect.hook == "dynamics":
-        return _keywords(effect, changed)
+        if isinstance(changed, Mapping):
+            return {**changed}
+        raise ValueError(
+            f"expected apply of effect {effect.name!r} to return a dict of keyword "
+            f"arguments; got {type(changed).__name__}; return {{**value, name: phi}}"
+        )
     try:
         result = torch.as_tensor(changed)
     except (TypeError, ValueError, RuntimeError):
@@ -54,15 +59,6 @@ def applied(
             f"{result.dtype}; return the changed {effect.hook}"
         )
     return result.to(value.dtype, copy=True)
-
-
-def _keywords(effect: Effect, changed: Any) -> dict[str, Any]:
-    if not isinstance(changed, Mapping):
-        raise ValueError(
-            f"expected apply of effect {effect.name!r} to return a dict of keyword "
-            f"arguments; got {type(changed).__name__}; return {{**value, name: phi}}"
-        )
-    return {**changed}
 
 
 def _copied(value: Any) -> Any:

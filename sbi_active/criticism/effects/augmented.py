@@ -47,7 +47,6 @@ class AugmentedSimulator(SimulatorModel):
             effect is compared with the simulator at its null; None compares in the
             first evaluation.
         next_index: Index of the trial that a plain call simulates.
-        sample_times: Times of x's first axis; None takes the model's.
 
     Raises:
         ValueError: If two effects share a name, or one does not vanish at its null.
@@ -66,7 +65,6 @@ class AugmentedSimulator(SimulatorModel):
         *,
         check: tuple[Tensor, Tensor] | None = None,
         next_index: int = 0,
-        sample_times: Tensor | None = None,
     ) -> None:
         base, before = model, []
         if isinstance(model, AugmentedSimulator):
@@ -77,7 +75,6 @@ class AugmentedSimulator(SimulatorModel):
         require_distinct(self.effects, base.parameter_names or ())
         self.next_index = next_index
         times = getattr(model, "sample_times", None)
-        times = times if sample_times is None else sample_times
         self._times = None if times is None else torch.as_tensor(times).double().clone()
         names = base.parameter_names
         if names is not None:
@@ -301,27 +298,17 @@ class AugmentedSimulator(SimulatorModel):
         spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
         scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
         for effect in self._unchecked:
+            changed, without, allowed = "x", x, TOLERANCE * scale
             if effect.hook == "noise":
-                one = torch.ones_like(x)
-                difference = _difference(
-                    one,
-                    lambda null, e=effect, one=one: applied(
-                        e, one, null, action, context
-                    ),
-                    effect,
-                )
-                allowed = TOLERANCE
-            else:
-                difference = _difference(
-                    x,
-                    lambda null, e=effect: self._seeded(
-                        theta, {e.name: null}, action, context
-                    ),
-                    effect,
-                )
-                allowed = TOLERANCE * scale
+                changed, without, allowed = "the noise", torch.ones_like(x), TOLERANCE
+
+            def at_null(null: Tensor, e: Effect = effect, x: Tensor = without) -> Any:
+                if e.hook == "noise":
+                    return applied(e, x, null, action, context)
+                return self._seeded(theta, {e.name: null}, action, context)
+
+            difference = _difference(without, at_null, effect)
             if difference > allowed:
-                changed = "the noise" if effect.hook == "noise" else "x"
                 raise ValueError(
                     f"expected effect {effect.name!r} to vanish at its null "
                     f"{effect.null}; got {changed} changed by up to "

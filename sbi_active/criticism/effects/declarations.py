@@ -36,10 +36,12 @@ def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) 
     """Raise where two numbers would have one name in tables and records.
 
     Args:
-        effects: By their own names, and those of the entries of their phi.
+        effects: By their own names, whose parts between " + " must not come again
+            either, since that joins names, and those of the entries of their phi.
         parameters: Names of the simulator's own.
     """
-    _require_once([effect.name for effect in effects], "effects with distinct names")
+    parts = [part for effect in effects for part in effect.name.split(" + ")]
+    _require_once(parts, "effects with distinct names")
     shown = [effect for effect in effects if effect.scope == "campaign"]
     entries = [name for effect in shown for name in effect.phi_names]
     _require_once(

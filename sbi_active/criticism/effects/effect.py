@@ -200,11 +200,8 @@ def _require_parts(effect: Effect) -> None:
             raise ValueError(
                 f"expected {part} of an effect as text; got {value!r}; pass a string"
             )
-    if not effect.name or " + " in effect.name:
-        raise ValueError(
-            f"expected a name without ' + ', which joins names; got {effect.name!r}; "
-            "do choose another"
-        )
+    if not effect.name:
+        raise ValueError("expected a name of an effect; got ''; pass one")
     if not isinstance(effect.prior, Distribution):
         raise ValueError(
             f"expected a torch distribution as prior of effect {effect.name!r}; got "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 from torch.distributions import (
@@ -78,27 +80,23 @@ def _of_action(actions: ActionSpace) -> list[Effect]:
     width = torch.where(high > low, high - low, high.abs().clamp(min=1e-12))
     largest = some.abs().max(0).values.clamp(min=1e-12)
     units = actions.units[0] if len({*actions.units}) == 1 else ""
+    make = partial(Effect, hook="action", null=0.0)
     found = [
-        Effect(
+        make(
             "action gain",
-            hook="action",
             prior=_normal(torch.full_like(width, GAIN)),
-            null=0.0,
             apply=_gain,
             describe="the action that is executed is a multiple of the commanded one",
         ),
-        Effect(
+        make(
             "action offset",
-            hook="action",
             prior=_normal(OFFSET * width),
-            null=0.0,
             apply=_add,
             units=units,
             describe="the action that is executed is shifted from the commanded one",
         ),
-        Effect(
+        make(
             "action saturation",
-            hook="action",
             prior=Independent(Uniform(LIMIT[0] * largest, LIMIT[1] * largest), 1),
             null=torch.inf,
             apply=_clamp,
@@ -108,11 +106,9 @@ def _of_action(actions: ActionSpace) -> list[Effect]:
     ]
     if bool(((low < 0) & (high > 0)).any()):
         found.append(
-            Effect(
+            make(
                 "dead zone",
-                hook="action",
                 prior=Independent(HalfNormal(OFFSET * width), 1),
-                null=0.0,
                 apply=_dead_zone,
                 units=units,
                 describe="actions are executed smaller by a constant, small ones not",
@@ -124,28 +120,23 @@ def _of_action(actions: ActionSpace) -> list[Effect]:
 def _of_observation(
     sd: Tensor, spread: Tensor | None, model: SimulatorModel
 ) -> list[Effect]:
+    make = partial(Effect, hook="observation", null=0.0)
     found = [
-        Effect(
+        make(
             "bias",
-            hook="observation",
             prior=_normal(BIAS * sd),
-            null=0.0,
             apply=_add,
             describe="the sensor reads a constant too much",
         ),
-        Effect(
+        make(
             "sensor gain",
-            hook="observation",
             prior=_normal(torch.full_like(sd, GAIN)),
-            null=0.0,
             apply=_gain,
             describe="the sensor reads a multiple of the truth",
         ),
-        Effect(
+        make(
             "drift",
-            hook="observation",
             prior=_normal(DRIFT * sd),
-            null=0.0,
             apply=_drift,
             units="a trial",
             describe="the sensor's bias grows from trial to trial",
@@ -154,11 +145,9 @@ def _of_observation(
     if model.sample_times is not None:
         span = float(model.sample_times.max() - model.sample_times.min())
         found.append(
-            Effect(
+            make(
                 "clock offset",
-                hook="observation",
                 prior=_normal(torch.tensor([CLOCK * span]).double()),
-                null=0.0,
                 apply=_shift_in_time,
                 units="s",
                 describe="the time stamps are late by a constant",
@@ -167,9 +156,8 @@ def _of_observation(
     if spread is not None:
         low, high = (torch.log(f * spread.reshape(1)) for f in RANGE)
         found.append(
-            Effect(
+            make(
                 "sensor saturation",
-                hook="observation",
                 prior=Independent(Uniform(low, high), 1),
                 null=torch.inf,
                 apply=_clamp_log,

@@ -27,7 +27,7 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
 
-__all__ = ["MANY", "MOST", "Summarized", "can_summarize", "summarize"]
+__all__ = ["MANY", "MOST", "Summarized", "obstacle", "summarize"]
 
 Array = NDArray[Any]
 
@@ -87,7 +87,7 @@ def summarize(
         ValueError: If the noise is not independent and Gaussian, numbers are masked,
             or an effect changes the noise.
     """
-    reason = _reason(model, trials, effects)
+    reason = obstacle(model, trials, effects)
     if reason:
         raise ValueError(
             "expected whole observations with independent Gaussian noise for "
@@ -126,23 +126,14 @@ def summarize(
             (x - center) @ weight.T,
             role=trials.role,
             index=trials.index,
-            performed_at=trials.performed_at,
             repeat_of=trials.repeat_of,
-            covariates=trials.covariates,
         ),
         [_before_summary(e) for e in effects],
         weight,
     )
 
 
-def can_summarize(
-    model: SimulatorModel, trials: Trials, effects: Sequence[Effect]
-) -> bool:
-    """Return whether there are summaries whose noise is known."""
-    return not _reason(model, trials, effects)
-
-
-def _reason(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -> str:
+def obstacle(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -> str:
     """Return what stands against summaries, in words; "" for nothing."""
     reason = ""
     if not isinstance(model.noise, GaussianNoise):

@@ -29,6 +29,7 @@ from sbi_active.criticism.rivals.error_models import (
     NoiseCell,
     NoiseGrid,
     Whitener,
+    drawn,
     student,
 )
 from sbi_active.criticism.rivals.residual_process import smooth_features
@@ -83,17 +84,13 @@ class OneOutlier(ErrorModel):
 
     @override
     def log_likelihood(self, residual: Array) -> Array:
-        parts = [
-            self._joint(residual, c).reshape(len(residual), -1)
-            for c in range(len(self.noise.cells))
-        ]
-        return log_sum_exp(np.concatenate(parts, 1), axis=1)
+        return log_sum_exp(self._joint(residual).reshape(len(residual), -1), axis=1)
 
     def responsibility(self, residual: Array) -> Array:
         """Return the probability that each trial is the one, shape (n, k)."""
-        cells = range(len(self.noise.cells))
-        joint = np.stack([self._joint(residual, c) for c in cells], 1)
-        rows = np.moveaxis(joint, 2, 1).reshape(len(residual), len(self.trials), -1)
+        rows = np.moveaxis(self._joint(residual), 2, 1).reshape(
+            len(residual), len(self.trials), -1
+        )
         each = log_sum_exp(rows, axis=2)
         return np.exp(each - log_sum_exp(each, axis=1)[:, None])
 
@@ -113,17 +110,13 @@ class OneOutlier(ErrorModel):
             parts.append(log_sum_exp(others + weight, axis=1) - scale)
         return log_sum_exp(np.stack(parts), axis=0)
 
+    @override
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Return a cell and a scale of the noise for each residual, at random."""
-        cells = range(len(self.noise.cells))
-        joint = np.stack([self._joint(residual, c) for c in cells], 1)
-        joint = np.moveaxis(joint, 2, 3)  # (n, cells, scales, trials, ...)
+    ) -> tuple[NDArray[np.intp], Array]:
+        joint = np.moveaxis(self._joint(residual), 2, 3)  # (n, cells, scales, ...)
         log_p = log_sum_exp(joint.reshape(*joint.shape[:3], -1), axis=3)
-        flat = log_p.reshape(len(residual), -1)
-        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
-        cell, scale = np.unravel_index(best, log_p.shape[1:])
+        cell, scale = drawn(log_p, rng)
         return cell, self.noise.scales[scale]
 
     @override
@@ -132,8 +125,7 @@ class OneOutlier(ErrorModel):
 
     @override
     def whitener(self, residual: Array) -> Whitener:
-        cells = range(len(self.noise.cells))
-        joint = np.stack([self._joint(residual[None], c)[0] for c in cells])
+        joint = self._joint(residual[None])[0]
         best = np.unravel_index(np.argmax(joint), joint.shape)
         cell, trial, scale, kind, size = map(int, best)
         return self._whitener(cell, trial, scale, kind, self.sizes[size])
@@ -169,7 +161,12 @@ class OneOutlier(ErrorModel):
 
         return whiten
 
-    def _joint(self, residual: Array, c: int) -> Array:
+    def _joint(self, residual: Array) -> Array:
+        """Return log p(residual, cell, trial, ...), shape (n, cells, k, ...)."""
+        cells = range(len(self.noise.cells))
+        return np.stack([self._within(residual, c) for c in cells], 1)
+
+    def _within(self, residual: Array, c: int) -> Array:
         """Return log p(residual, trial, scale, kind, size) in a cell, (n, k, ...)."""
         cell, scales = self.noise.cells[c], self.noise.scales
         e = cell.whiten(residual)

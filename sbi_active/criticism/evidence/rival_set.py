@@ -13,6 +13,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import (
     ENOUGH,
     MAX_ROUNDS,
@@ -25,7 +26,7 @@ from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.proposals import regressions, ridges
 from sbi_active.criticism.evidence.starts import starts_near_parents
 from sbi_active.criticism.evidence.tempering import temper
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Evidence
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
@@ -90,8 +91,7 @@ class RivalSet:
         is_smooth: Whether derivatives mean anything.
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
-        evidences: Of the rivals that were asked for, by name.
-        samples: Weighted samples behind them.
+        fits: The rivals that were asked for.
     """
 
     def __init__(
@@ -127,34 +127,26 @@ class RivalSet:
         self.simulator.measurements = self.measurements
         self.can_fail = not trials.valid.all() or self.simulator.failed
         self.step, self.is_smooth, self.roughness = look_for_jumps(
-            self.rival(()), seed=seed
+            self.rival(ModelKey()), seed=seed
         )
         if self.roughness.any():
             self.noise = self.noise.with_extra(self.roughness)
-        self.evidences: dict[str, Evidence] = {}
-        self.samples: dict[str, ImportanceSample] = {}
-        self.rivals: dict[str, Rival] = {}
+        self.fits: dict[ModelKey, Fit] = {}
 
-    def rival(self, names: Sequence[str], *, error: str | None = None) -> Rival:
-        """Return the simulator with some effects and an error model.
-
-        Args:
-            names: Of the effects.
-            error: None for the noise alone, "unexplained", "scatter" or "outlier".
-        """
-        parts = [*names, *([] if error is None else [error])]
+    def rival(self, key: ModelKey) -> Rival:
+        """Return the simulator with some effects and an error model."""
         return Rival(
-            " + ".join(parts) or NONE,
+            key,
             simulator=self.simulator,
             prior=self.prior,
-            effects=[self.effects[name] for name in names],
+            effects=[self.effects[name] for name in key.effects],
             nuisances=self.nuisances,
-            error=self._error_model(error),
+            error=self._error_model(key.error),
             spread=self.spread,
             center=self.center,
             disagreement=(
                 UNKNOWN_RATES
-                if error == UNEXPLAINED and self.can_fail
+                if key.error == UNEXPLAINED and self.can_fail
                 else (DISAGREEMENT,)
             ),
         )
@@ -226,44 +218,37 @@ class RivalSet:
             return None
         return (index - own.min()) / span
 
-    def evidence(
-        self, names: Sequence[str] = (), *, error: str | None = None
-    ) -> Evidence:
-        """Return the evidence of one rival, computed once."""
-        rival = self.rival(names, error=error)
-        if rival.name not in self.evidences:
-            seed = derive_seed(self.seed, "evidence", rival.name)
+    def fit(self, key: ModelKey = ModelKey()) -> Fit:  # noqa: B008  (frozen)
+        """Return one rival with its posterior and evidence, computed once."""
+        if key not in self.fits:
+            rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
             before = self.simulator.num_simulations
             sample, engine = self._estimate(rival, seed)
-            self._keep(rival, sample, engine, before, seed)
-        return self.evidences[rival.name]
+            self.fits[key] = self._record(rival, sample, engine, before, seed)
+        return self.fits[key]
 
-    def tempered(
-        self, names: Sequence[str] = (), *, error: str | None = None
-    ) -> Evidence:
+    def tempered(self, key: ModelKey = ModelKey()) -> Evidence:  # noqa: B008
         """Return the evidence by tempering, and keep it where it is the larger.
 
         A mode that the least-squares search missed is missing from its evidence, and
         no effective sample size shows it. A few particles do the check; where they say
         more than the evidence, the full number decides.
         """
-        rival = self.rival(names, error=error)
-        own = self.evidence(names, error=error)
-        seed = derive_seed(self.seed, "tempering", rival.name)
+        rival, own = self.fit(key).rival, self.fit(key).evidence
+        seed = derive_seed(self.seed, "tempering", str(key))
         before = self.simulator.num_simulations
         sample = self._temper(rival, seed, few=True)
         either = np.hypot(own.standard_error, sample.standard_error)
         if not sample.log_evidence < own.log_evidence + TOLERATED * either:
             sample = self._temper(rival, seed, few=False)
         other = self._record(rival, sample, "tempering", before, seed)
-        both = float(np.hypot(own.standard_error, other.standard_error))
-        if other.log_evidence > own.log_evidence + 2 * both:
-            self.evidences[rival.name] = other
-            self.samples[rival.name] = sample
-        return other
+        both = float(np.hypot(own.standard_error, sample.standard_error))
+        if sample.log_evidence > own.log_evidence + 2 * both:
+            self.fits[key] = other
+        return other.evidence
 
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
-        near = starts_near_parents(self.rivals, self.samples, rival, seed)
+        near = starts_near_parents(self.fits, rival, seed)
         search = THOROUGH if self.is_smooth else ROUGH
         modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
         rng = np.random.default_rng(seed)
@@ -314,20 +299,8 @@ class RivalSet:
 
     def _best_evidence(self) -> float:
         """Return the largest log evidence so far."""
-        known = [e.log_evidence for e in self.evidences.values()]
+        known = [fit.evidence.log_evidence for fit in self.fits.values()]
         return float(max([*known, self.reference]))
-
-    def _keep(
-        self,
-        rival: Rival,
-        sample: ImportanceSample,
-        engine: str,
-        before: int,
-        seed: int,
-    ) -> None:
-        self.evidences[rival.name] = self._record(rival, sample, engine, before, seed)
-        self.samples[rival.name] = sample
-        self.rivals[rival.name] = rival
 
     def _record(
         self,
@@ -336,7 +309,7 @@ class RivalSet:
         engine: str,
         before: int,
         seed: int,
-    ) -> Evidence:
+    ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
         best = sample.u[np.argsort(sample.weights)[-NUM_TOP:]]
         joint = rival.coordinates.joint
@@ -347,8 +320,8 @@ class RivalSet:
         own = sum(joint.sizes)
         residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
-        return Evidence(
-            name=rival.name,
+        evidence = Evidence(
+            key=rival.key,
             log_evidence=sample.log_evidence,
             standard_error=sample.standard_error,
             effective_sample_size=sample.effective_sample_size,
@@ -358,6 +331,7 @@ class RivalSet:
             draws=rival.coordinates.to_z(u)[:, :own],
             best_chi_square=float(min(square)),
         )
+        return Fit(rival, sample, evidence)
 
     def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
         """Return mean and deviation of each number before the data, shapes (N,)."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.importance import ImportanceSample
-from sbi_active.criticism.results import NONE
+from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 
 __all__ = ["starts_near_parents"]
@@ -21,10 +21,7 @@ NUM_NEAR = 8
 
 
 def starts_near_parents(
-    rivals: Mapping[str, Rival],
-    samples: Mapping[str, ImportanceSample],
-    rival: Rival,
-    seed: int,
+    fits: Mapping[ModelKey, Fit], rival: Rival, seed: int
 ) -> Array | None:
     """Return points at posteriors of smaller rivals, the rest from the prior.
 
@@ -32,8 +29,7 @@ def starts_near_parents(
     it is the bare model.
 
     Args:
-        rivals: Those whose posterior is known, by name.
-        samples: Of these posteriors.
+        fits: Rivals whose posterior is known.
         rival: Whose search starts.
         seed: Of the draws.
 
@@ -41,16 +37,16 @@ def starts_near_parents(
         Shape (k, dim); None without a parent.
     """
     names = [e.name for e in rival.effects]
-    parents = [[n for n in names if n != left] for left in names] or [[]]
-    known = [p for p in parents if (" + ".join(p) or NONE) in rivals]
-    if not known or rival.name == NONE:
+    parents = [tuple(n for n in names if n != left) for left in names] or [()]
+    known = [ModelKey(p) for p in parents if ModelKey(p) in fits]
+    if not known or rival.key == ModelKey():
         return None
     rng = np.random.default_rng(seed)
     parts = []
-    for own in known:
-        parent = rivals[" + ".join(own) or NONE]
+    for key in known:
+        parent = fits[key].rival
         each = max(NUM_NEAR // len(known), 1)
-        drawn = parent.coordinates.to_z(samples[parent.name].draws(each, rng))
+        drawn = parent.coordinates.to_z(fits[key].sample.draws(each, rng))
         z = rival.coordinates.to_z(rival.coordinates.sample(each, seed=seed))
         shared, theta_dim = parent.columns(), parent.theta_dim
         z[:, :theta_dim] = drawn[:, :theta_dim]

@@ -16,7 +16,6 @@ and so is one whose null is infinite, about which a scale has no meaning.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["SCALES", "log_evidence"]
@@ -36,32 +36,30 @@ SCALES = (1 / 3, 1.0, 3.0)
 
 def log_evidence(
     rivals: RivalSet,
-    names: Sequence[str] = (),
+    key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
     *,
-    error: str | None = None,
     factor: float = 1.0,
 ) -> tuple[float, float]:
     """Return the log evidence of a rival under unknown scales, and its error.
 
     Args:
         rivals: The models.
-        names: Of the effects.
-        error: As in :meth:`RivalSet.evidence`.
+        key: Which of them.
         factor: By which the declared scales are multiplied first.
 
     Returns:
         Log evidence and its Monte Carlo standard error, nats.
     """
-    evidence = rivals.evidence(names, error=error)
-    if not names or not np.isfinite(evidence.log_evidence):
+    fit = rivals.fit(key)
+    rival, sample, evidence = fit.rival, fit.sample, fit.evidence
+    if not key.effects or not np.isfinite(evidence.log_evidence):
         return evidence.log_evidence, evidence.standard_error
-    rival, sample = rivals.rivals[evidence.name], rivals.samples[evidence.name]
     some = sample.weights > 0
     z = torch.from_numpy(rival.coordinates.to_z(sample.u[some]))
     log_w = np.log(sample.weights[some])
     bounded = np.isfinite(rival.coordinates.low) & np.isfinite(rival.coordinates.high)
     for name, place in rival.columns().items():
-        if name not in names or bounded[place].any():
+        if name not in key.effects or bounded[place].any():
             continue
         effect, phi = rivals.effects[name], z[:, place]
         null = effect.null_phi(len(phi))

@@ -19,7 +19,7 @@ from sbi_active.criticism.next_trial.candidates import (
     simulated,
 )
 from sbi_active.criticism.next_trial.outside import outside_candidates
-from sbi_active.criticism.results import CATCH_ALLS, NextAction, Tracing
+from sbi_active.criticism.results import ModelKey, NextAction, Tracing
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.design.design import Design
 from sbi_active.design.designer import InformationGainDesigner
@@ -46,16 +46,16 @@ class PredictedRival:
 
     Args:
         rivals: The models.
-        name: Of this one, as in ``tracing.probabilities``.
+        key: Of this one.
         probability: Of this one, those of all rivals adding up to one.
         candidates: All actions that will be asked for, shape (a, action_dim). They are
             predicted together, each as the next trial.
     """
 
     def __init__(
-        self, rivals: RivalSet, name: str, probability: float, candidates: Tensor
+        self, rivals: RivalSet, key: ModelKey, probability: float, candidates: Tensor
     ) -> None:
-        self.rivals, self.name, self.probability = rivals, name, probability
+        self.rivals, self.key, self.probability = rivals, key, probability
         self.candidates = candidates
         self._trials = following(rivals, candidates)
         self._draws: tuple[tuple[int, int], Tensor] | None = None
@@ -94,12 +94,10 @@ class PredictedRival:
 
         Outcomes are NaN where there is none.
         """
-        parts = self.name.split(" + ")
         prediction = predict(
             self.rivals,
             self._trials,
-            names=tuple(n for n in parts if n in self.rivals.effects),
-            error=self.name if self.name in CATCH_ALLS else None,
+            key=self.key,
             num_draws=num_samples,
             seed=seed,
             scored=False,
@@ -136,7 +134,7 @@ def choose_action(
     action = None
     if len(named) > 1:
         p = np.array([tracing.probabilities[n] for n in named])
-        design = _select(rivals, named, p / p.sum(), candidates)
+        design = _select(rivals, tracing, named, p / p.sum(), candidates)
         gain = design.expected_information_gain.clamp_min(0.0).numpy()
         if gain[design.index] >= NOTHING:
             action = design.action.double().numpy()
@@ -153,29 +151,20 @@ def choose_action(
         groups = [frozenset(named)]
     groups = [g for g in groups if len(g) > 1]
     found = replace(found, inseparable=(*groups,))
-    if not beyond:
+    if not beyond or not groups:
         return found
-    return _look_outside(rivals, found, groups, actions, candidates)
+    others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
+    return _look_outside(rivals, tracing, found, simulated(rivals, others))
 
 
 def _look_outside(
-    rivals: RivalSet,
-    found: NextAction,
-    groups: Sequence[frozenset[str]],
-    actions: ActionSpace,
-    candidates: Tensor,
+    rivals: RivalSet, tracing: Tracing, found: NextAction, others: Tensor
 ) -> NextAction:
     """Return the choice with an action that is not permitted, if one separates."""
-    if not groups:
-        return found
-    others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
-    others = simulated(rivals, others)
-    if len(others) == 0:
-        return found
-    for group in groups:
+    for group in found.inseparable if len(others) else ():
         names = [n for n in found.separates if n in group]
         equal = np.full(len(names), 1 / len(names))
-        design = _select(rivals, names, equal, others)
+        design = _select(rivals, tracing, names, equal, others)
         gain = float(design.expected_information_gain[design.index])
         error = float(design.standard_error[design.index])
         if gain - 2 * error >= NOTHING and gain > found.outside_gain:
@@ -189,10 +178,14 @@ def _look_outside(
 
 
 def _select(
-    rivals: RivalSet, names: Sequence[str], p: Array, candidates: Tensor
+    rivals: RivalSet,
+    tracing: Tracing,
+    names: Sequence[str],
+    p: Array,
+    candidates: Tensor,
 ) -> Design:
     models = [
-        PredictedRival(rivals, name, float(share), candidates)
+        PredictedRival(rivals, tracing.evidences[name].key, float(share), candidates)
         for name, share in zip(names, p, strict=True)
     ]
     designer = InformationGainDesigner(

@@ -34,7 +34,7 @@ from sbi_active.criticism.next_trial.candidates import (
     simulated,
 )
 from sbi_active.criticism.next_trial.outside import extrapolated
-from sbi_active.criticism.results import UNEXPLAINED, SevereTest, Tracing
+from sbi_active.criticism.results import UNEXPLAINED, ModelKey, SevereTest, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
 
 __all__ = ["severe_tests"]
@@ -68,19 +68,19 @@ def severe_tests(
         (simulated(rivals, beyond), False),
     )
     return tuple(
-        _most_severe(rivals, tracing.chosen, some, is_permitted=is_permitted)
+        _most_severe(rivals, tracing.key, some, is_permitted=is_permitted)
         for some, is_permitted in tested
         if len(some)
     )
 
 
 def _most_severe(
-    rivals: RivalSet, names: tuple[str, ...], candidates: Tensor, *, is_permitted: bool
+    rivals: RivalSet, key: ModelKey, candidates: Tensor, *, is_permitted: bool
 ) -> SevereTest:
     trials = following(rivals, candidates)
     options = {"num_draws": NUM_DRAWS, "scored": False}
-    verdict = predict(rivals, trials, names=names, **options)
-    free = predict(rivals, trials, error=UNEXPLAINED, **options)
+    verdict = predict(rivals, trials, key=key, **options)
+    free = predict(rivals, trials, key=ModelKey(error=UNEXPLAINED), **options)
     difference = _difference(verdict, free, len(candidates))
     best = int(np.argmax(difference))
     return SevereTest(

@@ -19,6 +19,7 @@ from sbi_active.criticism.results import (
     UNEXPLAINED,
     Detection,
     Evaluation,
+    ModelKey,
     Residuals,
     Tracing,
 )
@@ -220,7 +221,7 @@ def _of_verdict(
         )
     if tracing.verdict == UNEXPLAINED:
         place = (
-            f"beside {' + '.join(tracing.beside)}" if tracing.beside else "in its place"
+            f"beside {ModelKey(tracing.beside)}" if tracing.beside else "in its place"
         )
         yield (
             f"no declared effect explains the data: the residual process {place} does "

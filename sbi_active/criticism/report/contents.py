@@ -51,19 +51,19 @@ class Contents:
     """
 
     residuals: Residuals
-    residuals_after: Residuals | None
     detection: Detection
     tracing: Tracing
-    evaluation: Evaluation | None
-    next_action: NextAction | None
     simulator: SimulatorModel
     prior: Distribution
     warnings: tuple[str, ...]
-    digest: str
     exploratory: bool
     num_trials: int
     action_labels: tuple[str, ...]
     channel_names: tuple[str, ...] | None
+    residuals_after: Residuals | None = None
+    evaluation: Evaluation | None = None
+    next_action: NextAction | None = None
+    digest: str = ""
     leave_one_out: tuple[LeaveOneOut, ...] = ()
     severe_tests: tuple[SevereTest, ...] = ()
 

@@ -88,7 +88,7 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
     kept = [
         (name, p)
         for name, p in tracing.probabilities.items()
-        if p >= 0.01 or " + " not in name
+        if p >= 0.01 or not tracing.has_several(name)
     ]
     order = sorted(kept, key=lambda item: -item[1])[:at_most]
     names = [name for name, _ in order][::-1]
@@ -164,7 +164,7 @@ def _by_entry(
         ax.set_xlabel("time [s]")
         return
     num = each.shape[1]
-    _scatter_entries(ax, np.arange(num), each, color)
+    ax.plot(np.arange(num), each.T, ".", ms=4, alpha=0.6, c=color)
     ax.set_xlabel("channel")
     if channel_names is not None and len(channel_names) == num <= 12:
         ax.set_xticks(range(num), channel_names, rotation=45, ha="right", fontsize=7)
@@ -175,10 +175,6 @@ def _scatter(ax: Axes, place: Array, each: Array, color: str) -> None:
     """Draw all entries of a trial at its place, and their root mean square."""
     many = each.shape[1] > 1
     ax.plot(place, each, ".", ms=3 if many else 7, alpha=0.45 if many else 0.9, c=color)
-
-
-def _scatter_entries(ax: Axes, place: Array, each: Array, color: str) -> None:
-    ax.plot(place, each.T, ".", ms=4, alpha=0.6, c=color)
 
 
 def _residual_axis(ax: Axes, each: Array) -> None:

@@ -19,14 +19,14 @@ SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
 def effects(report: Contents) -> Section:
     """Return every model alone, and the sets of effects that have a share."""
     tracing = report.tracing
-    any_set = any(" + " in name for name in tracing.probabilities)
+    any_set = any(map(tracing.has_several, tracing.probabilities))
     shares = ("P in any set",) if any_set else ()
     header = ("model", "P", *shares, "phi", "log BF", "ESS", "90 % set")
     estimates = {e.name: e for e in tracing.estimates}
     null = tracing.evidences[NONE].log_evidence
     rows, left_out = [], 0
     for name, p in tracing.probabilities.items():
-        if " + " in name and p < SHOWN and name != tracing.verdict:
+        if tracing.has_several(name) and p < SHOWN and name != tracing.verdict:
             left_out += 1
             continue
         inclusion, phi, fit, order = ("",) * any_set, "", ("", ""), -np.inf

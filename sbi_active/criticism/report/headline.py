@@ -6,7 +6,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
-from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED
+from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 
 __all__ = [
     "added",
@@ -26,7 +26,7 @@ def verdict_line(report: Contents) -> str:
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
     line += verdict_clause(tracing)
     if tracing.beside:
-        line += f", beside {' + '.join(tracing.beside)}"
+        line += f", beside {ModelKey(tracing.beside)}"
     if report.guess is not None:
         line += f", a guess, not declared: {report.guess}"
     if not tracing.robust:
@@ -41,10 +41,10 @@ def verdict_line(report: Contents) -> str:
 
 def added(report: Contents) -> str:
     """Return what was added to the bare model, in words."""
-    beside = " + ".join(report.tracing.beside)
+    beside = report.tracing.beside
     words = {
         NONE: "nothing",
-        UNEXPLAINED: (beside and f"{beside} and ") + "a residual process",
+        UNEXPLAINED: f"{ModelKey(beside)} and " * bool(beside) + "a residual process",
         SCATTER: "larger noise",
         OUTLIER: f"{in_words(report.tracing)} set aside",
     }
@@ -64,7 +64,7 @@ def summary_sentence(report: Contents) -> str:
         return f"The bare model explains the {trials} ({against})."
     found = [f"The bare model misses the {trials} ({against})."]
     if report.tracing.beside:
-        most = " + ".join(report.tracing.beside)
+        most = ModelKey(report.tracing.beside)
         found.append(f"{most} explains most of what it misses, and not all.")
     elif report.verdict == UNEXPLAINED:
         found.append("No declared effect explains what it misses.")

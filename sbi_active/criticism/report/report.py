@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
-from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
@@ -16,16 +15,6 @@ from sbi_active.criticism.report import rendering
 from sbi_active.criticism.report.cautions import find_warnings
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import verdict_line
-from sbi_active.criticism.results import (
-    Detection,
-    Evaluation,
-    NextAction,
-    Residuals,
-    SevereTest,
-    Tracing,
-)
-from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
-from sbi_active.simulation.model import SimulatorModel
 
 __all__ = ["Report", "build_report"]
 
@@ -78,44 +67,21 @@ class Report(Contents):
 def build_report(
     *,
     trials: Trials,
-    residuals: Residuals,
-    detection: Detection,
-    tracing: Tracing,
-    simulator: SimulatorModel,
-    prior: Distribution,
-    residuals_after: Residuals | None = None,
-    evaluation: Evaluation | None = None,
-    next_action: NextAction | None = None,
     actions: ActionSpace | None = None,
-    digest: str = "",
-    exploratory: bool = False,
     designed: bool = False,
-    leave_one_out: Sequence[LeaveOneOut] = (),
-    severe_tests: Sequence[SevereTest] = (),
+    exploratory: bool = False,
     warnings: Sequence[str] = (),
+    **parts: Any,
 ) -> Report:
     """Put the parts together, and find what a reader must be warned of.
 
     Args:
         trials: The measured trials.
-        residuals: Of the bare model.
-        detection: Whether it misses the data.
-        tracing: Which effect the data point to.
-        simulator: The augmented simulator, or the bare one.
-        prior: Of its parameters.
-        residuals_after: Of the augmented simulator.
-        evaluation: Error before and after.
-        next_action: What to do next.
         actions: Permitted ones, for names and units.
-        digest: Hash of what was frozen before the data.
-        exploratory: What was frozen was changed afterwards.
         designed: Actions were chosen for their information.
-        leave_one_out: Of the bare model and of the one that was chosen.
-        severe_tests: Where the verdict would be put to the test most.
+        exploratory: What was frozen was changed afterwards.
         warnings: Further ones.
-
-    Returns:
-        The report.
+        **parts: As in :class:`.Contents`.
     """
     labels = [f"action {i + 1}" for i in range(trials.action.shape[1])]
     if trials.action_labels is not None:
@@ -125,33 +91,23 @@ def build_report(
         labels = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
     found = find_warnings(
         trials,
-        residuals,
-        tracing,
-        detection=detection,
-        residuals_after=residuals_after,
-        evaluation=evaluation,
-        effects=getattr(prior, "effects", ()),
+        parts["residuals"],
+        parts["tracing"],
+        detection=parts["detection"],
+        residuals_after=parts.get("residuals_after"),
+        evaluation=parts.get("evaluation"),
+        effects=getattr(parts["prior"], "effects", ()),
         exploratory=exploratory,
         designed=designed,
     )
-    channels = trials.channel_labels or simulator.channel_names
+    channels = trials.channel_labels or parts["simulator"].channel_names
     return Report(
-        residuals=residuals,
-        residuals_after=residuals_after,
-        detection=detection,
-        tracing=tracing,
-        evaluation=evaluation,
-        next_action=next_action,
-        simulator=simulator,
-        prior=prior,
+        **parts,
         warnings=(*found, *warnings),
-        digest=digest,
         exploratory=exploratory,
         num_trials=len(trials.fit),
         action_labels=tuple(labels),
         channel_names=None if channels is None else tuple(channels),
-        leave_one_out=tuple(leave_one_out),
-        severe_tests=tuple(severe_tests),
     )
 
 

@@ -64,12 +64,11 @@ class SearchCoordinates:
         t = self._forward(z)
         self.shift, self.scale = t.mean(0), np.maximum(t.std(0), 1e-300)
         with np.errstate(divide="ignore"):
-            self.low = (
-                np.where(self.is_log, np.log(low.clip(0)), low) - self.shift
-            ) / (self.scale)
-            self.high = (
-                np.where(self.is_log, np.log(high.clip(0)), high) - self.shift
-            ) / self.scale
+            self.low, self.high = (
+                (np.where(self.is_log, np.log(end.clip(0)), end) - self.shift)
+                / self.scale
+                for end in (low, high)
+            )
         u = (t - self.shift) / self.scale
         below, above = np.isfinite(self.low), np.isfinite(self.high)
         # A prior with one bound is taken for a half Gaussian from there.

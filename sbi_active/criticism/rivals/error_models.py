@@ -20,7 +20,7 @@ from typing_extensions import override
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "student"]
+__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "drawn", "student"]
 
 Array = NDArray[Any]
 Whitener = Callable[[Array], Array]
@@ -44,6 +44,20 @@ class ErrorModel(ABC):
         """Return the whitening transform that a residual (N,) makes most probable.
 
         It maps (..., N) to (..., N), linearly.
+        """
+
+    @abstractmethod
+    def noise_posterior(
+        self, residual: Array, rng: np.random.Generator
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Return a cell and a scale of the noise for each residual, at random.
+
+        Args:
+            residual: Shape (n, N).
+            rng: Source of the draws.
+
+        Returns:
+            Shapes (n,).
         """
 
     def regimes(self, residual: Array) -> list[Whitener]:
@@ -167,6 +181,13 @@ class NoiseGrid(ErrorModel):
         cell, scale = self.cells[best[0]], self.scales[best[1]]
         return lambda residual: cell.whiten(residual) / scale
 
+    @override
+    def noise_posterior(
+        self, residual: Array, rng: np.random.Generator
+    ) -> tuple[NDArray[np.intp], Array]:
+        cell, scale = drawn(self.joint(residual), rng)
+        return cell, self.scales[scale]
+
     @property
     def typical_sd(self) -> Array:
         """Geometric mean over the cells, shape (N,)."""
@@ -191,6 +212,13 @@ class NoiseGrid(ErrorModel):
     def _typical(self) -> tuple[NoiseCell, float]:
         middle = np.argsort(self.scales)[len(self.scales) // 2]
         return self.cells[int(np.argmax(self.log_prior))], float(self.scales[middle])
+
+
+def drawn(log_p: Array, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:
+    """Return a place (n,) in each axis of unnormalized log densities (n, ...)."""
+    flat = log_p.reshape(len(log_p), -1)
+    best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)  # of softmax
+    return np.unravel_index(best, log_p.shape[1:])
 
 
 def student(e: Array, df: float) -> Array:

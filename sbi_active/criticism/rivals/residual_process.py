@@ -33,6 +33,7 @@ from sbi_active.criticism.rivals.error_models import (
     ErrorModel,
     NoiseGrid,
     Whitener,
+    drawn,
 )
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -122,8 +123,7 @@ class ResidualProcess(ErrorModel):
 
     @override
     def log_likelihood(self, residual: Array) -> Array:
-        parts = [self._joint(residual, basis) for basis in self._bases]
-        return log_sum_exp(np.stack(parts, 1).reshape(len(residual), -1), axis=1)
+        return log_sum_exp(self._joint(residual).reshape(len(residual), -1), axis=1)
 
     @override
     def start(self) -> Whitener:
@@ -131,12 +131,7 @@ class ResidualProcess(ErrorModel):
 
     @override
     def whitener(self, residual: Array) -> Whitener:
-        joint = np.stack([self._joint(residual[None], b)[0] for b in self._bases])
-        place = np.unravel_index(np.argmax(joint), joint.shape)
-        basis = self._bases[place[0]]
-        return self._whitener(
-            basis, self.amplitudes[place[1]], self.noise.scales[place[2]]
-        )
+        return self._whitener(*self._likeliest(residual))
 
     @override
     def regimes(self, residual: Array) -> list[Whitener]:
@@ -149,6 +144,12 @@ class ResidualProcess(ErrorModel):
             if basis.cell == cell
             for a in self.amplitudes[::2]
         ]
+
+    def _likeliest(self, residual: Array) -> tuple[_Basis, float, float]:
+        """Return the process, amplitude and scale that a residual (N,) points to."""
+        joint = self._joint(residual[None])[0]
+        basis, a, scale = np.unravel_index(np.argmax(joint), joint.shape)
+        return self._bases[basis], self.amplitudes[a], self.noise.scales[scale]
 
     def _whitener(self, basis: _Basis, a: float, scale: float) -> Whitener:
         cell = self.noise.cells[basis.cell]
@@ -186,11 +187,8 @@ class ResidualProcess(ErrorModel):
         Returns:
             Means, shape (n, M), and standard deviations, shape (M,).
         """
-        middle = residual.mean(0)
-        joint = np.stack([self._joint(middle[None], b)[0] for b in self._bases])
-        place = np.unravel_index(np.argmax(joint), joint.shape)
-        basis, a = self._bases[place[0]], self.amplitudes[place[1]]
-        cell, scale = self.noise.cells[basis.cell], self.noise.scales[place[2]]
+        basis, a, scale = self._likeliest(residual.mean(0))
+        cell = self.noise.cells[basis.cell]
         place_of = self._inputs(action, order)[basis.kind]
         own = _coordinates(self.measurements, place_of, self.measurements.span)
         there = _coordinates(new, place_of[-new.shape[0] :], self.measurements.span)
@@ -208,14 +206,11 @@ class ResidualProcess(ErrorModel):
         explained = np.einsum("mi,mi->m", weight, cell.whiten(across) / scale)
         return mean, np.sqrt(np.maximum((a * new_unit) ** 2 - explained, 0.0))
 
+    @override
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Return a cell and a scale of the noise for each residual, at random."""
-        joint = np.stack([self._joint(residual, basis) for basis in self._bases], 1)
-        flat = joint.reshape(len(residual), -1)
-        best = np.argmax(flat + rng.gumbel(size=flat.shape), axis=1)
-        basis, _, scale = np.unravel_index(best, joint.shape[1:])
+    ) -> tuple[NDArray[np.intp], Array]:
+        basis, _, scale = drawn(self._joint(residual), rng)
         cells = np.array([b.cell for b in self._bases])[basis]
         return cells, self.noise.scales[scale]
 
@@ -230,7 +225,11 @@ class ResidualProcess(ErrorModel):
             inputs.append(order[:, None] / ORDER_LENGTH)
         return inputs
 
-    def _joint(self, residual: Array, basis: _Basis) -> Array:
+    def _joint(self, residual: Array) -> Array:
+        """Return log p(residual, basis, amplitude, scale), shape (n, bases, ...)."""
+        return np.stack([self._with(residual, basis) for basis in self._bases], 1)
+
+    def _with(self, residual: Array, basis: _Basis) -> Array:
         """Return log p(residual, amplitude, scale), shape (n, amplitudes, scales)."""
         cell, num = self.noise.cells[basis.cell], residual.shape[1]
         e = cell.whiten(residual)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid, Whitener
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
@@ -27,7 +28,7 @@ class Rival:
     r"""A model of the trials, :math:`p(x | z)\, p(z)` with z = (theta, phi).
 
     Args:
-        name: Of the rival.
+        key: What the rival is.
         simulator: Of the trials, shared by all rivals.
         prior: Of theta.
         effects: Effects that this rival has.
@@ -45,7 +46,7 @@ class Rival:
 
     def __init__(
         self,
-        name: str,
+        key: ModelKey,
         *,
         simulator: TrialSimulator,
         prior: Distribution,
@@ -56,7 +57,7 @@ class Rival:
         center: Array | None = None,
         disagreement: Sequence[float] = (DISAGREEMENT,),
     ) -> None:
-        self.name, self.effects = name, (*effects,)
+        self.key, self.effects = key, (*effects,)
         self.simulator, self.error, self.spread = simulator, error, spread
         self.center = np.zeros(len(spread)) if center is None else center
         self.disagreement = disagreement

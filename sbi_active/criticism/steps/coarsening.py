@@ -25,13 +25,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 
 __all__ = ["coarsening", "power"]
 
 
-def coarsening(rivals: RivalSet, log_p: Mapping[str, float]) -> float:
+def coarsening(rivals: RivalSet, log_p: Mapping[ModelKey, float]) -> float:
     r"""Return :math:`\alpha`, 1 where the error of measurement is not known.
 
     Args:
@@ -41,23 +43,21 @@ def coarsening(rivals: RivalSet, log_p: Mapping[str, float]) -> float:
     measurement_sd = getattr(rivals.model.noise, "measurement_sd", None)
     if measurement_sd is None:
         return 1.0
-    explained = [n for n in log_p if isinstance(rivals.rivals[n].error, NoiseGrid)]
+    explained = [k for k in log_p if isinstance(rivals.fit(k).rival.error, NoiseGrid)]
     best = max(explained, key=log_p.__getitem__)
     trials = int(np.unique(rivals.measurements.trial).size)
     return power(
-        measurement_sd**2 / error_variance(rivals, best),
+        measurement_sd**2 / error_variance(rivals.fit(best)),
         num_trials=trials,
         num_measurements=len(rivals.measurements),
     )
 
 
-def error_variance(rivals: RivalSet, name: str) -> float:
+def error_variance(fit: Fit) -> float:
     """Return the mean variance of the errors under a model, at its likeliest draw."""
-    rival, sample = rivals.rivals[name], rivals.samples[name]
-    at = sample.u[[int(np.argmax(sample.weights))]]
-    noise = rival.error
+    noise = fit.rival.error
     assert isinstance(noise, NoiseGrid)
-    share = noise.posterior(rival.residual(at, penalized=False)[0][0])
+    share = noise.posterior(fit.rival.residual(fit.likeliest, penalized=False)[0][0])
     variance = np.array([(cell.sd**2).mean() for cell in noise.cells])
     return float(variance @ share @ noise.scales**2)
 

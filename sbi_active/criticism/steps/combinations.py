@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import HOPELESS, RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
-from sbi_active.criticism.results import CATCH_ALLS, NONE
+from sbi_active.criticism.results import CATCH_ALLS, NONE, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
@@ -34,8 +34,8 @@ WORTH = 2 * THRESHOLD
 
 def grow(
     rivals: RivalSet, singles: dict[str, float], prior: dict[str, float]
-) -> dict[str, float]:
-    r"""Return unnormalized log posteriors of sets of effects, by names joined.
+) -> dict[ModelKey, float]:
+    r"""Return unnormalized log posteriors of sets of effects.
 
     A beam of width 3 goes from sets of one effect to larger ones. A set counts if it
     has a Bayes factor above 20 against each of its parts that were tried with one
@@ -49,7 +49,7 @@ def grow(
         singles: Log posterior of each effect alone, prior included.
         prior: Log prior probability of each effect alone.
     """
-    found: dict[str, float] = {}
+    found: dict[ModelKey, float] = {}
     seen: set[frozenset[str]] = set()
     beam = [(n,) for n in sorted(singles, key=singles.__getitem__)[::-1][:BEAM]]
     for _ in range(MAX_EFFECTS - 1):
@@ -60,12 +60,12 @@ def grow(
                 if frozenset(larger) in seen:
                     continue
                 seen.add(frozenset(larger))
-                evidence = log_evidence(rivals, larger)[0]
+                evidence = log_evidence(rivals, ModelKey(larger))[0]
                 if evidence - _best_part(rivals, larger) > THRESHOLD:
                     level[larger] = log_prior(larger, prior) + evidence
         if not level:
             break
-        found |= {" + ".join(names): value for names, value in level.items()}
+        found |= {ModelKey(names): value for names, value in level.items()}
         beam = sorted(level, key=level.__getitem__)[::-1][:BEAM]
     return found
 
@@ -86,21 +86,21 @@ def _worthy(rivals: RivalSet, beam: list[tuple[str, ...]]) -> list[tuple[str, ..
     fits = [names for names in beam if not _is_far(rivals, names)]
     if not fits:
         return beam
-    best = max(rivals.evidence(names).log_evidence for names in fits)
-    return [n for n in beam if rivals.evidence(n).log_evidence > best - HOPELESS]
+    log_z = {n: rivals.fit(ModelKey(n)).evidence.log_evidence for n in beam}
+    best = max(log_z[names] for names in fits)
+    return [n for n in beam if log_z[n] > best - HOPELESS]
 
 
 def _is_far(rivals: RivalSet, names: tuple[str, ...]) -> bool:
     """Return whether a set is far from a fit."""
-    num = len(rivals.measurements)
-    return rivals.evidence(names).best_chi_square > num + FAR * np.sqrt(2 * num)
+    num, evidence = len(rivals.measurements), rivals.fit(ModelKey(names)).evidence
+    return evidence.best_chi_square > num + FAR * np.sqrt(2 * num)
 
 
 def _best_part(rivals: RivalSet, names: tuple[str, ...]) -> float:
     """Return the largest evidence among a set's parts with one effect less."""
-    parts = [" + ".join(n for n in names if n != left) for left in names]
-    known = [p.split(" + ") for p in parts if p in rivals.evidences]
-    return max(log_evidence(rivals, p)[0] for p in known)
+    parts = [ModelKey(tuple(n for n in names if n != left)) for left in names]
+    return max(log_evidence(rivals, p)[0] for p in parts if p in rivals.fits)
 
 
 def _promising(rivals: RivalSet, names: tuple[str, ...]) -> list[str]:
@@ -111,11 +111,10 @@ def _promising(rivals: RivalSet, names: tuple[str, ...]) -> list[str]:
     squares, with P the projection off the span of their derivatives. Far from a fit
     that says nothing, and every effect is promising.
     """
-    rival = rivals.rivals.get(" + ".join(names)) or rivals.rival(names)
     if _is_far(rivals, names):
         return [n for n in rivals.effects if n not in names]
-    sample = rivals.samples[rival.name]
-    at = sample.u[[int(np.argmax(sample.weights))]]
+    fit = rivals.fit(ModelKey(names))
+    rival, at = fit.rival, fit.likeliest
     whiten = rival.error.whitener(rival.residual(at)[0][0])
     r, jacobian = (part[0] for part in rival.jacobian(at, whiten, rivals.step))
     basis, size, _ = np.linalg.svd(jacobian, full_matrices=False)
@@ -128,7 +127,7 @@ def _promising(rivals: RivalSet, names: tuple[str, ...]) -> list[str]:
         if rivals.effects[extra].hook == "noise":
             promising.append(extra)
             continue
-        larger = rivals.rival((*names, extra))
+        larger = rivals.rival(ModelKey((*names, extra)))
         c = larger.coordinates
         draws = c.sample(NUM_TRIED, seed=derive_seed(rivals.seed, "tried", extra))
         z = rival.coordinates.to_z(at)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection, ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["REFUTED", "THRESHOLD", "alternatives", "detect"]
@@ -48,11 +48,13 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     References:
         Ville, Etude critique de la notion de collectif (1939), for any stopping time.
     """
-    null = rivals.evidence()
+    null = rivals.fit().evidence
     # First what can explain anything: beside it, a hopeless effect is soon dismissed.
     weights = alternatives([*rivals.effects], equivalent)
-    found = {e: log_evidence(rivals, error=e) for e in (UNEXPLAINED, SCATTER)}
-    found |= {name: log_evidence(rivals, (name,)) for name in rivals.effects}
+    found = {
+        name: log_evidence(rivals, ModelKey.of(name))
+        for name in (UNEXPLAINED, SCATTER, *rivals.effects)
+    }
     others = [
         (found[name][0] + float(np.log(w)), found[name][1])
         for name, w in weights.items()
@@ -64,7 +66,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
     if log_b - MARGIN * error > THRESHOLD or p_value < level:
         check = rivals.tempered().log_evidence
-        null = rivals.evidence()
+        null = rivals.fit().evidence
         log_b, error = bayes_factor(others, log_evidence(rivals))
         p_value = float(chi2.sf(null.best_chi_square, freedom))
     lower = log_b - MARGIN * error
@@ -91,8 +93,7 @@ def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
     Errors of t noise are taken as Gaussian of its core, which are no larger.
     """
     noise, own = rivals.noise, rivals.model.noise
-    name = rivals.evidence().name
-    rival, sample = rivals.rivals[name], rivals.samples[name]
+    rival, sample = rivals.fit().rival, rivals.fit().sample
     declared = own is not None and own.posterior is None and len(noise.scales) == 1
     spare = len(rivals.measurements) - rival.dim
     if not declared or rivals.roughness.any() or spare < 1:
@@ -117,7 +118,7 @@ def num_determined(rivals: RivalSet) -> float:
     References:
         MacKay, Neural Computation 4, 1992, 415-447 (the evidence framework).
     """
-    sample = rivals.samples[rivals.evidence().name]
+    sample = rivals.fit().sample
     weights = sample.weights / sample.weights.sum()
     center = sample.u - weights @ sample.u
     variances = np.linalg.eigvalsh((weights[:, None] * center).T @ center)

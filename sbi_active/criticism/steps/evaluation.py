@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import CATCH_ALLS, NONE, Evaluation, Tracing
+from sbi_active.criticism.results import NONE, Evaluation, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
 
 __all__ = ["Fold", "evaluate_held_out", "evaluate_left_out"]
@@ -78,9 +78,7 @@ def _predictions(
     before = predict(rivals, trials)
     if tracing.verdict == NONE:
         return before, before
-    error = tracing.verdict if tracing.verdict in CATCH_ALLS else None
-    names = tracing.chosen or tracing.beside
-    return before, predict(rivals, trials, names=names, error=error)
+    return before, predict(rivals, trials, key=tracing.key)
 
 
 def _scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:

@@ -18,7 +18,7 @@ from torch.distributions import Independent, StudentT
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
-from sbi_active.criticism.results import UNEXPLAINED
+from sbi_active.criticism.results import UNEXPLAINED, ModelKey
 
 __all__ = ["formula_effects", "guess"]
 
@@ -96,7 +96,7 @@ def guess(rivals: RivalSet) -> tuple[tuple[str, float], ...]:
         Formulas and their log evidence above that of the residual process, only those
         more than 2 nats above; empty where there is none.
     """
-    bar = rivals.evidence(error=UNEXPLAINED).log_evidence
+    bar = rivals.fit(ModelKey(error=UNEXPLAINED)).evidence.log_evidence
     effects = formula_effects(rivals)
     others = RivalSet(
         rivals.model,
@@ -107,7 +107,7 @@ def guess(rivals: RivalSet) -> tuple[tuple[str, float], ...]:
         seed=rivals.seed,
         reference=bar,
     )
-    found = {e.name: log_evidence(others, (e.name,)) for e in effects}
+    found = {e.name: log_evidence(others, ModelKey((e.name,))) for e in effects}
     gains = {name: value - bar for name, (value, _) in found.items()}
     best = sorted(gains, key=gains.__getitem__)[::-1]
     top, top_error = found[best[0]]

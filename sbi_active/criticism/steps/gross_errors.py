@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import OUTLIER
+from sbi_active.criticism.results import OUTLIER, ModelKey
 
 __all__ = ["gross_errors"]
 
@@ -19,11 +19,9 @@ def gross_errors(rivals: RivalSet) -> dict[float, float]:
     Returns:
         By the trial's index, most probable first.
     """
-    name = rivals.evidence(error=OUTLIER).name
-    sample, error = rivals.samples[name], rivals.one_outlier()
-    some = sample.weights > 0
-    residual = rivals.rivals[name].residual(sample.u[some], penalized=False)[0]
-    share = sample.weights[some] @ error.responsibility(residual)
+    _, weights, residual = rivals.fit(ModelKey(error=OUTLIER)).weighted()
+    error = rivals.one_outlier()
+    share = weights @ error.responsibility(residual)
     order = np.argsort(-share, kind="stable")
     index = rivals.trials.index.numpy()[error.trials]
     return {float(index[k]): float(share[k]) for k in order}

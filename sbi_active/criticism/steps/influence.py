@@ -10,7 +10,6 @@ error of any one trial takes its place, since it reaches all of those without on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,9 +19,12 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import (
+    CATCH_ALLS,
+    NONE,
     OUTLIER,
     UNEXPLAINED,
     Evaluation,
+    ModelKey,
     Tracing,
 )
 from sbi_active.criticism.steps.detection import THRESHOLD
@@ -38,7 +40,7 @@ FEWEST = 20.0
 DECISIVE = 150.0
 
 
-def needed_trials(rivals: RivalSet, names: Sequence[str]) -> tuple[float, ...]:
+def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
     """Return the trials without which the data do not point to some effects.
 
     Without any one of them the Bayes factor against the bare model is below 20; none
@@ -47,16 +49,16 @@ def needed_trials(rivals: RivalSet, names: Sequence[str]) -> tuple[float, ...]:
 
     Args:
         rivals: The models.
-        names: Of the effects.
+        key: Of the effects alone.
 
     Returns:
         Indices of the trials.
     """
-    own = rivals.rivals[rivals.evidence(names).name]
-    log_b = log_evidence(rivals, names)[0] - log_evidence(rivals)[0]
+    own = rivals.fit(key).rival
+    log_b = log_evidence(rivals, key)[0] - log_evidence(rivals)[0]
     if own.has_noise_effect or rivals.simulator.is_stochastic or log_b < THRESHOLD:
         return ()
-    without = log_b + _change(rivals, names) - _change(rivals, ())
+    without = log_b + _change(rivals, key) - _change(rivals, ModelKey())
     index = rivals.trials.index.numpy()[rivals.one_outlier().trials]
     return (*index[without < THRESHOLD].tolist(),)
 
@@ -71,9 +73,7 @@ def is_left_to_chance(tracing: Tracing) -> bool:
         return False
     suspect = next(iter(tracing.outliers))
     p = tracing.probabilities
-    declared = sum(
-        v for name, v in p.items() if {*name.split(" + ")} & {*tracing.inclusion}
-    )
+    declared = sum(v for name, v in p.items() if name not in (NONE, *CATCH_ALLS))
     return suspect in tracing.needed and declared < DECISIVE * p[OUTLIER]
 
 
@@ -106,31 +106,26 @@ def withdrawn(tracing: Tracing) -> Tracing:
         verdict=OUTLIER if by_chance else UNEXPLAINED,
         chosen=(),
         beside=(),
-        instead_of=" + ".join(tracing.chosen),
+        instead_of=str(ModelKey(tracing.chosen)),
     )
 
 
-def _change(rivals: RivalSet, names: Sequence[str]) -> Array:
+def _change(rivals: RivalSet, key: ModelKey) -> Array:
     """Return the log evidence without each trial less that of all, shape (k,)."""
-    change, effective = _reweighted(rivals, names, None)
+    change, effective = _reweighted(rivals, key)
     if effective.min() < FEWEST:
-        other, number = _reweighted(rivals, names, OUTLIER)
+        other, number = _reweighted(rivals, replace(key, error=OUTLIER))
         change = np.where(number > effective, other, change)
-    return change
+    return change - rivals.fit(key).evidence.log_evidence
 
 
-def _reweighted(
-    rivals: RivalSet, names: Sequence[str], error: str | None
-) -> tuple[Array, Array]:
-    """Return these changes by one sample, and how many draws are left, (k,) each."""
-    evidence = rivals.evidence(names, error=error)
-    rival, sample = rivals.rivals[evidence.name], rivals.samples[evidence.name]
-    some = sample.weights > 0
-    residual = rival.residual(sample.u[some], penalized=False)[0]
+def _reweighted(rivals: RivalSet, key: ModelKey) -> tuple[Array, Array]:
+    """Return these evidences by one sample, and how many draws are left, (k,) each."""
+    fit = rivals.fit(key)
+    _, weights, residual = fit.weighted()
     rest = rivals.one_outlier().without_each(residual)
-    full = rival.error.log_likelihood(residual)
-    log_w = np.log(sample.weights[some])[:, None] + rest - full[:, None]
+    full = fit.rival.error.log_likelihood(residual)
+    log_w = np.log(weights)[:, None] + rest - full[:, None]
     total = log_sum_exp(log_w, axis=0)
     effective = np.exp(2 * total - log_sum_exp(2 * log_w, axis=0))
-    all_trials = rivals.evidence(names).log_evidence
-    return evidence.log_evidence + total - all_trials, effective
+    return fit.evidence.log_evidence + total, effective

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, Tracing
+from sbi_active.criticism.results import NONE, OUTLIER, UNEXPLAINED, ModelKey, Tracing
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -75,22 +75,18 @@ def leave_one_out(rivals: RivalSet, tracing: Tracing) -> tuple[LeaveOneOut, ...]
         rivals: The models.
         tracing: Their verdict. "unexplained" and "outlier" have the bare model alone.
     """
-    found = [_density(rivals)]
-    if tracing.verdict == SCATTER:
-        found.append(_density(rivals, error=SCATTER))
-    elif tracing.verdict not in (NONE, UNEXPLAINED, OUTLIER):
-        found.append(_density(rivals, tracing.chosen))
+    found = [_density(rivals, ModelKey())]
+    if tracing.verdict not in (NONE, UNEXPLAINED, OUTLIER):
+        found.append(_density(rivals, tracing.key))
     return (*found,)
 
 
-def _density(
-    rivals: RivalSet, names: tuple[str, ...] = (), *, error: str | None = None
-) -> LeaveOneOut:
+def _density(rivals: RivalSet, key: ModelKey) -> LeaveOneOut:
     # ArviZ takes seconds to import.
     from sbi_active.arviz_versions import pareto_smoothed
 
-    evidence = rivals.evidence(names, error=error)
-    prediction = predict(rivals, names=names, error=error, num_draws=NUM_DRAWS)
+    evidence = rivals.fit(key).evidence
+    prediction = predict(rivals, key=key, num_draws=NUM_DRAWS)
     log_p = prediction.log_likelihood
     efficiency = np.clip(evidence.effective_sample_size, 1.0, NUM_DRAWS) / NUM_DRAWS
     log_w, k = pareto_smoothed(log_p, relative_efficiency=float(efficiency))

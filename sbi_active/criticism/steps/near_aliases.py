@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import every_action, noise_unit
@@ -55,7 +56,7 @@ def near_aliases(
     effects = [n for n, e in rivals.effects.items() if e.hook != "noise"]
     if not effects:
         return ()
-    log_z = {name: log_evidence(rivals, (name,))[0] for name in effects}
+    log_z = {name: log_evidence(rivals, ModelKey((name,)))[0] for name in effects}
     best = max(log_z.values())
     likely = [name for name in effects if log_z[name] > best - THRESHOLD]
     if len(likely) < 2:
@@ -80,7 +81,8 @@ def near_aliases(
 
 def _prediction(rivals: RivalSet, simulator: TrialSimulator, name: str) -> Array:
     """Return the posterior predictive mean with an effect, shape (N,)."""
-    draws = torch.from_numpy(rivals.evidences[name].draws[:NUM_DRAWS])
+    evidence = rivals.fit(ModelKey((name,))).evidence
+    draws = torch.from_numpy(evidence.draws[:NUM_DRAWS])
     size = rivals.effects[name].phi_dim
     phi = {name: draws[:, -size:]}
     theta = draws[:, :-size]

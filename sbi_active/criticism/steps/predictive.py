@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
-from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -68,8 +67,7 @@ def predict(
     rivals: RivalSet,
     trials: Trials | None = None,
     *,
-    names: tuple[str, ...] = (),
-    error: str | None = None,
+    key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
     num_draws: int = NUM_DRAWS,
     seed: int | None = None,
     scored: bool = True,
@@ -80,16 +78,14 @@ def predict(
         rivals: The models; the rival is fitted to their trials.
         trials: Trials to predict, taken as unseen; None takes those that were fitted,
             with the residual process of "unexplained" conditioned on them.
-        names: Effects of the rival.
-        error: None, "unexplained", "scatter" or "outlier".
+        key: Which of the models.
         num_draws: From the posterior, n.
         seed: Of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
     """
-    name = rivals.evidence(names, error=error).name
-    rival, sample = rivals.rivals[name], rivals.samples[name]
+    rival, sample = rivals.fit(key).rival, rivals.fit(key).sample
     seed = rivals.seed if seed is None else seed
-    rng = np.random.default_rng(derive_seed(seed, "predictive", name))
+    rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
     u = sample.draws(num_draws, rng)
     own_residual = rival.residual(u, penalized=False)[0]
     target = rivals.trials if trials is None else trials
@@ -129,7 +125,7 @@ def predict(
             spread=spread,
         )
         mean = mean + shift
-    cells, scales = _drawn_cells(rival, own_residual, rng)
+    cells, scales = rival.error.noise_posterior(own_residual, rng)
     errors, sd = _errors(noise, cells, scales, mean.shape, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
@@ -154,22 +150,6 @@ def predict(
         rng.uniform(size=probability.shape) < probability,
         probability,
     )
-
-
-def _drawn_cells(
-    rival: Rival, residual: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return a cell and a scale of the noise for each draw, given its residual."""
-    grid = rival.error
-    if not isinstance(grid, NoiseGrid):
-        assert isinstance(grid, ResidualProcess | OneOutlier)
-        return grid.noise_posterior(residual, rng)
-    joint = grid.joint(residual)
-    flat = joint.reshape(len(residual), -1)
-    gumbel = rng.gumbel(size=flat.shape)  # the maximum is a draw from softmax
-    best = np.argmax(flat + gumbel, axis=1)
-    cell, scale = np.unravel_index(best, joint.shape[1:])
-    return cell, grid.scales[scale]
 
 
 def _errors(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import Residuals
+from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.steps.predictive import Prediction, predict
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -22,17 +22,17 @@ NUM_PRIOR, NUM_ROUGH = 2_000, 500
 
 
 def find_residuals(
-    rivals: RivalSet, *, names: tuple[str, ...] = (), error: str | None = None
+    rivals: RivalSet,
+    key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
 ) -> Residuals:
     """Return the residuals of one rival.
 
     Args:
         rivals: The models and their trials.
-        names: Effects of the rival.
-        error: None, "unexplained", "scatter" or "outlier".
+        key: Which of them.
     """
     trials, m = rivals.trials, rivals.measurements
-    prediction = predict(rivals, names=names, error=error)
+    prediction = predict(rivals, key=key)
     mean, sd = prediction.moments()
     times = trials.sample_times
     if times is None and rivals.model.sample_times is not None:
@@ -51,9 +51,7 @@ def find_residuals(
         mean=_filled(mean, m.position, x.shape),
         sd=_filled(sd, m.position, x.shape),
         refitted=_filled((m.x - mean) / sd, m.position, x.shape),
-        prequential=_filled(
-            _prequential(rivals, names=names, error=error), m.position, x.shape
-        ),
+        prequential=_filled(_prequential(rivals, key), m.position, x.shape),
         correlation=_correlation(rivals, prediction),
         noise=kind,
         probability_valid=prediction.probability_valid.mean(0),
@@ -71,21 +69,19 @@ def _filled(values: Array, position: Array, shape: tuple[int, ...]) -> Array:
     return x.reshape(shape)
 
 
-def _prequential(
-    rivals: RivalSet, *, names: tuple[str, ...], error: str | None
-) -> Array:
+def _prequential(rivals: RivalSet, key: ModelKey) -> Array:
     r"""Return standardized residuals with each trial predicted from those before.
 
     Prior draws and draws of the posterior of all trials, together, are weighted to
     every posterior in between: from the mixture
     :math:`m(z) = \frac12 (p(z) + p(z | x_{1:t}))`.
     """
-    rival = rivals.rivals[rivals.evidence(names, error=error).name]
-    evidence = rivals.evidences[rival.name]
+    fit = rivals.fit(key)
+    rival, evidence = fit.rival, fit.evidence
     rng = np.random.default_rng(rivals.seed)
     num = NUM_PRIOR if rivals.is_smooth else NUM_ROUGH
     prior = rival.coordinates.sample(num, seed=rivals.seed)
-    u = np.concatenate([prior, rivals.samples[rival.name].draws(num, rng)])
+    u = np.concatenate([prior, fit.sample.draws(num, rng)])
     residual, log_scale, _ = rival.residual(u, penalized=False)
     # The process is left out: what is asked is how the simulator predicts.
     noise = rivals.noise

@@ -16,12 +16,12 @@ from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
-    OUTLIER,
     SCATTER,
     UNEXPLAINED,
     Detection,
     Estimate,
     Evidence,
+    ModelKey,
     Tracing,
 )
 from sbi_active.criticism.steps.coarsening import coarsening
@@ -102,43 +102,43 @@ def trace(
     # Without an alarm there is no trial to set aside.
     catch_alls = CATCH_ALLS if detection.alarm else (UNEXPLAINED, SCATTER)
     prior = log_priors([*rivals.effects.values()], catch_alls)
-    log_z = {NONE: rivals.evidence().log_evidence}
-    log_z |= {e: rivals.evidence(error=e).log_evidence for e in catch_alls}
-    log_z |= {name: log_evidence(rivals, (name,))[0] for name in rivals.effects}
-    log_prior, share = {**prior}, 1.0
+    names = (NONE, *catch_alls, *rivals.effects)
+    log_prior = {ModelKey.of(name): prior[name] for name in names}
+    log_z = {key: log_evidence(rivals, key)[0] for key in log_prior}
+    share, process = 1.0, ModelKey(error=UNEXPLAINED)
     if detection.alarm:
-        singles = {name: prior[name] + log_z[name] for name in rivals.effects}
-        for name, value in grow(rivals, singles, prior).items():
-            log_z[name] = log_evidence(rivals, name.split(" + "))[0]
-            log_prior[name] = value - log_z[name]
-        share = coarsening(rivals, {n: log_prior[n] + log_z[n] for n in log_z})
-    log_p = {name: log_prior[name] + share * log_z[name] for name in log_z}
-    probabilities = _normalized(log_p)
-    verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
+        singles = {n: prior[n] + log_z[ModelKey((n,))] for n in rivals.effects}
+        for key, value in grow(rivals, singles, prior).items():
+            log_z[key] = log_evidence(rivals, key)[0]
+            log_prior[key] = value - log_z[key]
+        share = coarsening(rivals, {k: log_prior[k] + log_z[k] for k in log_z})
+    log_p = {key: log_prior[key] + share * log_z[key] for key in log_z}
+    p = _normalized(log_p)
+    verdict = _verdict(p, equivalent, alarm=detection.alarm)
     beside: tuple[str, ...] = ()
-    found = _effects_of(verdict)
-    if found and detection.refutes(rivals.evidences[verdict], REFUTED):
+    found = verdict.effects
+    if found and detection.refutes(rivals.fit(verdict).evidence, REFUTED):
         # What takes up most of the misfit need not take up all of it.
-        rest = rivals.evidence(found, error=UNEXPLAINED).log_evidence
-        alone = log_z[UNEXPLAINED]
-        log_z[UNEXPLAINED] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
-        log_p[UNEXPLAINED] = log_prior[UNEXPLAINED] + share * log_z[UNEXPLAINED]
-        probabilities = _normalized(log_p)
-        verdict = _verdict(probabilities, equivalent, alarm=detection.alarm)
-        if verdict == UNEXPLAINED and rest > alone:
+        rest = rivals.fit(ModelKey(found, UNEXPLAINED)).evidence.log_evidence
+        alone = log_z[process]
+        log_z[process] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
+        log_p[process] = log_prior[process] + share * log_z[process]
+        p = _normalized(log_p)
+        verdict = _verdict(p, equivalent, alarm=detection.alarm)
+        if verdict == process and rest > alone:
             beside = found
     near = equivalent_effects(rivals, None) if compare else ()
     aliases = ()
     if compare and detection.alarm:
         aliases = near_aliases(rivals, actions, [*equivalent, *near])
-    chosen = _effects_of(verdict)
     inclusion = {
-        name: sum(p for k, p in probabilities.items() if name in k.split(" + "))
+        name: sum(share for key, share in p.items() if name in key.effects)
         for name in rivals.effects
     }
+    probabilities = {str(key): share for key, share in p.items()}
     tracing = Tracing(
-        verdict=verdict,
-        chosen=chosen,
+        verdict=str(verdict),
+        chosen=verdict.effects,
         probabilities=probabilities,
         inclusion=inclusion,
         credible_set=_credible_set(probabilities),
@@ -146,54 +146,53 @@ def trace(
         near=near,
         aliases=aliases,
         estimates=_estimates(rivals, inclusion),
-        evidences={name: _under_unknown_scale(rivals, name) for name in log_p},
+        evidences={str(key): _under_unknown_scale(rivals, key) for key in log_p},
         robust=_is_robust(
             rivals, detection, log_prior, log_z, share, equivalent, verdict
         ),
         coarsening=share,
         beside=beside,
-        outliers=gross_errors(rivals) if OUTLIER in log_p else {},
-        needed=needed_trials(rivals, chosen) if chosen else (),
+        outliers=gross_errors(rivals) if detection.alarm else {},
+        needed=needed_trials(rivals, verdict) if verdict.effects else (),
     )
     return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 
 
-def _normalized(log_p: dict[str, float]) -> dict[str, float]:
+def _normalized(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     values = np.array([*log_p.values()])
     p = np.exp(values - log_sum_exp(values))
     order = np.argsort(-p, kind="stable")
-    names = [*log_p]
-    return {names[i]: float(p[i]) for i in order}
+    keys = [*log_p]
+    return {keys[i]: float(p[i]) for i in order}
 
 
 def _verdict(
-    probabilities: dict[str, float],
+    probabilities: dict[ModelKey, float],
     equivalent: Sequence[frozenset[str]],
     *,
     alarm: bool,
-) -> str:
+) -> ModelKey:
     """Return the verdict: the kind of explanation, then the most probable of it.
 
     Several effects that share the probability do not lose it to a catch-all, and
     equivalent ones count as one.
     """
     if not alarm:
-        return NONE
-    catch_alls = {n: p for n, p in probabilities.items() if n in CATCH_ALLS}
-    declared = 1.0 - probabilities[NONE] - sum(catch_alls.values())
+        return ModelKey()
+    catch_alls = {k: p for k, p in probabilities.items() if k.error}
+    declared = 1.0 - probabilities[ModelKey()] - sum(catch_alls.values())
     best = max(catch_alls, key=catch_alls.__getitem__)
     if catch_alls[best] > declared:
         return best
     groups = [group for group in equivalent if NONE not in group]
-    classes: dict[frozenset[str], dict[str, float]] = {}
-    for name, p in probabilities.items():
-        if name in (NONE, *catch_alls):
+    classes: dict[frozenset[str], dict[ModelKey, float]] = {}
+    for key, p in probabilities.items():
+        if not key.effects:
             continue
-        parts = name.split(" + ")
-        key = frozenset(
-            min(next((g for g in groups if part in g), {part})) for part in parts
+        alike = frozenset(
+            min(next((g for g in groups if name in g), {name})) for name in key.effects
         )
-        classes.setdefault(key, {})[name] = p
+        classes.setdefault(alike, {})[key] = p
     likeliest = max(classes.values(), key=lambda members: sum(members.values()))
     return max(likeliest, key=likeliest.__getitem__)
 
@@ -209,10 +208,11 @@ def _credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
 
 
 def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate, ...]:
-    null = rivals.evidence().log_evidence
+    null = rivals.fit().evidence.log_evidence
     found = []
     for name, effect in rivals.effects.items():
-        evidence = rivals.evidence((name,))
+        key = ModelKey((name,))
+        evidence = rivals.fit(key).evidence
         phi = evidence.draws[:, -effect.phi_dim :]
         found.append(
             Estimate(
@@ -221,7 +221,7 @@ def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate,
                 units=effect.units,
                 describe=effect.describe or "",
                 probability=inclusion[name],
-                log_bayes_factor=log_evidence(rivals, (name,))[0] - null,
+                log_bayes_factor=log_evidence(rivals, key)[0] - null,
                 mean=phi.mean(0),
                 sd=phi.std(0),
                 effective_sample_size=evidence.effective_sample_size,
@@ -234,38 +234,29 @@ def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate,
 def _is_robust(
     rivals: RivalSet,
     detection: Detection,
-    log_prior: dict[str, float],
-    log_z: dict[str, float],
+    log_prior: dict[ModelKey, float],
+    log_z: dict[ModelKey, float],
     share: float,
     equivalent: Sequence[frozenset[str]],
-    verdict: str,
+    verdict: ModelKey,
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
     weights = alternatives([*rivals.effects], equivalent)
     for factor in RESCALED:
-        scaled = {**log_z}
-        for name in log_z:
-            names = _effects_of(name)
-            if names:
-                scaled[name] = log_evidence(rivals, names, factor=factor)[0]
-        singles = np.array([scaled[k] + np.log(w) for k, w in weights.items()])
-        log_b = log_sum_exp(singles) - scaled[NONE]
+        scaled = {
+            key: log_evidence(rivals, key, factor=factor)[0] if key.effects else value
+            for key, value in log_z.items()
+        }
+        singles = [scaled[ModelKey.of(k)] + np.log(w) for k, w in weights.items()]
+        log_b = log_sum_exp(np.array(singles)) - scaled[ModelKey()]
         alarm = bool(log_b > THRESHOLD) or detection.by_chi_square
-        log_p = {name: log_prior[name] + share * scaled[name] for name in scaled}
+        log_p = {key: log_prior[key] + share * scaled[key] for key in scaled}
         if _verdict(_normalized(log_p), equivalent, alarm=alarm) != verdict:
             return False
     return True
 
 
-def _under_unknown_scale(rivals: RivalSet, name: str) -> Evidence:
+def _under_unknown_scale(rivals: RivalSet, key: ModelKey) -> Evidence:
     """Return a rival's record with the evidence that the probabilities rest on."""
-    found = rivals.evidences[name]
-    names = _effects_of(name)
-    if not names:
-        return found
-    value, error = log_evidence(rivals, names)
-    return replace(found, log_evidence=value, standard_error=error)
-
-
-def _effects_of(name: str) -> tuple[str, ...]:
-    return () if name in (NONE, *CATCH_ALLS) else (*name.split(" + "),)
+    value, error = log_evidence(rivals, key)
+    return replace(rivals.fit(key).evidence, log_evidence=value, standard_error=error)

@@ -170,7 +170,6 @@ def test_the_loop_is_given_trials_and_no_truth(name):
     for kind in ("library", "pair", "outside"):
         problem = draw_case(world, kind, 1).problem
         assert [e.name for e in problem.effects] == declared
-        assert problem.trials.covariates == {}
 
 
 def test_what_is_removed_is_gone_with_its_equivalents():

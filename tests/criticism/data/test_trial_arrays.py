@@ -17,19 +17,17 @@ def test_what_was_given_may_change_afterwards(kind):
         "x": kind([[1.0, 2.0], [3.0, 4.0]]),
         "index": kind([0.0, 1.0]),
         "sample_times": kind([0.0, 1.0]),
-        "performed_at": kind([5.0, 6.0]),
     }
     given = {
         k: v.double() if torch.is_tensor(v) else v.astype(float)
         for k, v in given.items()
     }
-    trials = Trials(**given, covariates={"heat": given["index"]})
+    trials = Trials(**given)
     before = {k: v.clone() for k, v in vars(trials).items() if torch.is_tensor(v)}
     for value in given.values():
         value[:] = 99.0
     for name, value in before.items():
         assert torch.equal(getattr(trials, name), value), name
-    assert trials.covariates["heat"].tolist() == [0.0, 1.0]
 
 
 def test_what_a_masked_array_masks_is_not_measured():

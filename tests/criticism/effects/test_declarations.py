@@ -60,7 +60,7 @@ def loop(*effects, model=MODEL):
             r"expected a null of shape \(2,\).*got \(3,\)",
         ),
         ({"name": 3}, "expected name of an effect as text; got 3"),
-        ({"name": ""}, "expected a name without"),
+        ({"name": ""}, "expected a name of an effect"),
         ({"units": 3}, "expected units of an effect as text; got 3"),
         ({"units": None}, "expected units of an effect as text; got None"),
         ({"family": 3}, "expected family of an effect as text; got 3"),

@@ -12,6 +12,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 
 DEVIATION = np.array([2.0, 1.0])
@@ -36,7 +37,9 @@ def linear_rival() -> Rival:
     )
     prior = Independent(Normal(torch.zeros(2), torch.as_tensor(DEVIATION).float()), 1)
     actions = DiscreteActions(torch.linspace(-2, 2, 9))
-    return RivalSet(model, prior, Trials(ACTION, X), [], actions=actions).rival(())
+    return RivalSet(model, prior, Trials(ACTION, X), [], actions=actions).rival(
+        ModelKey()
+    )
 
 
 def exact() -> Exact:

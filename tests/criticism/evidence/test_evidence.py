@@ -11,6 +11,7 @@ from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import SCALES, log_evidence
+from sbi_active.criticism.results import ModelKey
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 ACTION = torch.linspace(-2, 2, 8)[:, None]
@@ -56,7 +57,7 @@ MODELS = {
 
 @pytest.mark.parametrize("names", MODELS)
 def test_importance_sampling_gives_the_evidence(names):
-    evidence = rivals().evidence(names)
+    evidence = rivals().fit(ModelKey(names)).evidence
     assert evidence.engine == "least squares"
     assert evidence.standard_error < 0.1
     assert evidence.log_evidence == pytest.approx(
@@ -70,7 +71,7 @@ def test_an_unknown_scale_of_the_prior_is_summed_out(factor):
         exact([XI**0, XI, XI**2], [2.0, 1.0, 0.7 * factor * s], 0.5) for s in SCALES
     ]
     expected = np.logaddexp.reduce(each) - np.log(len(each))
-    value, error = log_evidence(rivals(), ("curve",), factor=factor)
+    value, error = log_evidence(rivals(), ModelKey(("curve",)), factor=factor)
     assert error < 0.2
     assert value == pytest.approx(expected, abs=4 * error)
 
@@ -78,9 +79,9 @@ def test_an_unknown_scale_of_the_prior_is_summed_out(factor):
 def test_without_effects_there_is_no_scale():
     some = rivals()
     for error in (None, "scatter", "unexplained"):
-        evidence = some.evidence(error=error)
+        evidence = some.fit(ModelKey(error=error)).evidence
         expected = evidence.log_evidence, evidence.standard_error
-        assert log_evidence(some, error=error, factor=3.0) == expected
+        assert log_evidence(some, ModelKey(error=error), factor=3.0) == expected
 
 
 def test_a_bounded_prior_says_what_is_possible():
@@ -93,20 +94,22 @@ def test_a_bounded_prior_says_what_is_possible():
         Trials(ACTION, X),
         [Effect("curve", prior=prior, **own)],
     )
-    value, _ = log_evidence(some, ("curve",), factor=3.0)
-    assert value == pytest.approx(some.evidence(("curve",)).log_evidence, abs=1e-9)
+    value, _ = log_evidence(some, ModelKey(("curve",)), factor=3.0)
+    assert value == pytest.approx(
+        some.fit(ModelKey(("curve",))).evidence.log_evidence, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("names", MODELS)
 def test_tempering_gives_the_evidence(names):
-    evidence = rivals().tempered(names)
+    evidence = rivals().tempered(ModelKey(names))
     assert evidence.log_evidence == pytest.approx(
         MODELS[names], abs=4 * evidence.standard_error
     )
 
 
 def test_the_posterior_is_the_exact_one():
-    evidence = rivals().evidence()
+    evidence = rivals().fit().evidence
     design = np.stack([XI**0, XI], 1)
     precision = design.T @ design / 0.25 + np.diag([0.25, 1.0])
     mean = np.linalg.solve(precision, design.T @ X[:, 0].double().numpy() / 0.25)
@@ -120,7 +123,7 @@ def test_the_posterior_is_the_exact_one():
 
 def test_no_parameters_are_simulated_twice():
     sets = rivals()
-    rival, scattered = sets.rival(()), sets.rival((), error="scatter")
+    rival, scattered = sets.rival(ModelKey()), sets.rival(ModelKey(error="scatter"))
     u = rival.coordinates.sample(7, seed=3)
     before = sets.simulator.num_simulations
     first = rival.residual(u)[0]
@@ -132,17 +135,17 @@ def test_no_parameters_are_simulated_twice():
 def test_a_smooth_rival_costs_few_simulations():
     sets = rivals()
     for names, error in [((), None), (("curve",), None), ((), "unexplained")]:
-        assert sets.evidence(names, error=error).num_simulations < 6_000
+        assert sets.fit(ModelKey(names, error)).evidence.num_simulations < 6_000
 
 
 def test_the_same_seed_gives_the_same_evidence():
-    a, b, c = (rivals(seed=s).evidence().log_evidence for s in (1, 1, 2))
+    a, b, c = (rivals(seed=s).fit().evidence.log_evidence for s in (1, 1, 2))
     assert a == b
     assert a != c
 
 
 def test_scatter_sums_out_the_inflation():
-    evidence = rivals().evidence(error="scatter")
+    evidence = rivals().fit(ModelKey(error="scatter")).evidence
     factors = 1 + 2.5 * np.abs(np.random.default_rng(0).normal(size=4_000))
     each = [exact([XI**0, XI], [2.0, 1.0], 0.5 * f) for f in factors]
     expected = np.logaddexp.reduce(each) - np.log(len(each))
@@ -167,7 +170,7 @@ def test_a_curved_ridge_has_the_right_evidence():
         Trials(ACTION, x),
         [gain],
     )
-    evidence = sets.evidence(("gain",))
+    evidence = sets.fit(ModelKey(("gain",))).evidence
     phi = np.linspace(-0.95, 1.5, 4_001)
     each = [
         multivariate_normal(

@@ -9,6 +9,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Effect, Trials
 from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import TrialSimulator
 from sbi_active.inference.sampling import log_sum_exp
 
@@ -96,8 +97,8 @@ def test_a_response_that_bends_does_not_jump(seed):
 @pytest.mark.parametrize("names", [(), ("bias",)])
 def test_its_evidence_is_that_of_draws_from_the_prior(names):
     found = rivals(jumping, missing=0.5)
-    evidence = found.evidence(names)
-    rival = found.rival(names)
+    evidence = found.fit(ModelKey(names)).evidence
+    rival = found.rival(ModelKey(names))
     parts = [
         rival.log_likelihood(rival.coordinates.sample(100_000, seed=k)) for k in (1, 2)
     ]

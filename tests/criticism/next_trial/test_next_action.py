@@ -15,6 +15,7 @@ from sbi_active.criticism.next_trial import (
     choose_action,
     outside_candidates,
 )
+from sbi_active.criticism.results import ModelKey
 from sbi_active.information_gain import ModelIndexGain, RivalSampler
 
 NOISE = 0.1
@@ -58,7 +59,7 @@ def test_rivals_predict_their_posterior_predictive():
     action = torch.tensor([1.0, 2.0, 3.0, 2.0])
     c = criticism(action.tolist(), 0.7 * action, [BIAS], FORWARD)
     c.trace()
-    rival = PredictedRival(c.rivals, "none", 0.5, FORWARD.values)
+    rival = PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
     x = rival.predict(torch.tensor([2.5]), 4_000, 3)
     assert x.shape == (4_000, 1)
     assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3))
@@ -78,7 +79,7 @@ def test_the_gain_is_that_of_two_known_densities():
     c.trace()
     names = ("none", "bias")
     candidates = BOTH.values[[0, 3]]
-    rivals = [PredictedRival(c.rivals, n, 0.5, candidates) for n in names]
+    rivals = [PredictedRival(c.rivals, ModelKey.of(n), 0.5, candidates) for n in names]
     sampler = RivalSampler(rivals, candidates, 0)
     simulations = sampler.draw(1_000, torch.arange(2), replicates=False)
     gain = ModelIndexGain(sampler.probability)(None, simulations, None)

@@ -91,8 +91,8 @@ def _missed(criticism, action):
     from sbi_active.criticism.next_trial import following
 
     trials = following(criticism.rivals, action[None])
-    names = criticism.trace().chosen
-    mean, _ = predict(criticism.rivals, trials, names=names, scored=False).moments()
+    key = criticism.trace().key
+    mean, _ = predict(criticism.rivals, trials, key=key, scored=False).moments()
     return float(
         np.sqrt(((truth(action[None].double())[0].numpy() - mean) ** 2).mean())
     )

@@ -16,6 +16,7 @@ from sbi_active.criticism.results import (
     Estimate,
     Evaluation,
     Evidence,
+    ModelKey,
     NextAction,
     Residuals,
     Tracing,
@@ -37,7 +38,7 @@ def evidence(name: str, log_evidence: float) -> Evidence:
     rng = np.random.default_rng(0)
     names = ("mu_1", "mu_2") if name == "none" else ("mu_1", "mu_2", name)
     return Evidence(
-        name=name,
+        key=ModelKey.of(name),
         log_evidence=log_evidence,
         standard_error=0.05,
         effective_sample_size=312.0,

@@ -1,16 +1,20 @@
 """Sets of several effects, against all sets of a linear world."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
+from sbi_active.criticism import Trials
+from sbi_active.criticism.evidence import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.combinations import grow, log_prior
-from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.tracing import log_priors
+from sbi_active.criticism.steps.detection import THRESHOLD, detect
+from sbi_active.criticism.steps.tracing import log_priors, trace
 from tests.criticism.steps import linear_world
-from tests.criticism.steps.linear_world import SHAPES, measured, rivals
+from tests.criticism.steps.linear_world import ACTION, SHAPES, measured, rivals
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -33,7 +37,9 @@ def grown(x):
     """Return what is grown, the models, and the log priors of single effects."""
     some = rivals(x)
     prior = log_priors([*some.effects.values()])
-    singles = {n: prior[n] + log_evidence(some, (n,))[0] for n in some.effects}
+    singles = {
+        n: prior[n] + log_evidence(some, ModelKey((n,)))[0] for n in some.effects
+    }
     return grow(some, singles, prior), some, prior
 
 
@@ -64,13 +70,12 @@ def test_what_grows_are_the_sets_that_pay_for_each_of_their_effects(phi):
     worthy = worthy_sets(x)
     assert tuple(phi) in worthy
     # Once a set fits, no set far behind it is added to.
-    assert {*found} <= {" + ".join(names) for names in worthy}
-    assert " + ".join(phi) in found
-    assert max(found, key=found.__getitem__) == " + ".join(phi)
-    for joined, value in found.items():
-        names = (*joined.split(" + "),)
-        exact = linear_world.log_evidence(x, names) + log_prior(names, prior)
-        error = log_evidence(some, names)[1]
+    assert {*found} <= {ModelKey(names) for names in worthy}
+    assert max(found, key=found.__getitem__) == ModelKey((*phi,))
+    for key, value in found.items():
+        exact = linear_world.log_evidence(x, key.effects)
+        exact += log_prior(key.effects, prior)
+        error = log_evidence(some, key)[1]
         assert error < 0.2
         assert value == pytest.approx(exact, abs=4 * error)
 
@@ -79,4 +84,17 @@ def test_what_grows_are_the_sets_that_pay_for_each_of_their_effects(phi):
 def test_where_nothing_is_left_over_no_set_is_fitted(phi):
     found, some, _ = grown(measured(**phi))
     assert found == {}
-    assert not [name for name in some.evidences if " + " in name]
+    assert not [key for key in some.fits if len(key.effects) > 1]
+
+
+def test_a_name_may_contain_what_joins_names():
+    x = measured(curve=0.5, kink=0.6)
+    shapes = rivals(x).effects
+    renamed = [replace(e, name=f"{n} + {n} lag") for n, e in shapes.items()]
+    some = RivalSet(rivals(x).model, linear_world.PRIOR, Trials(ACTION, x), renamed)
+    tracing = trace(some, detect(some), compare=False)
+    assert tracing.chosen == ("curve + curve lag", "kink + kink lag")
+    assert tracing.verdict == "curve + curve lag + kink + kink lag"
+    assert tracing.inclusion["wave + wave lag"] < 0.2
+    assert not tracing.has_several("wave + wave lag")
+    assert tracing.has_several(tracing.verdict)

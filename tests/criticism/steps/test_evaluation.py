@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import norm
 
 from sbi_active.criticism import Trials
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.steps.residuals import find_residuals
@@ -97,7 +98,7 @@ def test_each_trial_is_left_out_of_its_own_fit(fitted):
 
 @pytest.mark.parametrize("names", [(), ("curve",)])
 def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
-    made = find_residuals(fitted[0], names=names)
+    made = find_residuals(fitted[0], ModelKey(names))
     mean, sd = predictive(X, names)
     own = X[:, 0].double().numpy()
     np.testing.assert_allclose(made.mean[:, 0], mean, atol=0.02)

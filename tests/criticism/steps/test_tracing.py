@@ -9,7 +9,7 @@ from torch.distributions import Normal
 
 from sbi_active.criticism import Effect
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
-from sbi_active.criticism.results import CATCH_ALLS
+from sbi_active.criticism.results import CATCH_ALLS, ModelKey
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.tracing import log_priors, trace
@@ -56,14 +56,17 @@ def test_probabilities_are_priors_times_evidences(phi):
     exact = {"none": linear_world.log_evidence(x) + prior["none"]}
     for name in tracing.probabilities:
         if name in CATCH_ALLS:
-            exact[name] = some.evidence(error=name).log_evidence + prior[name]
+            exact[name] = (
+                some.fit(ModelKey(error=name)).evidence.log_evidence + prior[name]
+            )
         elif name != "none":
-            names = (*name.split(" + "),)
+            key = tracing.evidences[name].key
+            names = key.effects
             of_set = log_prior(names, prior) if len(names) > 1 else prior[name]
             exact[name] = linear_world.log_evidence(x, names) + of_set
             # The record has the evidence that the probability rests on.
             kept = tracing.evidences[name].log_evidence
-            assert kept == log_evidence(some, names)[0]
+            assert kept == log_evidence(some, key)[0]
     total = np.logaddexp.reduce([*exact.values()])
     close = [name for name, value in exact.items() if value > total - 15]
     assert len(close) > 3
@@ -79,7 +82,7 @@ def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
     tracing, _ = traced(measured(curve=0.14, kink=kink), compare=False)
     p = tracing.probabilities
     for name, total in tracing.inclusion.items():
-        parts = [q for k, q in p.items() if name in k.split(" + ")]
+        parts = [p[k] for k, e in tracing.evidences.items() if name in e.key.effects]
         assert total == pytest.approx(sum(parts))
     num = len(tracing.credible_set)
     sums = [sum(p[n] for n in names) for names in combinations(p, num)]
@@ -122,11 +125,11 @@ def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     assert tracing.chosen == ()
     assert tracing.beside == ("curve",)
     # The process alone or with the effect, half and half.
-    alone = some.evidence(error="unexplained").log_evidence
-    rest = some.evidence(("curve",), error="unexplained").log_evidence
+    alone = some.fit(ModelKey(error="unexplained")).evidence.log_evidence
+    rest = some.fit(ModelKey(("curve",), "unexplained")).evidence.log_evidence
     prior = log_priors([*some.effects.values()])
     expected = np.logaddexp(alone, rest) - np.log(2) + prior["unexplained"]
-    expected -= log_evidence(some, ("curve",))[0] + prior["curve"]
+    expected -= log_evidence(some, ModelKey(("curve",)))[0] + prior["curve"]
     p = tracing.probabilities
     assert np.log(p["unexplained"] / p["curve"]) == pytest.approx(expected)
 

@@ -1,0 +1,40 @@
+"""A rival with its posterior and its evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbi_active.criticism.evidence.importance import Array, ImportanceSample
+from sbi_active.criticism.results import Evidence
+from sbi_active.criticism.rivals.rival import Rival
+
+__all__ = ["Fit"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A rival fitted to the trials.
+
+    Attributes:
+        rival: The model.
+        sample: Of its posterior, weighted.
+        evidence: What is recorded of it.
+    """
+
+    rival: Rival
+    sample: ImportanceSample
+    evidence: Evidence
+
+    @property
+    def likeliest(self) -> Array:
+        """The coordinates of the largest weight, shape (1, dim)."""
+        return self.sample.u[[int(np.argmax(self.sample.weights))]]
+
+    def weighted(self) -> tuple[Array, Array, Array]:
+        """Return draws u (n, dim) with a weight, the weights, and residuals (n, N)."""
+        some = self.sample.weights > 0
+        u = self.sample.u[some]
+        residual = self.rival.residual(u, penalized=False)[0]
+        return u, self.sample.weights[some], residual

@@ -1,0 +1,65 @@
+"""Steps of finite differences, and what a quadratic function leaves over."""
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Independent, Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Trials
+from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.evidence.jumps import (
+    _beside_quadratic,
+    look_for_jumps,
+    probe_step,
+    quadratic,
+)
+from sbi_active.criticism.results import ModelKey
+from tests.criticism.evidence.linear import linear_rival
+
+
+def stairs(height):
+    """Return a line whose value is rounded to steps of a height."""
+    model = SimulatorModel(
+        lambda theta, action: torch.round(theta * action / height) * height,
+        noise=GaussianNoise(0.3),
+    )
+    prior = Independent(Normal(torch.zeros(1), torch.ones(1)), 1)
+    action = torch.linspace(1, 2, 8)[:, None]
+    return RivalSet(model, prior, Trials(action, 0.7 * action), []).rival(ModelKey())
+
+
+def test_a_line_has_the_finest_step_and_no_roughness():
+    assert probe_step(linear_rival(), seed=0) == (1e-4, True)
+    step, is_smooth, rough = look_for_jumps(linear_rival(), seed=0)
+    assert (step, is_smooth) == (1e-4, True)
+    assert not rough.any()
+
+
+def test_stairs_have_the_roughness_of_their_rounding():
+    # Below the height slopes are 0 or wild. Rounding errs uniformly, and the median
+    # of |uniform| over +-h/2 is h / 4.
+    height = 0.1
+    _, is_smooth, rough = look_for_jumps(stairs(height), seed=0)
+    assert not is_smooth
+    assert np.median(rough) == pytest.approx(height / 4 / 0.6745, rel=0.4)
+
+
+def test_quadratic_functions_leave_nothing_and_noise_its_deviation():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(400, 3))
+    basis = quadratic(u)
+    assert basis.shape == (400, 10)
+    assert np.linalg.matrix_rank(basis) == 10
+    x = basis @ rng.normal(size=(10, 2))
+    assert _beside_quadratic(u, x) == pytest.approx(0.0, abs=1e-9)
+    noise = np.array([0.5, 2.0])
+    found = _beside_quadratic(u, x + noise * rng.normal(size=x.shape))
+    assert found == pytest.approx(noise, rel=0.15)
+    # Of few rows the regression takes a share of the noise with it.
+    few = _beside_quadratic(u[:20], rng.normal(size=(20, 500)))
+    assert np.sqrt((few**2).mean()) == pytest.approx(1.0, abs=0.3)
+    x[::2, 1] = np.nan  # lost rows are left out, and too few give nothing
+    x[12:, 0] = np.nan
+    assert _beside_quadratic(u, x)[0] == 0.0
+    assert _beside_quadratic(u, x)[1] == pytest.approx(0.0, abs=1e-9)

@@ -1,0 +1,65 @@
+"""Effects that the noise hides from each other."""
+
+import torch
+from torch.distributions import Normal
+
+from sbi_active import DiscreteActions
+from sbi_active.criticism import Effect
+from sbi_active.criticism.evidence import log_evidence
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.near_aliases import near_aliases
+from tests.criticism.steps.linear_world import NOISE, measured, rivals
+
+SIZE = 0.5
+X = measured(curve=SIZE)
+ACTIONS = DiscreteActions(torch.linspace(-2, 2, 12))
+PAIR = frozenset({"curve", "twin"})
+
+
+def twin(distance):
+    """Return the curve with a wave of a root mean square, in noise deviations."""
+    size = distance * NOISE / SIZE * 2**0.5
+    return Effect(
+        "twin",
+        hook="observation",
+        prior=Normal(0.0, 1.0),
+        null=0.0,
+        apply=lambda x, phi, action, context: (
+            x + phi * (action**2 - 1 + size * torch.sin(5 * action))
+        ),
+    )
+
+
+def test_effects_closer_than_the_noise_are_nearly_the_same():
+    assert near_aliases(rivals(X, twin(0.3)), ACTIONS) == (PAIR,)
+
+
+def test_what_is_listed_already_is_left_out():
+    group = frozenset({*PAIR, "kink"})
+    assert near_aliases(rivals(X, twin(0.3)), ACTIONS, [group]) == ()
+
+
+def test_effects_apart_by_more_over_the_permitted_actions_are_not():
+    # Between the trials at hand they hardly differ; beyond them they do.
+    other = Effect(
+        "twin",
+        hook="observation",
+        prior=Normal(0.0, 1.0),
+        null=0.0,
+        apply=lambda x, phi, action, context: (
+            x + phi * (action**2 - 1 + torch.relu(action.abs() - 2) ** 3)
+        ),
+    )
+    some = rivals(X, other)
+    assert near_aliases(some, None) == (PAIR,)
+    assert near_aliases(some, DiscreteActions(torch.linspace(-4, 4, 12))) == ()
+
+
+def test_an_effect_that_the_trials_refute_has_no_alias():
+    assert near_aliases(rivals(X), ACTIONS) == ()
+    # Closer than the noise, and yet refuted by these trials.
+    some = rivals(measured(curve=SIZE, seed=4), twin(0.95))
+    curve, other = (log_evidence(some, ModelKey((n,)))[0] for n in ("curve", "twin"))
+    assert curve - other > THRESHOLD
+    assert near_aliases(some, ACTIONS) == ()
