@@ -5,10 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from tests.campaign.learning.test_revision import ACTIONS as SIDES
-from tests.campaign.learning.test_revision import BIAS, OPTIONS
-from tests.campaign.learning.test_revision import MODEL as REVISED
-from tests.campaign.learning.test_revision import PRIOR as SLOPES
 
 from sbi_active import (
     BoxActions,
@@ -20,6 +16,10 @@ from sbi_active import (
     RefinementOptions,
     SimulatorModel,
 )
+from tests.campaign.learning.test_revision import ACTIONS as SIDES
+from tests.campaign.learning.test_revision import BIAS, OPTIONS
+from tests.campaign.learning.test_revision import MODEL as REVISED
+from tests.campaign.learning.test_revision import PRIOR as SLOPES
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.1, 1.0, 2.0, 3.0], names=["speed"], units=["m/s"])
