@@ -20,6 +20,7 @@ FLOORS = (
     "seeding",
     "threads",
     "arviz_versions",
+    "arrays",
     "actions",
     "simulation.noise",
     "simulation",

@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
+from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
 
 __all__ = ["BoxActions"]
@@ -45,7 +46,10 @@ class BoxActions(ActionSpace):
         names: Sequence[str] | None = None,
         units: Sequence[str] | None = None,
     ) -> None:
-        limits = [torch.as_tensor(v, dtype=torch.float32).clone() for v in (low, high)]
+        limits = [
+            own_tensor(value, torch.float32, name=name)
+            for name, value in (("low", low), ("high", high))
+        ]
         self.low, self.high = (v[None] if v.ndim == 0 else v for v in limits)
         if self.low.ndim != 1 or self.low.shape != self.high.shape or not len(self.low):
             raise ValueError(

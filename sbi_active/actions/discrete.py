@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from sbi_active.actions.space import ActionSpace
+from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
 
 __all__ = ["DiscreteActions"]
@@ -39,13 +40,13 @@ class DiscreteActions(ActionSpace):
         names: Sequence[str] | None = None,
         units: Sequence[str] | None = None,
     ) -> None:
-        tensor = torch.as_tensor(values, dtype=torch.float32).clone()
+        tensor = own_tensor(values, torch.float32, name="actions")
         if tensor.ndim == 1:
             tensor = tensor[:, None]
         if tensor.ndim != 2 or tensor.numel() == 0:
             raise ValueError(
                 "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "
-                f"{tuple(torch.as_tensor(values).shape)}; do give one row an action"
+                f"{tuple(tensor.shape)}; do give one row an action"
             )
         if not bool(tensor.isfinite().all()):
             raise ValueError(

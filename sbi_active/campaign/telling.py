@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import measured
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 
@@ -135,7 +136,7 @@ def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
             "expected the outcome x; got None; tell(x), or tell(status=...) with "
             "'invalid' or 'missing' where there is none"
         )
-    tensor = _numbers(x, "the outcome x")
+    tensor = _numbers(x, "x")
     if tensor.shape != x_shape and tensor.numel() == x_shape.numel() == 1:
         tensor = tensor.reshape(x_shape)
     rows = outcome_rows(tensor, x_shape)
@@ -200,7 +201,7 @@ def _trial_to_tell(
 def _action_told(action: Any, action_dim: int) -> Tensor:
     numbers = _numbers(action, "the action")
     finite = numbers.isfinite() & (numbers.abs() <= LARGEST)
-    if numbers.is_complex() or not bool(finite.all()):
+    if not bool(finite.all()):
         raise ValueError(
             f"expected a finite action of real numbers; got {numbers.tolist()}; pass "
             "the action that was executed, or status='missing' where it is unknown"
@@ -208,30 +209,12 @@ def _action_told(action: Any, action_dim: int) -> Tensor:
     return action_rows(numbers, action_dim, num_rows=1)[0]
 
 
-def _numbers(told: Any, what: str) -> Tensor:
+def _numbers(told: Any, name: str) -> Tensor:
     """Return numbers apart from what the caller may still change."""
-    with torch.inference_mode(False):  # tensors of that mode are barred from training
-        if isinstance(told, Tensor):
-            return told.detach().cpu().clone()
-        return torch.from_numpy(_array(told, what))
-
-
-def _array(told: Any, what: str) -> np.ndarray:
-    """Return an array of floats or of complex numbers, its own memory."""
-    try:
-        if isinstance(told, (list, tuple)):  # of tensors, perhaps
-            told = [_plain(part) for part in told]
-        array = np.asarray(told)
-        kind = complex if array.dtype.kind == "c" else float
-        if array.dtype.kind in "USmM" or None in array.ravel().tolist():
-            raise TypeError  # "1.5" is no measurement, and None is not NaN
-        return np.array(array, dtype=kind)
-    except (TypeError, ValueError, OverflowError):
+    listed = isinstance(told, Sequence | np.ndarray)
+    if listed and None in np.array(told, dtype=object).ravel().tolist():
         raise ValueError(
-            f"expected {what} as numbers; got {told!r:.80}; pass a number, or an array "
-            "or tensor of them"
-        ) from None
-
-
-def _plain(part: Any) -> Any:
-    return part.detach().cpu().numpy() if isinstance(part, Tensor) else part
+            f"expected {name} of real numbers; got {told!r:.80}; pass NaN where a "
+            "sensor gave nothing"
+        )
+    return measured(told, name=name)

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.arrays import all_finite
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.noise.gaussian import NoiseModel
 from sbi_active.simulation.simulator import (
     Simulator,
-    all_finite,
     outcome_array,
     outcome_tensor,
     require_noise,

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.arrays import measured, own_tensor
+
 __all__ = [
     "Simulator",
-    "all_finite",
     "outcome_array",
     "outcome_tensor",
-    "own_tensor",
     "require_noise",
 ]
 
@@ -52,6 +51,7 @@ def outcome_tensor(
         ValueError: If the output does not have ``num_rows`` rows of real numbers, or
             has a finite one beyond ``dtype``.
     """
+    _require_outcome(x)
     x = own_tensor(x, dtype)
     if x.ndim == 0 or x.shape[0] != num_rows:
         raise ValueError(
@@ -72,100 +72,22 @@ def outcome_array(x: Any) -> np.ndarray:
     """Return the outcome of one row as float64, which may share the memory of x.
 
     Raises:
-        ValueError: If a number is complex.
+        RuntimeError: If there is none.
+        ValueError: If it is no real numbers.
     """
     if type(x) is np.ndarray and x.dtype == np.float64:
         return x
-    array = np.asarray(_filled(x))
-    _require_real(array.dtype, array.dtype.kind == "c")
-    return array.astype(np.float64, copy=False)
+    _require_outcome(x)
+    return measured(x).numpy()
 
 
-def own_tensor(x: Any, dtype: torch.dtype | None = None) -> Tensor:
-    """Return real numbers as floating ones, in a tensor that shares no memory with x.
-
-    Args:
-        x: Anything that torch or NumPy takes for an array.
-        dtype: Of the result; None keeps a floating one.
-
-    Raises:
-        ValueError: If a number is complex, or finite but beyond ``dtype``.
-    """
-    tensor = x if isinstance(x, Tensor) else _converted(x)
-    _require_real(tensor.dtype, tensor.is_complex())
-    if dtype is None:
-        is_floating = tensor.is_floating_point()
-        dtype = tensor.dtype if is_floating else torch.get_default_dtype()
-    own = tensor.to(dtype, copy=tensor is x)
-    if tensor.dtype == torch.float64 != dtype:
-        _require_in_range(tensor, own)
-    return own
-
-
-def _require_real(dtype: Any, is_complex: bool) -> None:
-    if is_complex:
-        raise ValueError(
-            f"expected x of real numbers; got {dtype}, whose imaginary part would be "
-            "lost; return the real and the imaginary part as two numbers"
-        )
-
-
-def _require_in_range(x: Tensor, rounded: Tensor) -> None:
-    """Raise where rounding made a measurement infinite."""
-    if all_finite(rounded):
-        return
-    beyond = x.isfinite() & ~rounded.isfinite()
-    if bool(beyond.any()):
-        raise ValueError(
-            "expected x within +-3.4e38, the range of float32; got "
-            f"{x[beyond][0].item():g}, which would count as no measurement; return x "
-            "in other units, or NaN where there is no measurement"
-        )
-
-
-def all_finite(x: Tensor) -> bool:
-    """Return whether no number is NaN or infinite.
-
-    A sum, several times as fast as asking each number, is finite only then.
-    """
-    return math.isfinite(x.sum()) or bool(x.isfinite().all())
-
-
-def _converted(x: Any) -> Tensor:
-    """Return numbers that are no tensor as one, in memory of its own."""
-    x = _filled(x)
-    first = x[0] if isinstance(x, list | tuple) and x else None
-    if isinstance(first, Tensor):
-        return torch.stack(list(x))
-    if isinstance(first, np.ndarray) or hasattr(x, "__array__"):
-        return _from_numpy(np.array(x, order="C"))
-    tensor = torch.as_tensor(x)
-    if tensor.is_floating_point():  # of Python's numbers, which have 64 bits
-        _require_in_range(torch.as_tensor(x, dtype=torch.float64), tensor)
-    return tensor
-
-
-def _filled(x: Any) -> Any:
-    """Return an outcome with NaN for masked numbers, which were not measured.
-
-    Raises:
-        RuntimeError: If there is none; it counts as an exception of the simulator.
-    """
+def _require_outcome(x: Any) -> None:
+    """Raise where there is none; it counts as an exception of the simulator."""
     if x is None:
         raise RuntimeError(
             "expected an outcome from the simulator; got None; return x, with NaN "
             "where there is no measurement"
         )
-    if isinstance(x, np.ma.MaskedArray):
-        return np.ma.filled(x.astype(np.float64), np.nan)
-    return x
-
-
-def _from_numpy(array: np.ndarray) -> Tensor:
-    """Convert dtypes that torch refuses, too: of other bytes, precision or None."""
-    if array.dtype == np.longdouble or array.dtype == object:
-        array = array.astype(np.float64)
-    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:

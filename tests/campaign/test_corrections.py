@@ -260,11 +260,11 @@ def test_the_last_trial_told_twice():
 @pytest.mark.parametrize(
     ("x", "text"),
     [
-        ("abc", "expected the outcome x as numbers; got 'abc'"),
-        (["1.5"], "expected the outcome x as numbers; got"),
-        ([None], "expected the outcome x as numbers; got [None]"),
-        (object(), "expected the outcome x as numbers; got <object"),
-        (10**400, "expected the outcome x as numbers; got 1000"),
+        ("abc", "expected x of real numbers; got 'abc'"),
+        (["1.5"], "expected x of real numbers; got"),
+        ([None], "expected x of real numbers; got [None]"),
+        (object(), "expected x of real numbers; got <object"),
+        (10**400, "expected x of real numbers; got 1000"),
         (1 + 2j, "expected x of real numbers; got torch.complex128"),
         (torch.tensor([1j]), "expected x of real numbers; got torch.complex64"),
         (np.array([1e39]), "expected x within +-3.4e38, the range of float32"),

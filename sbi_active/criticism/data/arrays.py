@@ -1,4 +1,4 @@
-"""Measured numbers as they come, as tensors that nobody else holds."""
+"""Measured numbers of one or of several lengths, repeats, labels."""
 
 from __future__ import annotations
 
@@ -9,51 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["copied", "padded", "repeated", "require_labels", "root"]
+from sbi_active.arrays import measured
 
-
-def copied(value: Any) -> Tensor:
-    """Return a copy in float64 that keeps nothing of what was given.
-
-    Args:
-        value: A tensor, an array, or nested sequences of numbers; what a masked array
-            masks is NaN.
-
-    Raises:
-        ValueError: If it is complex, text, dates, or no numbers at all.
-    """
-    if isinstance(value, Sequence) and any(torch.is_tensor(part) for part in value):
-        return torch.stack([copied(part) for part in value])
-    if torch.is_tensor(value):
-        _require_real(value.is_complex(), value.dtype)
-        return value.detach().to("cpu", torch.float64, copy=True)
-    array = np.asanyarray(value)
-    _require_real(array.dtype.kind not in "biufO", array.dtype)
-    if np.ma.isMaskedArray(array):
-        array = np.ma.filled(array.astype(np.float64), np.nan)
-    try:
-        return torch.from_numpy(np.array(array, dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"expected real numbers; got {type(value).__name__} of {array.dtype} with "
-            f"an entry that is none ({error}); pass floats, NaN where nothing was "
-            "measured"
-        ) from error
-
-
-def _require_real(wrong: bool, dtype: Any) -> None:
-    if wrong:
-        raise ValueError(
-            f"expected real numbers; got {dtype}; pass floats, those of a complex "
-            "number as two channels"
-        )
+__all__ = ["padded", "repeated", "require_labels", "root"]
 
 
 def padded(value: Any) -> Tensor:
     """Return copies of arrays stacked, shorter ones padded with NaN at their end."""
     if _is_stacked(value):
-        return copied(value)
-    rows = [copied(row) for row in value]
+        return measured(value)
+    rows = [measured(np.nan if row is None else row) for row in value]
     if len({row.shape for row in rows}) <= 1:
         return torch.stack(rows) if rows else torch.empty(0)
     if len({row.shape[1:] for row in rows}) > 1 or any(r.ndim == 0 for r in rows):

@@ -11,8 +11,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from sbi_active.arrays import measured
 from sbi_active.criticism.data.arrays import (
-    copied,
     padded,
     repeated,
     require_labels,
@@ -71,7 +71,7 @@ class Trials:
         action_labels: Sequence[str] | None = None,
         channel_labels: Sequence[str] | None = None,
     ) -> None:
-        self.action = copied(action)
+        self.action = measured(action, name="action")
         if self.action.ndim == 1:
             self.action = self.action[:, None]
         self.x = padded(x)
@@ -275,7 +275,7 @@ class Trials:
         return self.select(positions)
 
     def _rows(self, name: str, value: Any) -> Tensor:
-        tensor = copied(value)
+        tensor = measured(value, name=name)
         if tensor.shape != (len(self),):
             raise ValueError(
                 f"expected {name} of shape ({len(self)},), one a trial; got "

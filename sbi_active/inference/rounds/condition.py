@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from sbi_active.simulation.simulator import own_tensor
+from sbi_active.arrays import own_tensor
 
 __all__ = ["ActionEmbedding", "action_rows", "outcome_rows", "pack", "unpack"]
 

@@ -6,13 +6,13 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
 
@@ -61,7 +61,9 @@ class NoiseModel(ABC):
     def at(self, times: Tensor | None) -> NoiseModel:
         """Return the same noise at time stamps (T,), in seconds."""
         noise = copy.copy(self)
-        noise.times = None if times is None else _copied(times)
+        noise.times = (
+            None if times is None else own_tensor(times, torch.float64, name="times")
+        )
         return noise
 
     @abstractmethod
@@ -132,7 +134,7 @@ class ScaleNoise(NoiseModel):
         shared: Mapping[str, float | Tensor] | None = None,
         posterior: Distribution | None = None,
     ) -> None:
-        self.sd = _copied(sd)
+        self.sd = own_tensor(sd, torch.float64, name="sd")
         if self.sd.ndim > 1:
             raise ValueError(
                 "expected a standard deviation that is a number or one a channel; got "
@@ -142,7 +144,7 @@ class ScaleNoise(NoiseModel):
         shared = {} if shared is None else shared
         names = [f"sd_{c + 1}" for c in range(self._num_sd)] if self.sd.ndim else ["sd"]
         self.parameter_names = (*names, *shared)
-        values = [torch.as_tensor(v, dtype=torch.float64) for v in shared.values()]
+        values = [own_tensor(v, torch.float64, name=k) for k, v in shared.items()]
         self.parameters = torch.cat(
             [self.sd.reshape(-1), *(v.reshape(1) for v in values)]
         )
@@ -303,11 +305,6 @@ def declared_sds(noise: NoiseModel) -> Tensor:
     with forked_generators(0, "sd"):
         draws = noise.sample(torch.zeros(NUM_SAMPLES, 1, dtype=torch.float64))
     return draws.std().reshape(1).double()
-
-
-def _copied(values: Any) -> Tensor:
-    """Return numbers in float64 that their owner cannot change afterwards."""
-    return torch.as_tensor(values, dtype=torch.float64).clone()
 
 
 def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:

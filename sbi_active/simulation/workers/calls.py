@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.simulator import outcome_tensor
@@ -28,7 +29,7 @@ Fault = Literal["raised", "timed out", "worker died", "misused", "not loaded"]
 #: What is caught in the user's process, where an interrupt means the whole program.
 HERE = (Exception, SystemExit)
 
-_INTERFACE = {SimulatorModel.__module__, outcome_tensor.__module__}
+_INTERFACE = {m.__module__ for m in (SimulatorModel, outcome_tensor, own_tensor)}
 
 # The generators of torch and NumPy belong to the process, and some executors run
 # several calls in threads of one.

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.arrays import all_finite
 from sbi_active.seeding import row_seeds
 from sbi_active.simulation.outcomes import Outcome, SimulationError
-from sbi_active.simulation.simulator import all_finite
 from sbi_active.simulation.workers.calls import BLOCK, Call, Reply
 from sbi_active.simulation.workers.pace import Pace
 from sbi_active.simulation.workers.pools import Pool

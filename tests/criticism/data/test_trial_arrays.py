@@ -59,11 +59,17 @@ def test_ragged_arrays_and_missing_entries_are_padded():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"x": np.ones((2, 1)) + 1j}, "expected real numbers; got complex128"),
-        ({"x": torch.ones(2, 1) + 1j}, "expected real numbers; got torch.complex64"),
-        ({"x": ["a", "b"]}, "expected real numbers"),
-        ({"x": np.array(["2020", "2021"], dtype="datetime64")}, "got datetime64"),
-        ({"action": ["slow", "fast"]}, "expected real numbers"),
+        (
+            {"x": np.ones((2, 1)) + 1j},
+            "x of real numbers; got torch.complex128",
+        ),
+        (
+            {"x": torch.ones(2, 1) + 1j},
+            "x of real numbers; got torch.complex64",
+        ),
+        ({"x": ["a", "b"]}, "expected x of real numbers"),
+        ({"x": np.array(["2020", "2021"], dtype="datetime64")}, r"got array\(\['2020"),
+        ({"action": ["slow", "fast"]}, "expected action of real numbers"),
         ({"x": np.ones((2, 0))}, r"expected at least one number in x; got shape"),
         ({"action": np.ones((2, 0))}, r"expected actions \(n, action_dim\)"),
         ({"index": [0.0, NAN]}, "expected finite places in index"),

@@ -1,0 +1,100 @@
+"""Numbers as users bring them, as tensors that nobody else holds."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["all_finite", "measured", "own_tensor"]
+
+
+def own_tensor(
+    value: Any, dtype: torch.dtype | None = None, *, name: str = "x"
+) -> Tensor:
+    """Return real numbers as floating ones, in a tensor that shares no memory.
+
+    Args:
+        value: A number, tensor, array, or nested sequences of them; NaN stands for
+            what a masked array masks, and for None among other numbers.
+        dtype: Of the result; None keeps a floating one.
+        name: Of the numbers, for errors.
+
+    Raises:
+        ValueError: If they are no real numbers, but complex, text, dates or None; if
+            rows differ in length; or if one is finite but beyond ``dtype``.
+    """
+    tensor = value if isinstance(value, Tensor) else _converted(value, name)
+    if tensor.is_complex():
+        raise ValueError(
+            f"expected {name} of real numbers; got {tensor.dtype}, whose imaginary "
+            "part would be lost; pass real and imaginary part as two numbers"
+        )
+    if dtype is None:
+        keeps = tensor.is_floating_point() and not _is_of_python(value)
+        dtype = tensor.dtype if keeps else torch.get_default_dtype()
+    own = tensor.to(dtype, copy=tensor is value)
+    if tensor.dtype == torch.float64 != dtype and not all_finite(own):
+        beyond = tensor.isfinite() & ~own.isfinite()
+        if bool(beyond.any()):
+            raise ValueError(
+                f"expected {name} within +-3.4e38, the range of float32; got "
+                f"{tensor[beyond][0].item():g}, which would become infinite; pass it "
+                "in other units, or NaN where there is no measurement"
+            )
+    return own
+
+
+def measured(value: Any, *, name: str = "x") -> Tensor:
+    """Return real numbers in float64 on the CPU, apart from any graph.
+
+    Args:
+        value: As in :func:`own_tensor`.
+        name: Of the numbers, for errors.
+
+    Raises:
+        ValueError: As :func:`own_tensor` does.
+    """
+    with torch.inference_mode(False):  # tensors of that mode are barred from training
+        return own_tensor(value, torch.float64, name=name).detach().cpu()
+
+
+def all_finite(x: Tensor) -> bool:
+    """Return whether no number is NaN or infinite.
+
+    A sum, several times as fast as asking each number, is finite only then.
+    """
+    return math.isfinite(x.sum()) or bool(x.isfinite().all())
+
+
+def _converted(value: Any, name: str) -> Tensor:
+    """Return numbers that are no tensor as one; dtypes that torch refuses, too."""
+    try:
+        is_list = isinstance(value, list | tuple)
+        if is_list and any(isinstance(part, Tensor) for part in value):
+            return torch.stack([torch.as_tensor(part) for part in value])
+        array = np.array(value, order="C", subok=True)
+        if value is None or array.dtype.kind not in "biufcO":
+            raise TypeError("not numbers")
+        if array.dtype.kind != "c":
+            if isinstance(array, np.ma.MaskedArray):
+                array = np.ma.filled(array.astype(np.float64), np.nan)
+            if array.dtype == np.longdouble or array.dtype == object:
+                array = array.astype(np.float64)
+        array = array.astype(array.dtype.newbyteorder("="), copy=False, subok=False)
+        return torch.from_numpy(array)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise ValueError(
+            f"expected {name} of real numbers; got {value!r:.80} ({error}); pass a "
+            "number, or an array or tensor of them, with rows of one length"
+        ) from None
+
+
+def _is_of_python(value: Any) -> bool:
+    """Return whether numbers are Python's own, whose 64 bits are no choice."""
+    while isinstance(value, list | tuple) and value:
+        value = value[0]
+    return type(value) in (int, float, bool, list, tuple)
