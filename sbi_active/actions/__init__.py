@@ -8,4 +8,9 @@ from sbi_active.actions.discrete import DiscreteActions
 from sbi_active.actions.mixed import MixedActions
 from sbi_active.actions.space import ActionSpace
 
-__all__ = ["ActionSpace", "BoxActions", "DiscreteActions", "MixedActions"]
+__all__ = [
+    "ActionSpace",
+    "BoxActions",
+    "DiscreteActions",
+    "MixedActions",
+]

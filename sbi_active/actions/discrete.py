@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -13,7 +14,12 @@ from sbi_active.actions.space import ActionSpace
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
 
-__all__ = ["DiscreteActions"]
+__all__ = ["DiscreteActions", "Actions", "action_space"]
+
+#: What is taken for an action space: a list stands for its actions.
+Actions: TypeAlias = (
+    ActionSpace | Tensor | np.ndarray | Sequence[float] | Sequence[Sequence[float]]
+)
 
 
 class DiscreteActions(ActionSpace):
@@ -81,3 +87,20 @@ class DiscreteActions(ActionSpace):
     @override
     def listed(self) -> Tensor:
         return self.values
+
+
+def action_space(actions: Any) -> ActionSpace:
+    """Return an action space; a list, array or tensor stands for its actions.
+
+    Raises:
+        TypeError: If it is neither.
+        ValueError: As :class:`DiscreteActions` raises.
+    """
+    if isinstance(actions, ActionSpace):
+        return actions
+    if not isinstance(actions, list | tuple | range | Tensor | np.ndarray):
+        raise TypeError(
+            f"expected an action space or a list of actions; got {actions!r:.80}; pass "
+            "DiscreteActions(values) or BoxActions(low, high)"
+        )
+    return DiscreteActions([*actions] if isinstance(actions, range) else actions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.limits import Limits
@@ -53,7 +54,7 @@ class Campaign(CampaignTrials):
         simulator: ``simulator(theta, action)``, shapes (n, theta_dim) and
             (n, action_dim), giving x of shape (n, *x_shape).
         prior: Over the parameters, with a support.
-        actions: What the robot may do.
+        actions: What the robot may do: a space, or a list of actions.
         method: "asbi", "alhi" (a surrogate likelihood) and "seqbed" (ratios) design
             actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
         effects: What the simulator may lack, see :class:`.Effect`.
@@ -63,7 +64,7 @@ class Campaign(CampaignTrials):
         constraint: Which of actions (n, action_dim) the robot may execute now, shape
             (n,), bool. The network learns about the others as well.
         seed: Of everything random; the same seed and outcomes give the same campaign.
-        options: Sizes and estimators.
+        options: Sizes and estimators; or fields of them in a dict.
         directory: New or empty folder to keep the campaign in, as it happens: whatever
             ends the process, :meth:`load` goes on. None keeps it in memory alone.
         on_trial: Called with each trial that was told, once it is recorded.
@@ -97,20 +98,20 @@ class Campaign(CampaignTrials):
         self,
         simulator: Callable[..., Any],
         prior: Distribution,
-        actions: ActionSpace,
+        actions: Actions,
         *,
         method: str = "asbi",
         effects: Sequence[Effect] = (),
         cost: Callable[[Tensor], Tensor] | Tensor | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
         seed: int = 0,
-        options: CampaignOptions | None = None,
+        options: CampaignOptions | Mapping[str, Any] | None = None,
         directory: str | os.PathLike[str] | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         on_update: Callable[[Trial], None] | None = None,
     ) -> None:
         find_method(method)  # an unknown name is an error here
-        options = CampaignOptions() if options is None else options
+        actions, options = action_space(actions), CampaignOptions.of(options)
         state = CampaignState(method=method, seed=seed, options=options)
         learner = Learner(simulator, prior, actions, state)
         limits = Limits(actions, constraint, cost)

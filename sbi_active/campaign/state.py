@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from torch import Tensor
@@ -112,6 +112,23 @@ class CampaignOptions:
     def workers(self) -> Workers:
         """Where all simulations run."""
         return Workers(self.num_workers, self.time_limit, self.num_retries)
+
+    @classmethod
+    def of(cls, options: Any) -> CampaignOptions:
+        """Return options as they are, or from a dict of their fields; None is default.
+
+        Raises:
+            TypeError: If they are neither, or a field has another name.
+        """
+        if options is None or isinstance(options, cls):
+            return options or cls()
+        known = {f.name for f in fields(cls)}
+        if not isinstance(options, Mapping) or not {*options} <= known:
+            raise TypeError(
+                f"expected options among {', '.join(sorted(known))}; got {options!r}; "
+                "pass CampaignOptions(...), or a dict of these"
+            )
+        return cls(**options)
 
     @classmethod
     def faithful(cls) -> CampaignOptions:

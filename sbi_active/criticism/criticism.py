@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.criticism.checks import digest, require_fitting, with_noise
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
@@ -94,11 +95,12 @@ class Criticism:
         trials: Trials,
         *,
         effects: Sequence[Effect] = (),
-        actions: ActionSpace | None = None,
+        actions: Actions | None = None,
         summaries: int | None = None,
         seed: int = 0,
     ) -> None:
         model = with_noise(model, prior, trials)
+        actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.trials = model, prior, trials
         self.effects, self.actions, self.seed = [*effects], actions, seed
         self._parts = model, trials, self.effects
@@ -303,7 +305,7 @@ def close_loop(
     trials: Trials,
     *,
     effects: Sequence[Effect] = (),
-    actions: ActionSpace | None = None,
+    actions: Actions | None = None,
     summaries: int | None = None,
     seed: int = 0,
     evaluate: bool = True,

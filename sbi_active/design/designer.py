@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.choice import as_batch, pricing
 from sbi_active.design.design import Design
 from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
@@ -54,7 +55,7 @@ class InformationGainDesigner:
     part in this.
 
     Args:
-        actions: The action space.
+        actions: The action space, or a list of actions.
         num_samples: Simulations a candidate on average; an action that stays among the
             leading ones gets at most four times as many. A search of a box spends as
             many as for four candidates, four more each entry, and four more each
@@ -94,7 +95,7 @@ class InformationGainDesigner:
 
     def __init__(
         self,
-        actions: ActionSpace,
+        actions: Actions,
         *,
         num_samples: int = 1_500,
         estimator: str | InformationGainEstimator = "auto",
@@ -113,7 +114,7 @@ class InformationGainDesigner:
                 f"expected exponent >= 0; got {exponent}; do use inf for the best "
                 "action, or about 8 for one at random among good ones"
             )
-        self.actions = actions
+        self.actions = actions = action_space(actions)
         self.num_samples, self.exponent = num_samples, exponent
         self.estimator, self.eliminate = estimator, eliminate
         self.search = _find_search(search, actions)

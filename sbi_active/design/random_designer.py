@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace
+from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design, action_name
 from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
 from sbi_active.seeding import derive_seed, forked_generators
@@ -26,7 +26,7 @@ class RandomDesigner:
     """Choose an action uniformly at random, the design of NSBI and NLHI.
 
     Args:
-        actions: The action space.
+        actions: The action space, or a list of actions.
         num_samples: Simulations a candidate where ``min_probability_valid`` asks for
             its share of measurements; otherwise nothing is simulated.
         workers: Of these simulations.
@@ -34,12 +34,12 @@ class RandomDesigner:
 
     def __init__(
         self,
-        actions: ActionSpace,
+        actions: Actions,
         *,
         num_samples: int = 200,
         workers: Workers = IN_PROCESS,
     ) -> None:
-        self.actions = actions
+        self.actions = action_space(actions)
         self.num_samples = num_samples
         self.workers = workers
 

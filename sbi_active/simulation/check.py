@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
@@ -31,7 +32,7 @@ MANY = 0.5  # share of rows without a measurement that is worth a word
 def check_simulator(
     simulator: Callable[..., Any],
     prior: Distribution,
-    actions: ActionSpace,
+    actions: Actions,
     *,
     num_rows: int = 256,
     max_seconds: float = 60.0,
@@ -66,7 +67,7 @@ def check_simulator(
         >>> report.is_ready, report.is_deterministic, report.idle_parameters
         (False, True, ('theta_2',))
     """
-    run = _Runs(simulator, prior, actions, seed)
+    run = _Runs(simulator, prior, action_space(actions), seed)
     theta, action = run.draw(MIN_ROWS)
     report = SimulatorReport(
         takes_seeds=takes_seeds(simulator),

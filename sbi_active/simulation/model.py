@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.arrays import all_finite
+from sbi_active.arrays import all_finite, own_tensor
 from sbi_active.seeding import forked_generators, row_seeds
-from sbi_active.simulation.noise.gaussian import NoiseModel
+from sbi_active.simulation.noise.base import NoiseModel
+from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.simulator import (
     Simulator,
     outcome_array,
@@ -51,8 +52,10 @@ class SimulatorModel:
         fn: ``fn(theta, action)``, shapes (n, theta_dim) and (n, action_dim), giving
             (n, *x_shape); it may accept ``seeds``, shape (n,). With ``batched=False``,
             ``fn(theta, action, rng)`` of one row: float64 NumPy arrays of shapes
-            (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed.
-        noise: Added to the output of ``fn``; None where ``fn`` is itself the draw.
+            (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed,
+            which a ``fn`` without random numbers may leave out.
+        noise: Added to the output of ``fn``; None where ``fn`` is itself the draw. A
+            number is the standard deviation of Gaussian noise.
         batched: Whether ``fn`` takes all rows at once.
         setup: Called without arguments once a process, before the first run; ``fn``
             receives what it returns as keyword argument ``context``. It is neither
@@ -69,7 +72,8 @@ class SimulatorModel:
         fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
 
     Raises:
-        ValueError: If ``setup`` is given and ``fn`` takes no ``context``.
+        ValueError: If ``setup`` is given and ``fn`` takes no ``context``, or ``fn``
+            takes ``rng`` and all rows at once.
 
     Example:
         >>> from sbi_active.simulation import GaussianNoise
@@ -82,7 +86,7 @@ class SimulatorModel:
         self,
         fn: Callable[..., Any],
         *,
-        noise: NoiseModel | None = None,
+        noise: NoiseModel | float | Tensor | None = None,
         batched: bool = True,
         setup: Callable[[], Any] | None = None,
         parameter_names: Sequence[str] | None = None,
@@ -96,13 +100,22 @@ class SimulatorModel:
         self.channel_names = None if channel_names is None else [*channel_names]
         self.sample_times = None
         if sample_times is not None:
-            times = torch.as_tensor(sample_times, dtype=torch.float64)
-            self.sample_times = times.clone()
+            self.sample_times = own_tensor(
+                sample_times, torch.float64, name="sample_times"
+            )
+        if noise is not None and not isinstance(noise, NoiseModel):
+            noise = GaussianNoise(noise)
         self.noise = noise
         if noise is not None and self.sample_times is not None:
             self.noise = noise.at(self.sample_times)
-        keywords, self._takes_any = _keywords(fn, 2 if batched else 3)
-        self.fn_takes_seeds = not batched or "seeds" in keywords
+        self._takes_rng = not batched and _takes_rng(fn)
+        keywords, self._takes_any = _keywords(fn, 3 if self._takes_rng else 2)
+        self.fn_takes_seeds = self._takes_rng or (batched and "seeds" in keywords)
+        if batched and "rng" in keywords:
+            raise ValueError(
+                "expected fn(theta, action) of all rows; got fn with an argument "
+                "'rng'; pass batched=False with a fn(theta, action, rng) of one row"
+            )
         reserved = ("seeds", "context") if batched else ("context",)
         self.effect_names = tuple(k for k in keywords if k not in reserved)
         if setup is not None and "context" not in keywords and not self._takes_any:
@@ -168,7 +181,8 @@ class SimulatorModel:
                 "from two seeds, so that noise would count twice; do remove the random "
                 "numbers from fn, or build SimulatorModel(fn, noise=None)"
             )
-        return self._run(theta, action, _zeros(theta), effects)
+        seeds = torch.zeros(len(theta), dtype=torch.int64)
+        return self._run(theta, action, seeds, effects)
 
     def log_prob(
         self, x: Tensor, theta: Tensor, action: Tensor, **effects: Any
@@ -254,7 +268,6 @@ class SimulatorModel:
         if self.setup is not None:
             keywords["context"] = self._context()
         if not self.is_batched:
-            assert seeds is not None
             x = self._run_rows(theta, action, seeds, effects, keywords)
         else:
             if self.fn_takes_seeds:
@@ -274,27 +287,30 @@ class SimulatorModel:
         self,
         theta: Tensor,
         action: Tensor,
-        seeds: Tensor,
+        seeds: Tensor | None,
         effects: Mapping[str, Any],
         keywords: Mapping[str, Any],
     ) -> np.ndarray:
         thetas = theta.detach().cpu().double().numpy()
         actions = action.detach().cpu().double().numpy()
         arrays = {k: np.asarray(v, dtype=np.float64) for k, v in effects.items()}
+        own_seeds = [] if seeds is None else seeds.tolist()
         rows: np.ndarray | None = None
-        for i, seed in enumerate(seeds.tolist()):
+        for i in range(len(theta)):
             own = {k: v[i].copy() if v.ndim else float(v) for k, v in arrays.items()}
-            rng = np.random.default_rng(seed)
-            x = self.fn(thetas[i].copy(), actions[i].copy(), rng, **own, **keywords)
-            row = outcome_array(x)
+            row = [thetas[i].copy(), actions[i].copy()]
+            if self._takes_rng:
+                row.append(np.random.default_rng(own_seeds[i]))
+            x = self.fn(*row, **own, **keywords)
+            outcome = outcome_array(x)
             if rows is None:
-                rows = np.empty((len(theta), *row.shape))
-            if row.shape != rows.shape[1:]:
+                rows = np.empty((len(theta), *outcome.shape))
+            if outcome.shape != rows.shape[1:]:
                 raise ValueError(
                     f"expected rows of one shape, {rows.shape[1:]}; got "
-                    f"{row.shape} in row {i}; do fill what is missing with NaN"
+                    f"{outcome.shape} in row {i}; do fill what is missing with NaN"
                 )
-            rows[i] = row  # a copy: x may be the view of what the next row changes
+            rows[i] = outcome  # a copy: x may be the view of what the next row changes
         return np.empty((0, 1)) if rows is None else rows
 
     def _context(self) -> Any:
@@ -346,16 +362,16 @@ def _copied(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-def _zeros(theta: Tensor) -> Tensor:
-    return torch.zeros(len(theta), dtype=torch.int64)
+def _parameters(fn: Callable[..., Any]) -> list[inspect.Parameter]:
+    try:
+        return [*inspect.signature(fn).parameters.values()]
+    except (TypeError, ValueError):  # builtins and C functions have no signature
+        return []
 
 
 def _keywords(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
     """Return names of keyword arguments behind the positional ones, and if any go."""
-    try:
-        parameters = [*inspect.signature(fn).parameters.values()]
-    except (TypeError, ValueError):  # builtins and C functions have no signature
-        return [], False
+    parameters = _parameters(fn)
     kinds = inspect.Parameter
     named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
     positional = [p for p in parameters if p.kind != kinds.KEYWORD_ONLY][:num_rows]
@@ -363,12 +379,21 @@ def _keywords(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
     return names, any(p.kind == kinds.VAR_KEYWORD for p in parameters)
 
 
+def _takes_rng(fn: Callable[..., Any]) -> bool:
+    """Return whether a function of one row takes a third argument, its generator."""
+    parameters = _parameters(fn)
+    kinds = inspect.Parameter
+    if any(p.kind == kinds.VAR_POSITIONAL for p in parameters) or not parameters:
+        return True
+    behind = [p for p in parameters if p.kind < kinds.VAR_POSITIONAL][2:3]
+    return any(
+        p.name != "context" and not isinstance(p.default, int | float) for p in behind
+    )
+
+
 def takes_seeds(simulator: Callable[..., Any]) -> bool:
     """Return whether each row of the simulator is a function of its seed."""
     if isinstance(simulator, SimulatorModel):
         has_no_use = simulator.noise is None and simulator._is_deterministic is True
         return simulator.fn_takes_seeds or has_no_use
-    try:
-        return "seeds" in inspect.signature(simulator).parameters
-    except (TypeError, ValueError):  # builtins and C functions have no signature
-        return False
+    return "seeds" in [p.name for p in _parameters(simulator)]

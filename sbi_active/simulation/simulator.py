@@ -56,7 +56,8 @@ def outcome_tensor(
     if x.ndim == 0 or x.shape[0] != num_rows:
         raise ValueError(
             f"expected x with one row a parameter set, shape ({num_rows}, ...); got "
-            f"{tuple(x.shape)}; do return a simulator's rows stacked along axis 0"
+            f"{tuple(x.shape)}; return its rows stacked along axis 0, or wrap a "
+            "function of one row, SimulatorModel(fn, batched=False)"
         )
     if x.ndim == 1:  # one number a row
         x = x[:, None]

@@ -98,6 +98,10 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
         actions: Of the campaign.
         report: Whose verdict names effects.
     """
+    if not hasattr(report, "tracing"):
+        raise TypeError(
+            f"expected a report; got {report!r:.80}; pass what criticize() returned"
+        )
     chosen = report.tracing.chosen
     if not chosen:
         raise ValueError(

@@ -332,7 +332,8 @@ class Trials:
 
 
 def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
-    roles: list[Role] = ["fit"] * n if role is None else [*role]
+    given = ["fit"] * n if role is None else role
+    roles: list[Any] = [str(each).replace("_", " ") for each in given]
     if len(roles) != n or not {*roles} <= {"fit", "held out"}:
         raise ValueError(
             f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "

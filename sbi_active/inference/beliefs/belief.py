@@ -248,7 +248,8 @@ def require_support(prior: Distribution | None) -> Distribution:
     """Return the prior, or raise where it has no support to keep a belief in.
 
     Raises:
-        ValueError: If there is no prior, or its ``support`` is not implemented.
+        ValueError: If there is no prior, it is a batch of them, or its ``support`` is
+            not implemented.
     """
     if prior is None:
         raise ValueError(
@@ -265,6 +266,16 @@ def require_support(prior: Distribution | None) -> Distribution:
             f"{type(prior).__name__} without one; do use sbi.utils.BoxUniform, a torch "
             "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
         )
+    if prior.batch_shape:
+        with forked_generators(0):
+            draws = prior.sample(torch.Size([2]))
+        if prior.log_prob(draws).shape != (2,):
+            name = type(prior).__name__
+            raise ValueError(
+                "expected a prior of one density a parameter set; got a batch of "
+                f"{tuple(prior.batch_shape)} densities, {name}; pass "
+                f"torch.distributions.Independent({name}(...), 1)"
+            )
     return prior
 
 

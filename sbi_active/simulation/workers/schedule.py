@@ -331,8 +331,9 @@ class Schedule:
         first = next(iter(self.tracebacks.values()))
         raise SimulationError(
             "expected a simulator that can simulate; got a fault in each of the "
-            f"{len(self.tracebacks)} rows tried, so this is no fault of a row; do mend "
-            f"the simulator. The first of them:\n{first}"
+            f"{len(self.tracebacks)} rows tried, so no row is to blame; mend the "
+            "simulator, or wrap a function of one row, SimulatorModel(fn, "
+            f"batched=False). The first of them:\n{first}"
         ) from reply.error
 
 

@@ -1,0 +1,116 @@
+"""What users write at first: taken where it is clear, refused early where it is not."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, LogNormal
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    InformationGainDesigner,
+    RandomDesigner,
+    SimulatorModel,
+    simulate,
+)
+from sbi_active.criticism import Criticism, Trials
+from sbi_active.simulation import SimulationError, check_simulator
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=0.02)
+ROWS = torch.rand(4, 1), torch.rand(4, 1)
+ACTIONS = [0.1, 1.0, 3.0]
+
+
+def test_a_number_as_noise_is_a_gaussian_standard_deviation():
+    assert isinstance(MODEL.noise, GaussianNoise)
+    assert MODEL.noise.sd.item() == 0.02
+    several = SimulatorModel(lambda theta, action: theta, noise=[0.1, 0.2])
+    assert several.noise.sd.tolist() == [0.1, 0.2]
+    with pytest.raises(ValueError, match="expected sd of real numbers"):
+        SimulatorModel(lambda theta, action: theta, noise="small")
+
+
+@pytest.mark.parametrize("make", [list, tuple, np.array, torch.tensor])
+def test_a_list_of_actions_is_taken(make):
+    actions = make(ACTIONS)
+    campaign = Campaign(MODEL, PRIOR, actions)
+    assert campaign.actions.values[:, 0].tolist() == pytest.approx(ACTIONS)
+    assert InformationGainDesigner(actions).actions.action_dim == 1
+    assert RandomDesigner(actions).select(seed=0).action.shape == (1,)
+    assert check_simulator(MODEL, PRIOR, actions, num_rows=16).is_ready
+    trials = Trials([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
+    assert Criticism(MODEL, PRIOR, trials, actions=actions).actions.action_dim == 1
+
+
+@pytest.mark.parametrize("actions", ["fast", None, 3.0, {1.0, 2.0}])
+def test_what_is_no_list_of_actions_is_refused(actions):
+    with pytest.raises(TypeError, match="expected an action space or a list of"):
+        Campaign(MODEL, PRIOR, actions)
+
+
+@pytest.mark.parametrize("make", [DiscreteActions, RandomDesigner])
+def test_actions_of_several_lengths_are_refused(make):
+    with pytest.raises(ValueError, match="expected actions of .* rows of one length"):
+        make([[1.0], [2.0, 3.0]])
+
+
+def test_options_are_taken_from_a_dict():
+    campaign = Campaign(MODEL, PRIOR, ACTIONS, options={"num_simulations": 300})
+    assert campaign.state.options == CampaignOptions(num_simulations=300)
+    for wrong in ({"simulations": 300}, 300):
+        with pytest.raises(TypeError, match="pass CampaignOptions"):
+            Campaign(MODEL, PRIOR, ACTIONS, options=wrong)
+
+
+def test_a_batch_of_densities_is_no_prior():
+    batch = LogNormal(torch.zeros(1), torch.ones(1))
+    with pytest.raises(ValueError, match=r"pass .*Independent\(LogNormal\(\.\.\.\), 1"):
+        Campaign(MODEL, batch, ACTIONS)
+    assert Campaign(MODEL, Independent(batch, 1), ACTIONS).belief is not None
+
+
+def test_a_function_of_one_row_says_so():
+    def row(theta, action, rng):
+        return theta * action + rng.normal()
+
+    with pytest.raises(ValueError, match="pass batched=False"):
+        SimulatorModel(row)
+    with pytest.raises(ValueError, match="batched=False"):
+        simulate(lambda theta, action: theta[0] * action[0], *ROWS, seed=0)
+    with pytest.raises(SimulationError, match="batched=False"):
+        simulate(lambda theta, action: {}[float(theta[0, 0])], *ROWS, seed=0)
+
+
+def test_a_function_of_one_row_may_leave_out_the_generator():
+    def row(theta, action, *, push=0.0):
+        return theta * action + push
+
+    model = SimulatorModel(row, batched=False, noise=0.1)
+    exact = ROWS[0].double() * ROWS[1].double()
+    assert torch.equal(model.mean(*ROWS), exact)
+    assert torch.equal(model.mean(*ROWS, push=2.0), exact + 2)
+    assert model.effect_names == ("push",)
+    drag = SimulatorModel(lambda t, a, drag=0.0: t * a - drag, batched=False, noise=0.1)
+    assert torch.equal(drag.mean(*ROWS, drag=1.0), exact - 1)
+
+
+def test_random_numbers_of_a_row_without_a_generator_follow_the_seed():
+    model = SimulatorModel(lambda theta, action: theta + np.random.normal(), batched=0)
+    assert not model.fn_takes_seeds
+    x, same, other = (simulate(model, *ROWS, seed=s).x for s in (0, 0, 1))
+    assert torch.equal(x, same)
+    assert not torch.equal(x, other)
+
+
+def test_a_campaign_adopts_reports_alone():
+    with pytest.raises(TypeError, match="pass what criticize"):
+        Campaign(MODEL, PRIOR, ACTIONS).adopt(None)
+
+
+def test_a_role_may_have_an_underscore():
+    trials = Trials([1.0, 2.0], [0.5, 1.0], role=["fit", "held_out"])
+    assert trials.held_out_positions == [1]
