@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+import cloudpickle
 from torch import Tensor
 
 from sbi_active.campaign.stopping import StopRules
@@ -112,6 +113,15 @@ class CampaignOptions:
     def workers(self) -> Workers:
         """Where all simulations run."""
         return Workers(self.num_workers, self.time_limit, self.num_retries)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Builders of sbi's are local functions, which pickle refuses.
+        estimator = cloudpickle.dumps(self.density_estimator)
+        return {**vars(self), "density_estimator": estimator}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        estimator = cloudpickle.loads(state["density_estimator"])
+        vars(self).update(state, density_estimator=estimator)
 
     @classmethod
     def of(cls, options: Any) -> CampaignOptions:

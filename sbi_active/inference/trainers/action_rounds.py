@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, ClassVar
 
+import cloudpickle
 from sbi.inference.trainers._contracts import StartIndexContext
 from sbi.sbi_types import Tracker
 from sbi.utils.sbiutils import mask_sims_from_prior
@@ -72,6 +73,17 @@ class ActionRounds(ActiveInference):
         self._action_estimator = self._settings() if estimator is None else estimator
         self._trained_round: int | None = None
         self.trials = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Builders of sbi's are local functions, which pickle refuses.
+        sbi_trainer: Any = super()
+        estimator = cloudpickle.dumps(self._action_estimator)
+        return {**sbi_trainer.__getstate__(), "_action_estimator": estimator}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        estimator = cloudpickle.loads(state["_action_estimator"])
+        sbi_trainer: Any = super()
+        sbi_trainer.__setstate__({**state, "_action_estimator": estimator})
 
     @property
     def has_actions(self) -> bool:

@@ -1,15 +1,20 @@
 """What everything that learns has in common."""
 
 import inspect
+import json
 import pickle
+import subprocess
+import sys
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
 from sbi.inference import NLE_A, NRE_B, NRE_C
+from sbi.neural_nets import classifier_nn, likelihood_nn, posterior_nn
 from sbi.utils import BoxUniform
 
-from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B, SeqBED_C
+from sbi_active import ALHI, ASBI, CampaignOptions, SeqBED, SeqBED_B, SeqBED_C
 from sbi_active.inference import ActiveInference
 from sbi_active.inference.rounds import SilentTracker
 
@@ -100,6 +105,46 @@ def test_a_pickled_trainer_goes_on(trainer, estimator):
     theta = torch.linspace(-0.9, 0.9, 7)[:, None]
     ours, theirs = (belief.log_prob(theta) for belief in beliefs)
     assert torch.equal(ours, theirs)
+
+
+LOAD = """
+import sys, pickle, torch
+with open(sys.argv[1], "rb") as file:
+    inference = pickle.load(file)
+torch.manual_seed(1)
+belief = inference.update(torch.tensor([0.3]), action=torch.ones(1), seed=0)
+print(belief.log_prob(torch.tensor([[-0.5], [0.5]])).tolist())
+"""
+
+
+@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
+@pytest.mark.filterwarnings("ignore:When the inference object is pickled")
+def test_a_trainer_on_a_builder_of_sbi_is_loaded_by_another_process(tmp_path):
+    whole = round_of(ASBI(PRIOR, posterior_nn("maf"), show_progress_bars=False))
+    path = tmp_path / "trainer.pkl"
+    path.write_bytes(pickle.dumps(whole))
+    command = [sys.executable, "-W", "ignore", "-c", LOAD, str(path)]
+    loaded = subprocess.run(command, check=True, capture_output=True, text=True)
+    torch.manual_seed(1)
+    belief = whole.update(torch.tensor([0.3]), action=torch.ones(1), seed=0)
+    expected = belief.log_prob(torch.tensor([[-0.5], [0.5]])).tolist()
+    assert json.loads(loaded.stdout) == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:When the inference object is pickled")
+@pytest.mark.parametrize(
+    ("trainer", "builder"),
+    [
+        *[(ASBI, posterior_nn("maf")), (ALHI, likelihood_nn("maf"))],
+        *[(SeqBED_B, classifier_nn("mlp")), (SeqBED_C, classifier_nn("resnet"))],
+    ],
+)
+def test_builders_of_sbi_pickle(trainer, builder):
+    copy = pickle.loads(pickle.dumps(trainer(PRIOR, builder)))
+    assert callable(copy._action_estimator)
+    options = pickle.loads(pickle.dumps(CampaignOptions(density_estimator=builder)))
+    assert callable(options.density_estimator)
+    assert replace(options, density_estimator=None) == CampaignOptions()
 
 
 PARENTS = {ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED_C: NRE_C}
