@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import itertools
+import sys
+import time
+import warnings
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,20 +16,24 @@ from sbi.utils import BoxUniform
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.campaign import CampaignOptions
+from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.cli.loading import load_object
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import GaussianNoise, SimulatorModel, simulate
 from sbi_active.simulation.check import check_simulator
 from sbi_active.tasks import get_task  # pyright: ignore
 
-__all__ = ["actions_of", "check", "numbers_of", "prior_of"]
+__all__ = ["actions_of", "check", "prior_of", "with_noise"]
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
+LONG = 20.0  # seconds of simulation a round, beside which learning counts little
 
 
 def check(arguments: argparse.Namespace) -> int:
     """Look a simulator over; status 1 where a campaign cannot run."""
     simulator, prior, actions = _source(arguments)
     num_simulations = _campaign_size(actions, arguments.rounds)
+    print("sbi-active: running the simulator", file=sys.stderr)
     report = check_simulator(
         simulator,
         prior,
@@ -34,8 +43,37 @@ def check(arguments: argparse.Namespace) -> int:
         num_workers=arguments.workers,
         seed=arguments.seed,
     )
+    # Where simulations take longer than this, they are what a campaign takes.
+    is_short = 60 * (report.minutes or 0.0) <= LONG * arguments.rounds
+    if report.is_ready and is_short:
+        print("sbi-active: timing a round", file=sys.stderr)
+        try:
+            seconds = _time_round(simulator, prior, actions, arguments)
+            report = replace(report, seconds_round=seconds, num_rounds=arguments.rounds)
+        except Exception as error:  # whatever a campaign meets is the finding
+            report = replace(report, defects=(f"a round of a campaign fails: {error}",))
     print(report)
     return 0 if report.is_ready else 1
+
+
+def _time_round(
+    simulator: Any, prior: Distribution, actions: ActionSpace, arguments: Any
+) -> float:
+    """Return wall seconds of a round on an outcome that the prior allows."""
+    options = CampaignOptions(num_workers=arguments.workers)
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the round is thrown away
+        campaign = Campaign(
+            simulator, prior, actions, seed=arguments.seed, options=options
+        )
+        action = campaign.ask().action[None]
+        with forked_generators(arguments.seed, "truth"):
+            theta = prior.sample(torch.Size([1])).float()
+        x = simulate(simulator, theta, action, seed=arguments.seed).x[0]
+        campaign.tell(x)
+        campaign.update()
+    return time.perf_counter() - start
 
 
 def _campaign_size(actions: ActionSpace, num_rounds: int) -> int:
@@ -59,13 +97,15 @@ def _source(arguments: argparse.Namespace) -> tuple[Any, Distribution, ActionSpa
         )
     if arguments.task is not None:
         task = get_task(arguments.task)
-        return task.simulator, task.prior, task.actions
+        simulator = with_noise(task.simulator, arguments.noise)
+        return simulator, task.prior, task.actions
     simulator = load_object(arguments.simulator)
     if not callable(simulator):
         raise ValueError(
             f"expected a function or SimulatorModel; got {type(simulator).__name__} "
             f"under {arguments.simulator}; do name what takes (theta, action)"
         )
+    simulator = with_noise(simulator, arguments.noise)
     return simulator, prior_of(arguments), actions_of(arguments)
 
 
@@ -78,7 +118,7 @@ def prior_of(arguments: argparse.Namespace) -> Distribution:
             "expected --theta-low and --theta-high, or --prior; got too few; do give "
             "bounds as in --theta-low=0,-1 --theta-high=1,1"
         )
-    low, high = numbers_of(arguments.theta_low), numbers_of(arguments.theta_high)
+    low, high = _numbers(arguments.theta_low), _numbers(arguments.theta_high)
     if len(low) != len(high) or any(a >= b for a, b in zip(low, high, strict=True)):
         raise ValueError(
             f"expected as many bounds, low below high; got {low} and {high}; do give "
@@ -104,16 +144,34 @@ def actions_of(arguments: argparse.Namespace) -> ActionSpace:
 def _axis(spec: str) -> list[float]:
     parts = spec.split(":")
     if len(parts) == 1:
-        return numbers_of(spec)
+        return _numbers(spec)
     if len(parts) != 3 or not parts[2].isdigit() or int(parts[2]) < 1:
         raise ValueError(
             f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; do write, say, 0:5:11"
         )
-    low, high = (numbers_of(part)[0] for part in parts[:2])
+    low, high = (_numbers(part)[0] for part in parts[:2])
     return torch.linspace(low, high, int(parts[2])).tolist()
 
 
-def numbers_of(text: str) -> list[float]:
+def with_noise(simulator: Any, text: str | None) -> Any:
+    """Return a simulator with the Gaussian noise that --noise gives; None for none."""
+    if text is None:
+        return simulator
+    sd = _numbers(text)
+    if min(sd) <= 0:
+        raise ValueError(
+            f"expected --noise > 0; got {text}; give the standard deviation of a "
+            "measurement"
+        )
+    noise = GaussianNoise(torch.tensor(sd) if len(sd) > 1 else sd[0])
+    if not isinstance(simulator, SimulatorModel):
+        return SimulatorModel(simulator, noise=noise)
+    noisy = copy.copy(simulator)
+    noisy.noise = noise
+    return noisy
+
+
+def _numbers(text: str) -> list[float]:
     """Return numbers that are separated by commas."""
     try:
         return [float(part) for part in text.split(",")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import copy
 import functools
 import sys
 import warnings
@@ -16,12 +15,12 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.cli.check import actions_of, numbers_of, prior_of
+from sbi_active.cli.check import actions_of, prior_of, with_noise
 from sbi_active.cli.loading import load_object
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
 from sbi_active.criticism.data.table import TrialTable, read_table
 from sbi_active.criticism.effects.augmented import takes_times
-from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks import get_task  # pyright: ignore
 
 __all__ = ["criticize"]
@@ -122,7 +121,7 @@ def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
         _require_units(task.actions, trials, arguments)
         actions = actions_of(arguments) if arguments.actions else task.actions
         effects = getattr(task, "effects", list)()
-        simulator = _with_noise(task.simulator, arguments.noise)
+        simulator = with_noise(task.simulator, arguments.noise)
         return _Source(simulator, task.prior, actions, [*effects])
     fn = load_object(arguments.simulator)
     if not callable(fn):
@@ -132,7 +131,7 @@ def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
         )
     if not isinstance(fn, SimulatorModel):
         fn = _with_times(SimulatorModel(fn), trials, arguments)
-    prior, simulator = prior_of(arguments), _with_noise(fn, arguments.noise)
+    prior, simulator = prior_of(arguments), with_noise(fn, arguments.noise)
     actions = actions_of(arguments) if arguments.actions else None
     if actions is not None:
         _require_units(actions, trials, arguments)
@@ -193,17 +192,3 @@ def _declared(arguments: argparse.Namespace) -> list[Effect]:
             f"{type(wrong[0]).__name__} in it; do declare sbi_active.criticism.Effect"
         )
     return found
-
-
-def _with_noise(model: SimulatorModel, text: str | None) -> SimulatorModel:
-    if text is None:
-        return model
-    sd = numbers_of(text)
-    if min(sd) <= 0:
-        raise ValueError(
-            f"expected --noise > 0; got {text}; do give the standard deviation of a "
-            "measurement"
-        )
-    noisy = copy.copy(model)
-    noisy.noise = GaussianNoise(torch.tensor(sd) if len(sd) > 1 else sd[0])
-    return noisy

@@ -21,7 +21,7 @@ def make_task(name: str, options: Sequence[str]) -> Task:
 
     Raises:
         ValueError: If an option has no value, the task has none of that name, or what
-            the task needs is not installed.
+            the task needs is not installed or its data are elsewhere.
 
     Example:
         >>> make_task("numerical", ["variant=sinh"]).variant
@@ -40,6 +40,8 @@ def make_task(name: str, options: Sequence[str]) -> Task:
         return get_task(name, **values)
     except ImportError as error:  # its text has the line that installs it
         raise ValueError(str(error)) from error
+    except FileNotFoundError as error:
+        raise ValueError(f"{error}, as --option data=FOLDER") from error
     except TypeError as error:
         raise ValueError(
             f"expected values that {name!r} can use; got {values} ({error}); do "

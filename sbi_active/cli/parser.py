@@ -144,6 +144,12 @@ def _add_check(commands: Any) -> None:
         help="for each entry of the action LOW:HIGH:COUNT or A,B,...; or one "
         "MODULE:NAME of an action space",
     )
+    check.add_argument(
+        "--noise",
+        metavar="SD[,SD...]",
+        help="standard deviation of a measurement, one or one an entry of x, where the "
+        "simulator gives none",
+    )
     check.add_argument("--rows", type=_count, default=256, help="a check (256)")
     check.add_argument("--rounds", type=_count, default=4, help="of the campaign (4)")
     check.add_argument("--workers", type=_count, default=1, help="of the campaign (1)")

@@ -15,12 +15,12 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.options import make_task
+from sbi_active.cli.progress import Progress
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
@@ -35,46 +35,50 @@ SETTINGS = {"default": lambda _: CampaignOptions(), "faithful": faithful_options
 
 def run(arguments: argparse.Namespace) -> int:
     """Run a campaign on a task, and save its table, figure and results."""
-    task = make_task(arguments.task, arguments.option)
-    campaign = Campaign(
-        task.simulator,
-        task.prior,
-        task.actions,
-        method=arguments.method,
-        seed=arguments.seed,
-        options=_campaign_options(arguments),
-    )
-    arguments.out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    beliefs, rounds, exact_gains = [campaign.belief], [], []
-    with tqdm(total=arguments.rounds, desc=arguments.method, unit="round") as bar:
+    beliefs, rounds, exact_gains = [], [], []
+    with Progress(arguments.rounds, arguments.method) as progress:
+        progress.step("preparing the task")
+        task = make_task(arguments.task, arguments.option)
+        campaign = Campaign(
+            task.simulator,
+            task.prior,
+            task.actions,
+            method=arguments.method,
+            seed=arguments.seed,
+            options=_campaign_options(arguments),
+        )
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        beliefs.append(campaign.belief)
         for index in range(arguments.rounds):
+            progress.step("looking up what is exact")
             exact_gains.append(_exact_gain(task, campaign))
-            bar.set_postfix_str("designing")
+            progress.step("simulating, training and designing")
             trial = campaign.ask()
-            bar.set_postfix_str("measuring")
+            progress.step("measuring")
             campaign.tell(
                 task.real_system(
                     trial.action, seed=derive_seed(arguments.seed, "real", index)
                 )
             )
-            bar.set_postfix_str("updating")
+            progress.step("updating the belief")
             beliefs.append(campaign.update())
             rounds.append(_round_record(task, campaign, exact_gains[-1]))
-            bar.update()
-    wall = time.perf_counter() - start
+            progress.count()
+        wall = time.perf_counter() - start
+        progress.step("drawing and saving")
+        figure_path = arguments.out / "loop.png"
+        with forked_generators(arguments.seed, "figure"):
+            figure = plot_rounds(
+                beliefs,
+                [t.design for t in campaign.history if t.design is not None],
+                parameter_names=task.parameter_names,
+                theta_true=task.theta_true,
+                exact_gains=exact_gains,
+            )
+        save(figure, str(figure_path))
+        _save(arguments, campaign, rounds, wall)
     print(_table(rounds))
-    figure_path = arguments.out / "loop.png"
-    with forked_generators(arguments.seed, "figure"):
-        figure = plot_rounds(
-            beliefs,
-            [trial.design for trial in campaign.history if trial.design is not None],
-            parameter_names=task.parameter_names,
-            theta_true=task.theta_true,
-            exact_gains=exact_gains,
-        )
-    save(figure, str(figure_path))
-    _save(arguments, campaign, rounds, wall)
     mean, sd = campaign.belief.mean, campaign.belief.variance.sqrt()
     for name, m, s, truth in zip(
         task.parameter_names, mean, sd, task.theta_true, strict=True

@@ -29,6 +29,8 @@ class SimulatorReport:
         idle_actions: Entries of the action that change nothing.
         seconds_batch: Time of ``num_rows`` rows at once.
         seconds_row: Time of a call with one row.
+        seconds_round: Measured wall time of a campaign's round; None where it was not.
+        num_rounds: Of that campaign.
         num_simulations: That a campaign needs.
         num_workers: That share them.
         noiseless: Numbers of x, flattened, that two seeds leave as they are while
@@ -50,6 +52,8 @@ class SimulatorReport:
     idle_actions: tuple[str, ...] = ()
     seconds_batch: float | None = None
     seconds_row: float | None = None
+    seconds_round: float | None = None
+    num_rounds: int = 1
     num_simulations: int | None = None
     num_workers: int = 1
     noiseless: tuple[int, ...] = ()
@@ -63,7 +67,12 @@ class SimulatorReport:
 
     @property
     def minutes(self) -> float | None:
-        """Simulation time of a campaign, shared evenly by the workers."""
+        """Time of a campaign, as the round that was measured, or of its simulations.
+
+        The latter, shared evenly by the workers, where no round was measured.
+        """
+        if self.seconds_round is not None:
+            return self.num_rounds * self.seconds_round / 60
         if self.seconds_batch is None or self.num_simulations is None:
             return None
         seconds = self.num_simulations * self.seconds_batch / self.num_rows
@@ -91,10 +100,11 @@ class SimulatorReport:
                 f"once, {1e3 * self.seconds_row:.3g} ms for one"
             )
         if self.minutes is not None:
+            of = "" if self.seconds_round else " for them, and some to learn"
             workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}"
             lines.append(
                 f"campaign: at most {self.num_simulations:,} simulations, about "
-                f"{_duration(self.minutes)} on {workers}"
+                f"{_duration(self.minutes)} on {workers}{of}"
             )
         lines += [f"warning: {text}" for text in self.warnings]
         lines += [f"defect: {text}" for text in self.defects]

@@ -1,5 +1,6 @@
 import json
 import sys
+import time
 
 import arviz as az
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.colors import to_rgb
 
 from sbi_active.campaign import Trial
 from sbi_active.cli import main
+from sbi_active.cli.progress import Progress
 from sbi_active.cli.run import _reference
 from sbi_active.tasks import get_task  # pyright: ignore
 
@@ -70,7 +72,7 @@ def test_same_seed_same_results(tmp_path):
         ),
         (
             ["run", "box_collision", "--option", 'noise="loud"'],
-            "expected values that 'box_collision' can use; got {'noise': 'loud'}",
+            "expected sd of real numbers; got 'loud'",
         ),
         (
             ["run", "box_collision", "--option", "target=3"],
@@ -116,3 +118,20 @@ def test_a_task_s_own_options(tmp_path, capsys):
     assert result["options"] == ["target=2", "noise=0.01"]
     trial = result["rounds"][0]
     assert (trial["x"] == [None] * 3) == (trial["status"] == "invalid")
+
+
+def test_progress_names_steps_and_shows_that_it_lives(capsys, monkeypatch):
+    monkeypatch.setattr(Progress, "SIGN_IN_FILE", 0.05)
+    with Progress(2, "asbi") as progress:
+        progress.step("designing")
+        time.sleep(0.5)
+        progress.count()
+    shown = capsys.readouterr().err
+    assert shown.count("designing") > 3
+    assert "1/2" in shown
+
+
+def test_data_elsewhere_are_named_by_an_option(tmp_path, capsys):
+    arguments = ["run", "servo_pendulum", "--option", f"data={tmp_path}"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 2
+    assert "as --option data=FOLDER" in capsys.readouterr().err

@@ -1,7 +1,9 @@
 """The command on small modules in files, one for each defect, and a clean one."""
 
+import re
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -96,8 +98,9 @@ def _same_path(monkeypatch):
 
 
 @pytest.fixture
-def check(tmp_path, capsys, request):
+def check(tmp_path, capsys, request, monkeypatch):
     """Return exit status and printed text of the command on a module of this text."""
+    monkeypatch.setattr("sbi_active.cli.check._time_round", lambda *_: 1.0)
 
     def run(text, *options):
         name = f"robot_{abs(hash(request.node.name))}"
@@ -105,7 +108,7 @@ def check(tmp_path, capsys, request):
         path = str(tmp_path / f"{name}.py:simulator")
         status = main(["check", path, *SPACE, "--rows", "64", *options])
         captured = capsys.readouterr()
-        return status, captured.out + captured.err
+        return status, captured.err + captured.out
 
     return run
 
@@ -274,3 +277,18 @@ def simulator(theta, action):
     assert "changing action_1 leaves x as it is" in printed
     assert "at most 68,000 simulations" not in printed
     assert "at most 86,000 simulations" in printed  # 4 (5000 + 6 x 1500) + 30,000
+
+
+def test_the_cost_of_a_campaign_is_that_of_a_round_and_noise_is_an_option(
+    tmp_path, capsys
+):
+    (tmp_path / "exact.py").write_text(HEAD + DETERMINISTIC)
+    command = ["check", f"{tmp_path}/exact.py:simulator", *SPACE, "--rounds", "3"]
+    assert main(command) == 1
+    assert "expected a simulator with noise" in capsys.readouterr().out
+    start = time.perf_counter()
+    assert main([*command, "--noise", "0.1"]) == 0
+    elapsed = time.perf_counter() - start
+    shown = capsys.readouterr().out
+    seconds = float(re.search(r"about (\S+) seconds on 1 worker\n", shown)[1])
+    assert elapsed < seconds < 3 * elapsed
