@@ -5,6 +5,6 @@ here simulates.
 """
 
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.data.trials import Role, Trials
+from sbi_active.criticism.data.trials import Role
 
-__all__ = ["Measurements", "Role", "Trials"]
+__all__ = ["Measurements", "Role"]

@@ -4,7 +4,6 @@ Here live effects, their checks and priors. How well one explains trials does no
 """
 
 from sbi_active.criticism.effects.declarations import require_nested
-from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.joint_prior import JointPrior
 
-__all__ = ["Context", "Effect", "JointPrior", "require_nested"]
+__all__ = ["JointPrior", "require_nested"]

@@ -4,8 +4,7 @@ Here live words and pictures of finished results. Nothing here simulates or fits
 """
 
 from sbi_active.criticism.report.cautions import find_warnings
-from sbi_active.criticism.report.figures import plot_residuals
 from sbi_active.criticism.report.headline import with_error
-from sbi_active.criticism.report.report import Report, build_report
+from sbi_active.criticism.report.report import build_report
 
-__all__ = ["Report", "build_report", "find_warnings", "plot_residuals", "with_error"]
+__all__ = ["build_report", "find_warnings", "with_error"]

@@ -5,7 +5,6 @@ in ``report``, proposals of trials in ``next_trial``.
 """
 
 from sbi_active.criticism.steps.coarsening import power
-from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import LEVEL, num_determined
 from sbi_active.criticism.steps.influence import (
     is_left_to_chance,
@@ -19,7 +18,6 @@ __all__ = [
     "LEVEL",
     "LeaveOneOut",
     "is_left_to_chance",
-    "log_prior",
     "num_determined",
     "power",
     "predict",

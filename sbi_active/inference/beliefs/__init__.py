@@ -4,16 +4,11 @@ Here live those that are made of densities or particles alone. Those that simula
 in ``refinement``, those of learned factors in ``products``.
 """
 
-from sbi_active.inference.beliefs.belief import (
-    Belief,
-    ChainedBelief,
-    information_gained,
-)
+from sbi_active.inference.beliefs.belief import ChainedBelief, information_gained
 from sbi_active.inference.beliefs.comparison import compare, compare_orders
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 
 __all__ = [
-    "Belief",
     "ChainedBelief",
     "KernelBelief",
     "compare",

@@ -5,7 +5,5 @@ Here live posteriors, likelihoods and ratios. Beliefs, which have seen a trial, 
 """
 
 from sbi_active.inference.models.factors import ActionLikelihood, ActionRatio
-from sbi_active.inference.models.lfire import LFIRE
-from sbi_active.inference.models.posterior import ActionPosterior
 
-__all__ = ["ActionLikelihood", "ActionPosterior", "ActionRatio", "LFIRE"]
+__all__ = ["ActionLikelihood", "ActionRatio"]

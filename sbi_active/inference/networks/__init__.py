@@ -11,12 +11,8 @@ from sbi_active.inference.networks.action_scaling import (
 )
 from sbi_active.inference.networks.baseline import Baseline, local
 from sbi_active.inference.networks.conditioning import Conditioning
-from sbi_active.inference.networks.mixture_density import (
-    MixtureDensity,
-    MixtureDensityNetwork,
-)
+from sbi_active.inference.networks.mixture_density import MixtureDensityNetwork
 from sbi_active.inference.networks.mixture_network import PreparedLoss
-from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.inference.networks.response import Response
 from sbi_active.inference.networks.training import TrainingBudget, train_mixture_density
 
@@ -24,11 +20,9 @@ __all__ = [
     "ActionScaling",
     "Baseline",
     "Conditioning",
-    "MixtureDensity",
     "MixtureDensityNetwork",
     "Polynomials",
     "PreparedLoss",
-    "RatioClassifier",
     "Response",
     "TrainingBudget",
     "exponents_of",

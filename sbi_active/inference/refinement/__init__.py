@@ -17,7 +17,6 @@ from sbi_active.inference.refinement.simulated_likelihood import (
     SimulatedLikelihood,
     declares_noise,
 )
-from sbi_active.inference.refinement.stages import RefinementOptions, refine
 
 __all__ = [
     "BLURRED",
@@ -25,11 +24,9 @@ __all__ = [
     "LARGE",
     "MeanTable",
     "LearnedBelief",
-    "RefinementOptions",
     "SimulatedLikelihood",
     "declares_noise",
     "expected_error",
     "importance_sample",
-    "refine",
     "widened",
 ]

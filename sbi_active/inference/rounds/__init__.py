@@ -9,11 +9,10 @@ from sbi_active.inference.rounds.condition import (
     pack,
     unpack,
 )
-from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.rounds.tracking import SilentTracker
 
 __all__ = [
-    "Observation",
     "SilentTracker",
     "UnexplainedOutcomeError",
     "action_rows",

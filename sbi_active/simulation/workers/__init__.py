@@ -4,12 +4,10 @@ Here lives how rows are run, lost and stored. What a row means does not.
 """
 
 from sbi_active.simulation.workers.cluster import DaskPool
-from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.idle import IDLE
 from sbi_active.simulation.workers.pace import Pace, pace_of
 from sbi_active.simulation.workers.pools import pickled
 from sbi_active.simulation.workers.schedule import Schedule
-from sbi_active.simulation.workers.settings import Workers
 from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
 
 __all__ = [
@@ -19,9 +17,7 @@ __all__ = [
     "Recorder",
     "RowStore",
     "Schedule",
-    "Workers",
     "pace_of",
     "pickled",
     "run_digest",
-    "simulate",
 ]
