@@ -9,8 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["all_finite", "measured", "own_tensor"]
-
 
 def own_tensor(
     value: Any, dtype: torch.dtype | None = None, *, name: str = "x"

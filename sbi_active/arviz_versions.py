@@ -11,8 +11,6 @@ with warnings.catch_warnings():  # ArviZ 0.23 announces 1.0 at every import
     warnings.simplefilter("ignore", FutureWarning)
     import arviz as az
 
-__all__ = ["inference_data", "pareto_smoothed"]
-
 
 def inference_data(
     groups: dict[str, dict[str, np.ndarray]],

@@ -17,8 +17,6 @@ from sbi_active.simulation import simulate
 if TYPE_CHECKING:
     from sbi_active.campaign import Campaign
 
-__all__ = ["to_inference_data"]
-
 
 def to_inference_data(
     source: Distribution | Campaign,

@@ -7,8 +7,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["former_names"]
-
 
 def former_names(
     package: str, names: Mapping[str, str], *, stacklevel: int = 2

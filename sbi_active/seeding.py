@@ -26,15 +26,6 @@ import torch
 from scipy.special import ndtri
 from torch import Tensor
 
-__all__ = [
-    "derive_seed",
-    "forked_generators",
-    "kept_generators",
-    "row_normals",
-    "row_seeds",
-    "row_uniforms",
-]
-
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 

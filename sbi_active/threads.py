@@ -9,8 +9,6 @@ from functools import lru_cache
 import torch
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["single_thread"]
-
 
 @contextmanager
 def single_thread() -> Iterator[None]:

@@ -13,8 +13,6 @@ from sbi_active.actions.space import ActionSpace
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
 
-__all__ = ["BoxActions"]
-
 ROUNDING = 1e-6  # of the width, by which a float32 may leave the box
 
 

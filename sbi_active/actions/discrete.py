@@ -14,8 +14,6 @@ from sbi_active.actions.space import ActionSpace
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
 
-__all__ = ["DiscreteActions", "Actions", "action_space"]
-
 #: What is taken for an action space: a list stands for its actions.
 Actions: TypeAlias = (
     ActionSpace | Tensor | np.ndarray | Sequence[float] | Sequence[Sequence[float]]

@@ -11,8 +11,6 @@ from typing_extensions import override
 from sbi_active.actions.space import ActionSpace
 from sbi_active.seeding import derive_seed
 
-__all__ = ["MixedActions"]
-
 
 class MixedActions(ActionSpace):
     r"""The product :math:`\mathcal D_1 \times \cdots \times \mathcal D_k` of spaces.

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-__all__ = ["ActionSpace"]
-
 
 class ActionSpace(ABC):
     """A set of actions that can be sampled and tested for membership.

@@ -23,8 +23,6 @@ from sbi_active.simulation.bank import Bank
 from sbi_active.simulation.bank.labeled import LabeledStore
 from sbi_active.simulation.workers.store import run_digest
 
-__all__ = ["build", "inspect"]
-
 #: Rows that are drawn and simulated at once. Part of the definition of a bank's theta
 #: and action given a seed, so it is never a setting.
 BLOCK = 8192

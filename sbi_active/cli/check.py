@@ -23,8 +23,6 @@ from sbi_active.simulation import GaussianNoise, SimulatorModel, simulate
 from sbi_active.simulation.check import check_simulator
 from sbi_active.tasks import get_task  # pyright: ignore
 
-__all__ = ["actions_of", "check", "prior_of", "with_noise"]
-
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
 LONG = 20.0  # seconds of simulation a round, beside which learning counts little
 

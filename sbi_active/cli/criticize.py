@@ -23,8 +23,6 @@ from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks import get_task  # pyright: ignore
 
-__all__ = ["criticize"]
-
 
 @dataclass(frozen=True)
 class _Source:

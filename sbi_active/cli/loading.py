@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = ["load_object"]
-
 
 def load_object(name: str) -> Any:
     """Import what a user names.

@@ -9,8 +9,6 @@ from typing import Any
 
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 
-__all__ = ["make_task"]
-
 
 def make_task(name: str, options: Sequence[str]) -> Task:
     """Return a task with the options of a command line.

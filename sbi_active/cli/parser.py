@@ -10,8 +10,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-__all__ = ["METHODS", "SETTINGS", "TASKS", "make_parser"]
-
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
     "numerical",

@@ -8,8 +8,6 @@ from types import TracebackType
 
 from tqdm import tqdm
 
-__all__ = ["Progress"]
-
 
 class Progress:
     """A bar of rounds that names the present step and goes on counting seconds.

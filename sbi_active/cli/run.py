@@ -28,8 +28,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import Task  # pyright: ignore
 
-__all__ = ["SETTINGS", "run"]
-
 SETTINGS = {"default": lambda _: CampaignOptions(), "faithful": faithful_options}
 
 

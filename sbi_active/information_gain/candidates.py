@@ -21,7 +21,7 @@ from sbi_active.simulation import (
     SimulatorModel,
     simulate,
 )
-from sbi_active.simulation.model import require_noise
+from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 __all__ = ["CandidateSampler"]

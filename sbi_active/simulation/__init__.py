@@ -48,9 +48,9 @@ __getattr__ = former_names(
     {
         "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
         "RowStore": "sbi_active.simulation.workers:RowStore",
-        "Simulator": "sbi_active.simulation.model:Simulator",
+        "Simulator": "sbi_active.simulation.simulator:Simulator",
         "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
-        "require_noise": "sbi_active.simulation.model:require_noise",
+        "require_noise": "sbi_active.simulation.simulator:require_noise",
         "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
     },
 )

@@ -21,8 +21,6 @@ from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.simulator import outcome_tensor, require_noise
 from sbi_active.simulation.workers.engine import simulate
 
-__all__ = ["SimulatorReport", "check_simulator"]
-
 MIN_ROWS = 16
 RUNS = 6  # of all rows, beside one a parameter and one an entry of the action
 ROUNDING = 1e-5  # relative difference between batches that mixes no rows

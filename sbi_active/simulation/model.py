@@ -18,19 +18,9 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.simulator import (
-    Simulator,
     outcome_array,
     outcome_tensor,
-    require_noise,
 )
-
-__all__ = [
-    "Simulator",
-    "SimulatorModel",
-    "outcome_tensor",
-    "require_noise",
-    "takes_seeds",
-]
 
 FEW = 8  # rows that show whether fn is random
 ROUNDING = 1e-6  # relative difference that makes no draw

@@ -8,14 +8,6 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-__all__ = [
-    "MissingRowsWarning",
-    "Outcome",
-    "SimulationError",
-    "SimulationInterrupted",
-    "Simulations",
-]
-
 
 class Outcome(IntEnum):
     """What became of a row.

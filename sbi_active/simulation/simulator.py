@@ -10,13 +10,6 @@ from torch import Tensor
 
 from sbi_active.arrays import measured, own_tensor
 
-__all__ = [
-    "Simulator",
-    "outcome_array",
-    "outcome_tensor",
-    "require_noise",
-]
-
 
 class Simulator(Protocol):
     """What users bring: a draw from p(x | theta, action), one row a parameter set.

@@ -21,12 +21,12 @@ from sbi_active.inference.regression.surrogate import (
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation.model import require_noise
 from sbi_active.simulation.outcomes import (
     MissingRowsWarning,
     Outcome,
     SimulationError,
 )
+from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 

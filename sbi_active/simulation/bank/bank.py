@@ -33,8 +33,6 @@ from sbi_active.simulation.workers.store import StoredRows, run_digest
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["Bank", "LabeledStore"]
-
 
 class Bank:
     r"""Simulated rows on disk, to go on with, read in parts, and reuse.

@@ -7,15 +7,6 @@ import stat
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "LARGEST_TEXT",
-    "CorruptSegmentError",
-    "is_count",
-    "parsed",
-    "regular_size",
-    "require",
-]
-
 #: Bytes of a header that are read at most; the settings in one have far fewer.
 LARGEST_TEXT = 256 * 2**20
 

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["differences", "fingerprint", "simulator_name"]
-
 #: Arrays up to this size are kept as numbers, so that a difference can be shown.
 SMALL = 16
 

@@ -18,15 +18,6 @@ from sbi_active.simulation.bank.damage import (
 from sbi_active.simulation.bank.fingerprint import differences
 from sbi_active.simulation.bank.segments import TEMPORARY, write_file
 
-__all__ = [
-    "has_header",
-    "make_folder",
-    "new_header",
-    "read_header",
-    "require_same_simulator",
-    "write_header",
-]
-
 FORMAT = 1
 HEADER = "bank.json"
 

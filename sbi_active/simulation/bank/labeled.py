@@ -16,8 +16,6 @@ from sbi_active.simulation.workers.store import StoredRows
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["LabeledStore"]
-
 
 class Rows(Protocol):
     """Where rows are kept: a bank."""

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import filelock
 
-__all__ = ["LockedError", "WriterLock"]
-
 
 class LockedError(OSError):
     """Somebody else is writing.

@@ -7,8 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["log_density"]
-
 
 def log_density(distribution: Any, theta: Tensor) -> Tensor:
     """Return the log density of rows, -inf outside the support.

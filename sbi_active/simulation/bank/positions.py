@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["positions"]
-
 
 def positions(rows: Any, total: int) -> np.ndarray | None:
     """Return the positions of rows, int64; None where all are meant.

@@ -16,8 +16,6 @@ from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.log_density import log_density
 from sbi_active.simulation.outcomes import Outcome, Simulations
 
-__all__ = ["ReusedRows", "reuse"]
-
 #: Below it an average over the rows has a standard error above a tenth of an sd.
 FEW = 100
 

@@ -28,8 +28,6 @@ from sbi_active.simulation.bank.damage import (
 )
 from sbi_active.simulation.outcomes import Outcome
 
-__all__ = ["read_segment", "write_file", "write_segment"]
-
 TEMPORARY = ".writing-"
 
 #: Compare with ``meta`` in the file, which holds the checksums of all columns.

@@ -31,8 +31,6 @@ from sbi_active.simulation.bank.segments import (
 )
 from sbi_active.simulation.outcomes import Outcome
 
-__all__ = ["Segment", "Shelf"]
-
 #: Bytes of a segment: what reading one row may cost in memory.
 SEGMENT_BYTES = 64 * 2**20
 

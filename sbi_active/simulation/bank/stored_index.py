@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["StoredIndex"]
-
 
 class StoredIndex:
     """A mask over the rows of one run, which grows as they are added.

@@ -19,8 +19,6 @@ from sbi_active.simulation.noise.posterior import (
     log_student_evidence,
 )
 
-__all__ = ["AutocorrelatedNoise", "innovations", "time_stamps"]
-
 
 class AutocorrelatedNoise(ScaleNoise):
     r"""Gaussian noise whose correlation decays exponentially with the time between.

@@ -16,14 +16,6 @@ from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
 
-__all__ = [
-    "NoiseModel",
-    "ScaleNoise",
-    "declared_sds",
-    "observed_terms",
-    "standard_normals",
-]
-
 NUM_SAMPLES = 4_096  # for the deviation of a noise that declares none
 NUM_DRAWS = 256  # of a posterior that is not one of this library's own
 

@@ -18,7 +18,8 @@ from sbi_active.simulation.noise.autocorrelated import (
     innovations,
     time_stamps,
 )
-from sbi_active.simulation.noise.gaussian import GaussianNoise, NoiseModel
+from sbi_active.simulation.noise.base import NoiseModel
+from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.noise.posterior import (
     Cells,
     InverseChiSquare,
@@ -26,8 +27,6 @@ from sbi_active.simulation.noise.posterior import (
     SdGrid,
 )
 from sbi_active.simulation.noise.student import StudentTNoise, log_student
-
-__all__ = ["NoiseKind", "estimate_noise"]
 
 NoiseKind = Literal["gaussian", "autocorrelated", "student"]
 

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.simulation.noise.base import (
-    NoiseModel,
     ScaleNoise,
     observed_terms,
     standard_normals,
@@ -19,8 +18,6 @@ from sbi_active.simulation.noise.posterior import (
     NoisePosterior,
     log_student_evidence,
 )
-
-__all__ = ["GaussianNoise", "NoiseModel"]
 
 LOG_2PI = math.log(2 * math.pi)
 

@@ -16,14 +16,6 @@ from scipy.special import chdtri
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-__all__ = [
-    "Cells",
-    "InverseChiSquare",
-    "NoisePosterior",
-    "SdGrid",
-    "log_student_evidence",
-]
-
 
 class ConditionalSd(Protocol):
     """Standard deviations given the cell of the shared parameter."""

@@ -12,8 +12,6 @@ from sbi_active.seeding import row_uniforms
 from sbi_active.simulation.noise.base import ScaleNoise, observed_terms
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 
-__all__ = ["StudentTNoise", "log_student"]
-
 
 class StudentTNoise(ScaleNoise):
     r"""Independent Student-t noise of a given standard deviation.

@@ -18,8 +18,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.simulator import outcome_tensor
 
-__all__ = ["BLOCK", "Call", "Fault", "Reply", "answer"]
-
 #: Rows that share one seed of the global generators. Part of the definition of x for a
 #: simulator that takes no seeds, so it is never a setting.
 BLOCK = 256

@@ -22,8 +22,6 @@ from typing_extensions import override
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.pools import Pool, WorkerPool, pickled
 
-__all__ = ["DaskPool", "JoblibPool", "configured_pool"]
-
 
 def configured_pool(simulator: Callable[..., Any], num_workers: int) -> Pool | None:
     """Return the pool that ``joblib.parallel_config`` asks for; None for processes."""

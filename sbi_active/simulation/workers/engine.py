@@ -33,8 +33,6 @@ from sbi_active.simulation.workers.store import (
     run_digest,
 )
 
-__all__ = ["simulate"]
-
 
 def simulate(
     simulator: Callable[..., Any],

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 
 from sbi_active.simulation.workers.processes import Worker
 
-__all__ = ["IDLE", "IdleWorkers"]
-
 
 class IdleWorkers:
     """Keeps loaded workers between simulations, so that each is started once.

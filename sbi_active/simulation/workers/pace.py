@@ -11,8 +11,6 @@ from collections.abc import Callable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-__all__ = ["Pace", "pace_of"]
-
 
 class Pace:
     """What calls of a simulator took, a fixed time and a time a row.

@@ -19,8 +19,6 @@ from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.idle import IDLE
 from sbi_active.simulation.workers.processes import Worker, surroundings
 
-__all__ = ["InProcess", "Pool", "WorkerPool", "pickled"]
-
 
 class Pool(ABC):
     """Runs calls, some at a time, and hands back what came of them in any order.

@@ -31,8 +31,6 @@ from joblib.externals.loky.backend import get_context
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.calls import Reply, answer
 
-__all__ = ["Worker", "surroundings"]
-
 _FORKS = sys.platform.startswith("linux")
 
 _LOKY: Any = get_context("loky")

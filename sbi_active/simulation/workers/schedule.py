@@ -18,8 +18,6 @@ from sbi_active.simulation.workers.pace import Pace
 from sbi_active.simulation.workers.pools import Pool
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["Schedule"]
-
 _UNFINISHED = -1
 
 

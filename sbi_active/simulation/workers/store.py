@@ -15,16 +15,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = [
-    "FindStore",
-    "Recorder",
-    "RowStore",
-    "StoredRows",
-    "find_store",
-    "run_digest",
-    "storing",
-]
-
 
 class StoredRows(TypedDict):
     """Rows of a set, as a store gets them.
