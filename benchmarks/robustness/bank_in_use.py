@@ -56,14 +56,14 @@ def raises(kind: type[Exception], text: str, act: Callable[[], Any]) -> None:
 
 MISUSE: dict[str, tuple[str, Callable[[Bank], Any]]] = {
     "complex x": (
-        "expected real x",
+        "expected x of real",
         lambda b: b.append(
             Simulations(torch.ones(2, 1), torch.ones(2, 1), 1j * torch.ones(2, 1), _ok),
             seed=0,
         ),
     ),
     "x of 1e39": (
-        "within float32",
+        "within +-3.4e38",
         lambda b: b.append(
             Simulations(torch.ones(2, 1), torch.ones(2, 1), _large, _ok), seed=0
         ),

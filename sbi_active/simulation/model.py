@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.arrays import all_finite, own_tensor
+from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.simulator import (
     outcome_array,
     outcome_tensor,
+    require_rows,
 )
 
 FEW = 8  # rows that show whether fn is random
@@ -312,25 +313,13 @@ class SimulatorModel:
         return _contexts[key]
 
     def _check(self, theta: Tensor, action: Tensor, effects: Mapping[str, Any]) -> None:
-        if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
-            raise ValueError(
-                "expected theta (n, theta_dim) and action (n, action_dim) with as many "
-                f"rows; got {tuple(theta.shape)} and {tuple(action.shape)}; do repeat "
-                "the action for each row"
-            )
+        require_rows(theta, action)
         names = self.parameter_names
         if names is not None and theta.shape[1] != len(names):
             raise ValueError(
                 f"expected {len(names)} parameters, {', '.join(names)}; got theta of "
                 f"shape {tuple(theta.shape)}; do give one column a parameter"
             )
-        for name, rows in (("theta", theta), ("action", action)):
-            if not all_finite(rows):
-                first = int(torch.nonzero(~rows.isfinite().all(1))[0, 0])
-                raise ValueError(
-                    f"expected finite {name}; got {rows[first].tolist()} in row "
-                    f"{first}; do remove NaN and inf"
-                )
         for name, value in effects.items():
             if name not in self.effect_names and not self._takes_any:
                 known = ", ".join(map(repr, self.effect_names)) or "none"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.arrays import measured, own_tensor
+from sbi_active.arrays import all_finite, measured, own_tensor
 
 
 class Simulator(Protocol):
@@ -82,6 +82,27 @@ def _require_outcome(x: Any) -> None:
             "expected an outcome from the simulator; got None; return x, with NaN "
             "where there is no measurement"
         )
+
+
+def require_rows(theta: Tensor, action: Tensor) -> None:
+    """Raise where parameters and actions are no finite rows (n, ...) of each other.
+
+    Raises:
+        ValueError: With the first row that is not finite.
+    """
+    if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
+        raise ValueError(
+            "expected theta (n, theta_dim) and action (n, action_dim) with as many "
+            f"rows; got {tuple(theta.shape)} and {tuple(action.shape)}; repeat the "
+            "action for each row"
+        )
+    for name, rows in (("theta", theta), ("action", action)):
+        if not all_finite(rows):
+            first = int(torch.nonzero(~rows.isfinite().all(1))[0, 0])
+            raise ValueError(
+                f"expected finite {name}; got {rows[first].tolist()} in row {first}; "
+                "remove NaN and inf"
+            )
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:

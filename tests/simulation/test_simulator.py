@@ -161,7 +161,7 @@ def test_a_complex_outcome_is_refused(x):
 def test_complex_parameters_and_actions_are_refused(name):
     rows = {"theta": THETA, "action": THETA}
     rows[name] = rows[name] + 1j
-    with pytest.raises(ValueError, match="expected theta and action of real numbers"):
+    with pytest.raises(ValueError, match=f"expected {name} of real numbers"):
         simulate(lambda t, a: t, **rows, seed=0)
 
 

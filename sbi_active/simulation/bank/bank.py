@@ -24,9 +24,8 @@ from sbi_active.simulation.bank.header import (
 )
 from sbi_active.simulation.bank.labeled import LabeledStore
 from sbi_active.simulation.bank.lock import WriterLock
-from sbi_active.simulation.bank.positions import positions
+from sbi_active.simulation.bank.rows import StoredIndex, positions
 from sbi_active.simulation.bank.shelf import COLUMN_NAMES, Shelf
-from sbi_active.simulation.bank.stored_index import StoredIndex
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.store import StoredRows, run_digest
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import own_tensor
 from sbi_active.simulation.bank.log_density import log_density
 from sbi_active.simulation.workers.store import StoredRows
 
@@ -52,8 +53,6 @@ class LabeledStore:
                 f"expected {len(index)} rows, one an index; got {lengths}; do give "
                 "columns of one length"
             )
-        for name in ("theta", "action", "x"):
-            _require_storable(name, columns[name])
         log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
         if self._proposal is not None:
             log_proposal = log_density(self._proposal, theta)
@@ -68,7 +67,10 @@ class LabeledStore:
         log_action = log_action[index] if log_action.ndim else log_action
         stored = {
             "index": index.to(torch.int64),
-            **{name: columns[name].float() for name in ("theta", "action", "x")},
+            **{
+                name: own_tensor(columns[name], torch.float32, name=name)
+                for name in ("theta", "action", "x")
+            },
             "status": columns["status"].to(torch.int8),
             "log_proposal": log_proposal,
             "log_action": log_action.expand(len(index)),
@@ -76,19 +78,4 @@ class LabeledStore:
         self._bank.store(
             {"digest": run, "seed": int(seed), "label": self._label},
             {name: c.detach().cpu().numpy() for name, c in stored.items()},
-        )
-
-
-def _require_storable(name: str, column: Tensor) -> None:
-    """Raise where float32 loses more than digits."""
-    if column.is_complex():
-        raise ValueError(
-            f"expected real {name}; got {column.dtype}; pass real and imaginary parts "
-            "as numbers of their own"
-        )
-    if bool((column.isfinite() & ~column.float().isfinite()).any()):
-        raise ValueError(
-            f"expected {name} within float32, up to 3.4e38; got "
-            f"{float(column.abs().nan_to_num(posinf=0.0).max()):.3g}; pass other units "
-            "or its logarithm"
         )

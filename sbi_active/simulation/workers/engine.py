@@ -12,6 +12,7 @@ from joblib import effective_n_jobs
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from sbi_active.arrays import own_tensor
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.model import takes_seeds
 from sbi_active.simulation.outcomes import (
@@ -20,7 +21,7 @@ from sbi_active.simulation.outcomes import (
     SimulationInterrupted,
     Simulations,
 )
-from sbi_active.simulation.simulator import require_noise
+from sbi_active.simulation.simulator import require_noise, require_rows
 from sbi_active.simulation.workers.cluster import configured_pool
 from sbi_active.simulation.workers.pace import pace_of
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
@@ -116,7 +117,11 @@ def simulate(
         >>> rows.x.shape
         torch.Size([3, 1])
     """
-    theta, action = _checked(torch.as_tensor(theta), torch.as_tensor(action))
+    theta = own_tensor(theta, torch.float32, name="theta")
+    action = own_tensor(action, torch.float32, name="action")
+    require_rows(theta, action)
+    if not len(theta):
+        raise ValueError("expected at least one row; got none; pass theta of n >= 1")
     single = Workers(num_workers, time_limit, num_retries)
     if workers is not None and single != IN_PROCESS:
         raise ValueError(
@@ -154,37 +159,6 @@ def simulate(
                 require_noise(rows.x[few], other.x)
     _warn(schedule)
     return rows
-
-
-def _checked(theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-    if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
-        raise ValueError(
-            "expected theta (n, theta_dim) and action (n, action_dim) with as many "
-            f"rows; got {tuple(theta.shape)} and {tuple(action.shape)}; do repeat the "
-            "action for each row"
-        )
-    if not len(theta):
-        raise ValueError("expected at least one row; got none; do pass theta of n >= 1")
-    theta, action = _own_rows(theta), _own_rows(action)
-    for name, rows in (("theta", theta), ("action", action)):
-        finite = rows.isfinite().flatten(1).all(-1)
-        if not bool(finite.all()):
-            bad = torch.nonzero(~finite).flatten()
-            raise ValueError(
-                f"expected finite {name}; got NaN or inf in {len(bad)} rows, first "
-                f"{int(bad[0])}: {rows[bad[0]].tolist()}; do remove those rows"
-            )
-    return theta, action
-
-
-def _own_rows(rows: Tensor) -> Tensor:
-    """Return parameters or actions in float32, which no caller changes later."""
-    if rows.is_complex():
-        raise ValueError(
-            f"expected theta and action of real numbers; got {rows.dtype}; pass the "
-            "real and the imaginary part as two columns"
-        )
-    return rows.to(torch.float32, copy=True)
 
 
 def _pool(simulator: Callable[..., Any], workers: Workers) -> Pool:

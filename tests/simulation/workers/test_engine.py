@@ -279,7 +279,7 @@ def test_bad_options(options, text):
 def test_rows_must_be_finite(name):
     rows = {"theta": torch.rand(3, 1), "action": torch.rand(3, 1)}
     rows[name][1] = torch.nan
-    with pytest.raises(ValueError, match=f"expected finite {name}; got NaN"):
+    with pytest.raises(ValueError, match=f"expected finite {name}; got"):
         simulate(seeded, **rows, seed=0)
 
 

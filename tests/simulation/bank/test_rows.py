@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sbi_active.simulation.bank.stored_index import StoredIndex
+from sbi_active.simulation.bank.rows import StoredIndex
 
 
 def test_it_knows_what_a_set_knows():

@@ -1,8 +1,36 @@
-"""Which rows of a run are stored."""
+"""Rows of a bank: those that are meant, and those of a run that are stored."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+
+
+def positions(rows: Any, total: int) -> np.ndarray | None:
+    """Return the positions of rows, int64; None where all are meant.
+
+    Args:
+        rows: Positions, a slice, a mask over all rows, or None.
+        total: How many rows there are.
+
+    Raises:
+        ValueError: If they are anything else.
+    """
+    if rows is None:
+        return None
+    if isinstance(rows, slice):
+        return np.arange(*rows.indices(total))
+    found = np.asarray(rows)
+    if found.dtype == bool and found.shape == (total,):
+        return np.flatnonzero(found)
+    whole = found.ndim == 1 and found.dtype.kind in "iu"
+    if not whole or not bool(((found >= 0) & (found < total)).all()):
+        raise ValueError(
+            f"expected positions of rows within [0, {total}), or a mask of "
+            f"{total}; got {rows!r}; do use what columns() is indexed by"
+        )
+    return found
 
 
 class StoredIndex:
