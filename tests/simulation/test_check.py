@@ -1,6 +1,6 @@
 """The command on small modules in files, one for each defect, and a clean one."""
 
-import re
+import argparse
 import subprocess
 import sys
 import time
@@ -9,8 +9,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions
+from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.cli import main
+from sbi_active.cli.check import _time_round
 from sbi_active.simulation import check_simulator
 
 HEAD = "import numpy as np\nimport torch\nfrom sbi_active import *\n"
@@ -279,16 +280,29 @@ def simulator(theta, action):
     assert "at most 86,000 simulations" in printed  # 4 (5000 + 6 x 1500) + 30,000
 
 
-def test_the_cost_of_a_campaign_is_that_of_a_round_and_noise_is_an_option(
-    tmp_path, capsys
-):
-    (tmp_path / "exact.py").write_text(HEAD + DETERMINISTIC)
-    command = ["check", f"{tmp_path}/exact.py:simulator", *SPACE, "--rounds", "3"]
-    assert main(command) == 1
-    assert "expected a simulator with noise" in capsys.readouterr().out
+def test_a_campaign_costs_what_its_rounds_cost(check, monkeypatch):
+    shown = check(CLEAN, "--rounds", "3")[1]
+    assert "about 3 seconds on 1 worker\n" in shown
+    monkeypatch.setattr("sbi_active.cli.check.LONG", -1.0)
+    shown = check(CLEAN, "--rounds", "3")[1]
+    assert "on 1 worker for them, and some to learn\n" in shown
+
+
+def test_the_round_that_is_timed_is_one_of_a_campaign():
+    def simulator(theta, action):
+        return theta * action
+
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    arguments = argparse.Namespace(workers=1, seed=0)
+    model, actions = SimulatorModel(simulator, noise=0.1), DiscreteActions([1.0, 2.0])
     start = time.perf_counter()
-    assert main([*command, "--noise", "0.1"]) == 0
-    elapsed = time.perf_counter() - start
-    shown = capsys.readouterr().out
-    seconds = float(re.search(r"about (\S+) seconds on 1 worker\n", shown)[1])
-    assert elapsed < seconds < 3 * elapsed
+    seconds = _time_round(model, prior, actions, arguments)
+    assert 0.1 < seconds <= time.perf_counter() - start
+
+
+def test_noise_is_an_option(check):
+    status, shown = check(DETERMINISTIC)
+    assert status == 1
+    assert "expected a simulator with noise" in shown
+    assert check(DETERMINISTIC, "--noise", "0.1")[0] == 0
+    assert check(DETERMINISTIC, "--noise", "0")[0] == 2
