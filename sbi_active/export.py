@@ -59,7 +59,7 @@ def to_inference_data(
         parameter_names = [f"theta_{i + 1}" for i in range(theta.shape[1])]
     if len(parameter_names) != theta.shape[1]:
         raise ValueError(
-            f"expected {theta.shape[1]} parameter names; got {[*parameter_names]}; do "
+            f"expected {theta.shape[1]} parameter names; got {[*parameter_names]}; "
             "give one a parameter"
         )
     groups: dict[str, dict[str, np.ndarray]] = {"posterior": {"theta": _draws(theta)}}

@@ -84,7 +84,7 @@ def plot_rounds(
     if len(beliefs) != len(designs) + 1:
         raise ValueError(
             "expected one belief more than designs, the first before any trial; got "
-            f"{len(beliefs)} and {len(designs)}; do add the prior in front"
+            f"{len(beliefs)} and {len(designs)}; add the prior in front"
         )
     figure, axes = plt.subplots(
         len(designs), 3, figsize=(11, 2.9 * len(designs)), squeeze=False

@@ -46,7 +46,7 @@ def derive_seed(seed: int, *key: int | str) -> int:
         False
     """
     if seed < 0:
-        raise ValueError(f"expected a seed >= 0; got {seed}; do use 0, 1, 2, ...")
+        raise ValueError(f"expected a seed >= 0; got {seed}; use 0, 1, 2, ...")
     words = [k if isinstance(k, int) else zlib.crc32(k.encode()) for k in key]
     state = np.random.SeedSequence([seed, *words]).generate_state(1, np.uint64)
     return int(state[0] >> np.uint64(1))

@@ -52,14 +52,14 @@ class BoxActions(ActionSpace):
         if self.low.ndim != 1 or self.low.shape != self.high.shape or not len(self.low):
             raise ValueError(
                 "expected low and high of the same shape (action_dim,); got "
-                f"{tuple(limits[0].shape)} and {tuple(limits[1].shape)}; do give one "
+                f"{tuple(limits[0].shape)} and {tuple(limits[1].shape)}; give one "
                 "limit each an entry of the action"
             )
         apart = (self.high > self.low) & (self.high - self.low).isfinite()
         if not bool(apart.all()):
             raise ValueError(
                 f"expected finite low < high; got {self.low.tolist()} and "
-                f"{self.high.tolist()}; do give an entry that does not change to the "
+                f"{self.high.tolist()}; give an entry that does not change to the "
                 "simulator, not to the action"
             )
         self._label(names, units)

@@ -50,11 +50,11 @@ class DiscreteActions(ActionSpace):
         if tensor.ndim != 2 or tensor.numel() == 0:
             raise ValueError(
                 "expected actions of shape (a,) or (a, action_dim) with a >= 1; got "
-                f"{tuple(tensor.shape)}; do give one row an action"
+                f"{tuple(tensor.shape)}; give one row an action"
             )
         if not bool(tensor.isfinite().all()):
             raise ValueError(
-                f"expected finite actions; got {tensor.tolist()}; do remove NaN and inf"
+                f"expected finite actions; got {tensor.tolist()}; remove NaN and inf"
             )
         self.values = tensor
         self._label(names, units)

@@ -43,13 +43,11 @@ class MixedActions(ActionSpace):
         strange = [s for s in spaces if not isinstance(s, ActionSpace)]
         if strange:
             raise TypeError(
-                f"expected action spaces; got {type(strange[0]).__name__}; do pass "
+                f"expected action spaces; got {type(strange[0]).__name__}; pass "
                 "BoxActions(low, high) or DiscreteActions(values), one a part"
             )
         if not spaces:
-            raise ValueError(
-                "expected one or more action spaces; got none; do pass some"
-            )
+            raise ValueError("expected one or more action spaces; got none; pass some")
         self._parts = [part for space in spaces for part in space.parts()]
         names = [name for part in self._parts for name in part.names]
         unique = len(set(names)) == len(names)

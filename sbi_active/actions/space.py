@@ -63,5 +63,5 @@ class ActionSpace(ABC):
         if len(self.names) != dim or len(self.units) != dim:
             raise ValueError(
                 f"expected {dim} names and units, one an entry of the action; got "
-                f"{self.names} and {self.units}; do give one each"
+                f"{self.names} and {self.units}; give one each"
             )

@@ -103,7 +103,7 @@ def _source(
     if arguments.prior is None or arguments.actions is None:
         raise ValueError(
             "expected --prior and --actions with --simulator; got one without the "
-            "other; do name them, as in --prior my_robot:prior"
+            "other; name them, as in --prior my_robot:prior"
         )
     return (
         load_object(arguments.simulator),

@@ -90,7 +90,7 @@ def _campaign_size(actions: ActionSpace, num_rounds: int) -> int:
 def _source(arguments: argparse.Namespace) -> tuple[Any, Distribution, ActionSpace]:
     if (arguments.task is None) == (arguments.simulator is None):
         raise ValueError(
-            "expected MODULE:FUNCTION or --task; got both or neither; do give one, as "
+            "expected MODULE:FUNCTION or --task; got both or neither; give one, as "
             "in sbi-active check my_robot.py:simulator"
         )
     if arguments.task is not None:
@@ -101,7 +101,7 @@ def _source(arguments: argparse.Namespace) -> tuple[Any, Distribution, ActionSpa
     if not callable(simulator):
         raise ValueError(
             f"expected a function or SimulatorModel; got {type(simulator).__name__} "
-            f"under {arguments.simulator}; do name what takes (theta, action)"
+            f"under {arguments.simulator}; name what takes (theta, action)"
         )
     simulator = with_noise(simulator, arguments.noise)
     return simulator, prior_of(arguments), actions_of(arguments)
@@ -113,13 +113,13 @@ def prior_of(arguments: argparse.Namespace) -> Distribution:
         return load_object(arguments.prior)
     if arguments.theta_low is None or arguments.theta_high is None:
         raise ValueError(
-            "expected --theta-low and --theta-high, or --prior; got too few; do give "
+            "expected --theta-low and --theta-high, or --prior; got too few; give "
             "bounds as in --theta-low=0,-1 --theta-high=1,1"
         )
     low, high = _numbers(arguments.theta_low), _numbers(arguments.theta_high)
     if len(low) != len(high) or any(a >= b for a, b in zip(low, high, strict=True)):
         raise ValueError(
-            f"expected as many bounds, low below high; got {low} and {high}; do give "
+            f"expected as many bounds, low below high; got {low} and {high}; give "
             "one of each a parameter"
         )
     return BoxUniform(torch.tensor(low), torch.tensor(high))
@@ -130,7 +130,7 @@ def actions_of(arguments: argparse.Namespace) -> ActionSpace:
     specs = arguments.actions
     if specs is None:
         raise ValueError(
-            "expected --actions; got none; do give values as in --actions 0:5:11, one "
+            "expected --actions; got none; give values as in --actions 0:5:11, one "
             "an entry of the action"
         )
     if len(specs) == 1 and specs[0].count(":") == 1:
@@ -145,7 +145,7 @@ def _axis(spec: str) -> list[float]:
         return _numbers(spec)
     if len(parts) != 3 or not parts[2].isdigit() or int(parts[2]) < 1:
         raise ValueError(
-            f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; do write, say, 0:5:11"
+            f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; write, say, 0:5:11"
         )
     low, high = (_numbers(part)[0] for part in parts[:2])
     return torch.linspace(low, high, int(parts[2])).tolist()
@@ -175,5 +175,5 @@ def _numbers(text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError as error:
         raise ValueError(
-            f"expected numbers separated by commas; got {text!r}; do write, say, 0,1.5"
+            f"expected numbers separated by commas; got {text!r}; write, say, 0,1.5"
         ) from error

@@ -77,7 +77,7 @@ def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
     if num - held < 2:
         raise ValueError(
             f"expected at least two trials to fit; got {num - held} in "
-            f"{arguments.trials} ({num} in all, {held} held out); do measure more, "
+            f"{arguments.trials} ({num} in all, {held} held out); measure more, "
             "since one trial fits any model"
         )
     return table, trials
@@ -89,7 +89,7 @@ def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
         key, equals, value = text.partition("=")
         if not (key and equals and value):
             raise ValueError(
-                f"expected {option} KEY=NAME; got {text!r}; do write, say, x=height_m"
+                f"expected {option} KEY=NAME; got {text!r}; write, say, x=height_m"
             )
         found[key] = value
     return found
@@ -113,7 +113,7 @@ def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
             if getattr(arguments, name) is not None:
                 raise ValueError(
                     f"expected no --{name.replace('_', '-')} with --task, which has a "
-                    f"prior; got {getattr(arguments, name)}; do drop one of them"
+                    f"prior; got {getattr(arguments, name)}; drop one of them"
                 )
         task = get_task(arguments.task)
         _require_units(task.actions, trials, arguments)
@@ -125,7 +125,7 @@ def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
     if not callable(fn):
         raise ValueError(
             f"expected a function or SimulatorModel; got {type(fn).__name__} under "
-            f"{arguments.simulator}; do name what takes (theta, action)"
+            f"{arguments.simulator}; name what takes (theta, action)"
         )
     if not isinstance(fn, SimulatorModel):
         fn = _with_times(SimulatorModel(fn), trials, arguments)
@@ -150,7 +150,7 @@ def _with_times(
         raise ValueError(
             "expected a simulator that takes times=, shape (n, k), where trials are "
             f"sampled at different times, as in {arguments.trials}; got one without "
-            f"under {arguments.simulator}; do add it, or give a SimulatorModel with "
+            f"under {arguments.simulator}; add it, or give a SimulatorModel with "
             "sample_times"
         )
     fn = model.fn
@@ -171,7 +171,7 @@ def _require_units(
         given = label.partition(" [")[2].removesuffix("]")
         if unit and given and unit != given:
             raise ValueError(
-                f"expected actions in {unit}; got {label} in {arguments.trials}; do "
+                f"expected actions in {unit}; got {label} in {arguments.trials}; "
                 "convert the column, and state the unit in brackets"
             )
 
@@ -187,6 +187,6 @@ def _declared(arguments: argparse.Namespace) -> list[Effect]:
     if wrong:
         raise ValueError(
             f"expected a list of Effect under {arguments.effects}; got "
-            f"{type(wrong[0]).__name__} in it; do declare sbi_active.criticism.Effect"
+            f"{type(wrong[0]).__name__} in it; declare sbi_active.criticism.Effect"
         )
     return found

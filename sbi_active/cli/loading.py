@@ -21,13 +21,13 @@ def load_object(name: str) -> Any:
     module, _, attribute = name.partition(":")
     if not module or not attribute:
         raise ValueError(
-            f"expected MODULE:NAME; got {name!r}; do write, say, my_robot:simulator"
+            f"expected MODULE:NAME; got {name!r}; write, say, my_robot:simulator"
         )
     file = None
     if module.endswith(".py"):
         file = Path(module).resolve()
         if not file.is_file():
-            raise ValueError(f"expected a file; got none at {file}; do check the path")
+            raise ValueError(f"expected a file; got none at {file}; check the path")
         sys.path.insert(0, str(file.parent))
         module = file.stem
     here = str(Path.cwd())
@@ -40,18 +40,18 @@ def load_object(name: str) -> Any:
             raise  # an import within the module
         raise ValueError(
             f"expected a module {module!r}; got none in {here} or among the installed "
-            "ones; do run where it lies, or install it"
+            "ones; run where it lies, or install it"
         ) from error
     origin = getattr(loaded, "__file__", None)
     if file is not None and (origin is None or Path(origin).resolve() != file):
         raise ValueError(
             f"expected a file whose name no other module has; got {file.name}, which "
-            f"is also {origin or 'built in'}; do rename the file"
+            f"is also {origin or 'built in'}; rename the file"
         )
     try:
         return getattr(loaded, attribute)
     except AttributeError as error:
         raise ValueError(
-            f"expected {attribute!r} in module {module!r}; got none; do choose among "
+            f"expected {attribute!r} in module {module!r}; got none; choose among "
             f"{', '.join(n for n in vars(loaded) if not n.startswith('_'))}"
         ) from error

@@ -32,7 +32,7 @@ def make_task(name: str, options: Sequence[str]) -> Task:
         if unknown:
             raise ValueError(
                 f"expected options of {name!r} among {', '.join(known) or 'none'}; got "
-                f"{unknown[0]!r}; do drop it or choose one of these"
+                f"{unknown[0]!r}; drop it or choose one of these"
             )
     try:
         return get_task(name, **values)
@@ -42,7 +42,7 @@ def make_task(name: str, options: Sequence[str]) -> Task:
         raise ValueError(f"{error}, as --option data=FOLDER") from error
     except TypeError as error:
         raise ValueError(
-            f"expected values that {name!r} can use; got {values} ({error}); do "
+            f"expected values that {name!r} can use; got {values} ({error}); "
             "correct the types"
         ) from error
 
@@ -51,7 +51,7 @@ def _parse(option: str) -> tuple[str, Any]:
     name, separator, text = option.partition("=")
     if not separator or not name:
         raise ValueError(
-            f"expected --option NAME=VALUE; got {option!r}; do write, say, target=2"
+            f"expected --option NAME=VALUE; got {option!r}; write, say, target=2"
         )
     try:
         return name, json.loads(text)

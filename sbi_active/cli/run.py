@@ -103,7 +103,7 @@ def _campaign_options(arguments: argparse.Namespace) -> CampaignOptions:
         if not isinstance(estimator, MixtureDensity):
             raise ValueError(
                 f"expected --iterations with a method that trains a mixture density; "
-                f"got --method {arguments.method}; do leave it out"
+                f"got --method {arguments.method}; leave it out"
             )
         estimator = replace(estimator, num_iterations=arguments.iterations)
         options = replace(options, density_estimator=estimator)

@@ -150,7 +150,7 @@ def _look(
     if single.shape[1:] != x.shape[1:]:
         text = (
             f"expected x of one shape; got {tuple(x.shape[1:])} a row from "
-            f"{len(theta)} rows and {tuple(single.shape[1:])} from one; do keep the "
+            f"{len(theta)} rows and {tuple(single.shape[1:])} from one; keep the "
             "rows' axis for a single row"
         )
         return replace(report, defects=(text,))
@@ -263,7 +263,7 @@ def _judge(
         text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
         notes.append(
             f"{report.counts['missing']} rows raise, the first "
-            f"{text[-1] if text else 'without a word'}; their outcome is missing; do "
+            f"{text[-1] if text else 'without a word'}; their outcome is missing; "
             "return NaN where the system gave no measurement"
         )
     if report.is_deterministic:
@@ -276,22 +276,22 @@ def _judge(
     sound = report.counts["missing"] == 0
     if declared and sound and not model.is_deterministic(theta, action):
         notes.append(
-            "fn is random beside declared noise, which so counts twice; do declare "
+            "fn is random beside declared noise, which so counts twice; declare "
             "noise=None, or remove the random numbers from fn"
         )
     if report.noiseless:
         notes.append(
             f"numbers {', '.join(map(str, report.noiseless))} of x have no noise, and "
-            "so no density; do declare the noise of every channel"
+            "so no density; declare the noise of every channel"
         )
     if report.rows_are_independent is False:
         defects.append(
-            "rows permuted with their seeds do not give permuted x; do let row i "
+            "rows permuted with their seeds do not give permuted x; let row i "
             "depend on theta[i], action[i] and seeds[i] alone"
         )
     if not report.is_reproducible:
         notes.append(
-            "one seed gives two different x, so that no run can be repeated; do take "
+            "one seed gives two different x, so that no run can be repeated; take "
             "seeds, or draw from torch's or NumPy's global generator"
         )
     if len(report.idle_parameters) == theta.shape[1]:

@@ -112,7 +112,7 @@ class SimulatorModel:
         if setup is not None and "context" not in keywords and not self._takes_any:
             raise ValueError(
                 "expected fn to take what setup returns; got a fn without an argument "
-                f"'context', only {keywords}; do add it as a keyword argument"
+                f"'context', only {keywords}; add it as a keyword argument"
             )
         self._token = uuid.uuid4().hex
         self._is_deterministic: bool | None = None
@@ -163,13 +163,13 @@ class SimulatorModel:
         if self.noise is None:
             raise ValueError(
                 "expected a simulator with a noise model; got noise=None, so the "
-                "output of fn is already a random draw; do build "
+                "output of fn is already a random draw; build "
                 "SimulatorModel(fn, noise=GaussianNoise(sd)) around a noise-free fn"
             )
         if not self.is_deterministic(theta, action, **effects):
             raise ValueError(
                 "expected a noise-free fn beside declared noise; got different outputs "
-                "from two seeds, so that noise would count twice; do remove the random "
+                "from two seeds, so that noise would count twice; remove the random "
                 "numbers from fn, or build SimulatorModel(fn, noise=None)"
             )
         seeds = torch.zeros(len(theta), dtype=torch.int64)
@@ -270,7 +270,7 @@ class SimulatorModel:
         if names is not None and x.shape[-1] != len(names):
             raise ValueError(
                 f"expected {len(names)} channels, {', '.join(names)}; got x of shape "
-                f"{tuple(x.shape)}; do name the entries of its last axis"
+                f"{tuple(x.shape)}; name the entries of its last axis"
             )
         return x
 
@@ -299,7 +299,7 @@ class SimulatorModel:
             if outcome.shape != rows.shape[1:]:
                 raise ValueError(
                     f"expected rows of one shape, {rows.shape[1:]}; got "
-                    f"{outcome.shape} in row {i}; do fill what is missing with NaN"
+                    f"{outcome.shape} in row {i}; fill what is missing with NaN"
                 )
             rows[i] = outcome  # a copy: x may be the view of what the next row changes
         return np.empty((0, 1)) if rows is None else rows
@@ -318,19 +318,19 @@ class SimulatorModel:
         if names is not None and theta.shape[1] != len(names):
             raise ValueError(
                 f"expected {len(names)} parameters, {', '.join(names)}; got theta of "
-                f"shape {tuple(theta.shape)}; do give one column a parameter"
+                f"shape {tuple(theta.shape)}; give one column a parameter"
             )
         for name, value in effects.items():
             if name not in self.effect_names and not self._takes_any:
                 known = ", ".join(map(repr, self.effect_names)) or "none"
                 raise TypeError(
                     f"expected effects among the keyword arguments of fn, {known}; got "
-                    f"{name!r}; do add it to fn, with its null value as the default"
+                    f"{name!r}; add it to fn, with its null value as the default"
                 )
             if np.ndim(value) and len(value) != len(theta):
                 raise ValueError(
                     f"expected {name} as a number or one a row, shape ({len(theta)}, "
-                    f"...); got {tuple(np.shape(value))}; do repeat it for each row"
+                    f"...); got {tuple(np.shape(value))}; repeat it for each row"
                 )
 
 

@@ -120,6 +120,6 @@ def require_noise(x: Tensor, again: Tensor) -> None:
         raise ValueError(
             "expected a simulator with noise; got identical x from two seeds, and a "
             "deterministic simulator has neither a posterior density nor a finite "
-            "information gain; do declare the measurement noise, "
+            "information gain; declare the measurement noise, "
             "SimulatorModel(simulator, noise=GaussianNoise(sd))"
         )

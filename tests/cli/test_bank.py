@@ -114,7 +114,7 @@ def test_inspect_names_a_damaged_file(capsys):
         ),
         (
             ["--simulator", "math:tau2", "--prior", "a:b", "--actions", "a:b"],
-            "expected 'tau2' in module 'math'; got none; do choose among acos",
+            "expected 'tau2' in module 'math'; got none; choose among acos",
         ),
     ],
 )

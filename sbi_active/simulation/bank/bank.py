@@ -201,7 +201,7 @@ class Bank:
         if (proposal is None) != (not label):
             raise ValueError(
                 f"expected a proposal and its label together; got {proposal!r} and "
-                f"{label!r}; do name the proposal, as in label='round 3'"
+                f"{label!r}; name the proposal, as in label='round 3'"
             )
         return LabeledStore(self, proposal, label or "", torch.as_tensor(log_action))
 
@@ -337,7 +337,7 @@ class Bank:
         if not self._writable:
             raise ValueError(
                 f"expected a bank opened with its simulator, to write to; got "
-                f"Bank({str(self.path)!r}), which reads; do open it by "
+                f"Bank({str(self.path)!r}), which reads; open it by "
                 f"Bank({str(self.path)!r}, simulator=...)"
             )
         if not self._lock.held:
@@ -371,5 +371,5 @@ class Bank:
             return
         raise ValueError(
             f"expected rows of shapes {self.header['shapes']}, as in the bank "
-            f"{self.path}; got {shapes}; do make a bank of its own for them"
+            f"{self.path}; got {shapes}; make a bank of its own for them"
         )

@@ -66,13 +66,13 @@ def make_folder(folder: Path, name: str) -> None:
         raise type(error)(
             error.errno,
             f"expected a folder that can be made for a bank; got {error.strerror!r}; "
-            "do choose a place that can be written",
+            "choose a place that can be written",
             str(folder),
         ) from error
     other = [f for f in found if f not in OWN and not f.startswith(TEMPORARY)]
     if other:
         raise ValueError(
-            f"expected a bank or an empty folder; got {folder} with {other[0]!r}; do "
+            f"expected a bank or an empty folder; got {folder} with {other[0]!r}; "
             "choose another folder"
         )
 
@@ -96,7 +96,7 @@ def read_header(folder: Path) -> dict[str, Any]:
         header = parsed(path, path.read_bytes())
     except (FileNotFoundError, NotADirectoryError) as error:
         raise ValueError(
-            f"expected a bank; got no {path}; do give simulator= to make one"
+            f"expected a bank; got no {path}; give simulator= to make one"
         ) from error
     found = header.get("format")
     require(path, type(found) is int, "no header (it tells no format)")
@@ -162,7 +162,7 @@ def require_same_simulator(
     if lines:
         raise ValueError(
             f"expected the simulator of the bank {folder}; got another: "
-            f"{'; '.join(lines)}; do make a bank for each simulator, or, where x is "
+            f"{'; '.join(lines)}; make a bank for each simulator, or, where x is "
             "the same, give the same version= each time and keep what changes from "
             "call to call in attributes with a leading underscore"
         )

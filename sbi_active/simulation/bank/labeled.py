@@ -50,7 +50,7 @@ class LabeledStore:
         if any(len(column) != len(index) for column in columns.values()):
             lengths = {name: len(column) for name, column in columns.items()}
             raise ValueError(
-                f"expected {len(index)} rows, one an index; got {lengths}; do give "
+                f"expected {len(index)} rows, one an index; got {lengths}; give "
                 "columns of one length"
             )
         log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)

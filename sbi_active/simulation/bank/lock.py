@@ -22,7 +22,7 @@ class LockedError(OSError):
         here = " (this one)" if pid == os.getpid() and host == platform.node() else ""
         super().__init__(
             f"expected no other writer of {folder}; got process {pid}{here} on "
-            f"{host}; do wait for it, call close() there, or write to a bank of your "
+            f"{host}; wait for it, call close() there, or write to a bank of your "
             "own: any number of readers may go on"
         )
 
@@ -65,7 +65,7 @@ class WriterLock:
         except OSError as error:
             raise type(error)(
                 error.errno,
-                f"expected to lock a bank for writing; got {error.strerror!r}; do "
+                f"expected to lock a bank for writing; got {error.strerror!r}; "
                 "choose a place that can be written, or open the bank without "
                 "simulator= to read it",
                 str(self._folder),

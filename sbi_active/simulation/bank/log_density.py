@@ -32,7 +32,7 @@ def log_density(distribution: Any, theta: Tensor) -> Tensor:
         if value.shape != (int(inside.sum()),):
             raise ValueError(
                 "expected one log density a row from a distribution over parameters; "
-                f"got shape {tuple(value.shape)} for {int(inside.sum())} rows; do wrap "
+                f"got shape {tuple(value.shape)} for {int(inside.sum())} rows; wrap "
                 "it, as in torch.distributions.Independent(distribution, 1)"
             )
         result[inside] = value.double()

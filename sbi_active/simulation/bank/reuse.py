@@ -136,7 +136,7 @@ def reuse(
     if not len(rows):
         raise ValueError(
             f"expected rows of a known proposal in {bank}; got none"
-            f"{'' if action is None else f' at action {action.tolist()}'}; do simulate "
+            f"{'' if action is None else f' at action {action.tolist()}'}; simulate "
             "with store=bank.drawn_from(prior, label='prior')"
         )
     theta, label = column["theta"][rows], column["label"][rows]
@@ -154,7 +154,7 @@ def reuse(
     if not bool((log_weight > -torch.inf).any()):
         raise ValueError(
             f"expected rows within the support of the target; got {len(rows)} rows, all"
-            " of density 0; do simulate from the target"
+            " of density 0; simulate from the target"
         )
     weights = log_weight.softmax(0)
     totals = {
@@ -188,7 +188,7 @@ def _log_densities(
     if lacking:
         raise ValueError(
             f"expected proposals for all labels in the bank, {[*present.values()]}; got"
-            f" none for {lacking}; do give them, or none at all for weights by each "
+            f" none for {lacking}; give them, or none at all for weights by each "
             "row's own proposal"
         )
     result = torch.full((len(theta), len(bank.labels)), -torch.inf).double()
@@ -200,7 +200,7 @@ def _log_densities(
             raise ValueError(
                 f"expected proposals[{name!r}] to be what its rows were drawn from; got"
                 f" log densities that differ by {gap:.3g} nats (median) from those in "
-                "the bank; do give the distribution that was passed to drawn_from"
+                "the bank; give the distribution that was passed to drawn_from"
             )
     return result
 

@@ -28,7 +28,7 @@ def positions(rows: Any, total: int) -> np.ndarray | None:
     if not whole or not bool(((found >= 0) & (found < total)).all()):
         raise ValueError(
             f"expected positions of rows within [0, {total}), or a mask of "
-            f"{total}; got {rows!r}; do use what columns() is indexed by"
+            f"{total}; got {rows!r}; use what columns() is indexed by"
         )
     return found
 

@@ -207,7 +207,7 @@ def write_file(path: Path, content: bytes) -> None:
             temporary.unlink()
         raise type(error)(
             error.errno,
-            f"expected to write {len(content)} bytes; got {error.strerror!r}; do make "
+            f"expected to write {len(content)} bytes; got {error.strerror!r}; make "
             "room or choose a place that can be written, and run again: what was "
             "stored before is whole",
             str(path),

@@ -282,7 +282,7 @@ class Shelf:
             start = stop
         if not result:
             raise ValueError(
-                f"expected rows in {self._folder.parent}; got none; do simulate into "
+                f"expected rows in {self._folder.parent}; got none; simulate into "
                 "it first"
             )
         return result

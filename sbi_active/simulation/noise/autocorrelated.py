@@ -69,7 +69,7 @@ class AutocorrelatedNoise(ScaleNoise):
         )
         if measurement_sd is not None and not 0 < measurement_sd < float("inf"):
             raise ValueError(
-                f"expected measurement_sd > 0; got {measurement_sd}; do give the "
+                f"expected measurement_sd > 0; got {measurement_sd}; give the "
                 "sensor's error in the units of x, or None"
             )
         self.measurement_sd = measurement_sd
@@ -128,7 +128,7 @@ class AutocorrelatedNoise(ScaleNoise):
         tau = parameters[..., -1]
         if not bool((tau.isfinite() & (tau >= 0)).all()):
             raise ValueError(
-                f"expected a correlation time >= 0; got {tau.tolist()}; do give it in "
+                f"expected a correlation time >= 0; got {tau.tolist()}; give it in "
                 "seconds"
             )
 
@@ -136,7 +136,7 @@ class AutocorrelatedNoise(ScaleNoise):
         if len(shape) == 2 and self._num_sd > 1:
             raise ValueError(
                 f"expected outcomes of shape (n, T, {self._num_sd}), time before "
-                f"channels; got {tuple(shape)}; do give one standard deviation where x "
+                f"channels; got {tuple(shape)}; give one standard deviation where x "
                 "has a time axis only"
             )
         super()._check_shape(shape)
@@ -248,11 +248,11 @@ def time_stamps(times: Tensor | None, shape: Sequence[int]) -> Tensor:
     if times.shape not in ((num,), (n, num)):
         raise ValueError(
             f"expected times of shape ({num},) or ({n}, {num}), one a sample of x's "
-            f"first axis; got {tuple(times.shape)}; do give the stamps of x {(*shape,)}"
+            f"first axis; got {tuple(times.shape)}; give the stamps of x {(*shape,)}"
         )
     if not bool((times.diff() > 0).all()):
         raise ValueError(
-            f"expected times that increase; got {times.tolist()}; do sort x by time "
+            f"expected times that increase; got {times.tolist()}; sort x by time "
             "and drop repeated stamps"
         )
     return times.expand(n, num)

@@ -130,7 +130,7 @@ class ScaleNoise(NoiseModel):
         if self.sd.ndim > 1:
             raise ValueError(
                 "expected a standard deviation that is a number or one a channel; got "
-                f"shape {tuple(self.sd.shape)}; do give shape () or (channels,)"
+                f"shape {tuple(self.sd.shape)}; give shape () or (channels,)"
             )
         self._num_sd = self.sd.numel()
         shared = {} if shared is None else shared
@@ -191,7 +191,7 @@ class ScaleNoise(NoiseModel):
             if not bool((rows[:, : self._num_sd] > 0).all()):
                 raise ValueError(
                     "expected a standard deviation > 0 for a density; got 0, at which "
-                    "there is none; do give the noise of every channel"
+                    "there is none; give the noise of every channel"
                 )
             density = self._log_density(residual, rows.to(x.device), times)
         return density.masked_fill(impossible.flatten(1).any(1), -torch.inf)
@@ -226,7 +226,7 @@ class ScaleNoise(NoiseModel):
         sd = parameters[..., : self._num_sd]
         if not bool((sd.isfinite() & (sd >= 0)).all()):
             raise ValueError(
-                f"expected a standard deviation >= 0; got {sd.tolist()}; do give it in "
+                f"expected a standard deviation >= 0; got {sd.tolist()}; give it in "
                 "the units of x"
             )
 
@@ -235,7 +235,7 @@ class ScaleNoise(NoiseModel):
         if len(shape) < 2 or self._num_sd not in (1, shape[-1]):
             raise ValueError(
                 f"expected outcomes of shape (n, ..., {self._num_sd}), one standard "
-                f"deviation a channel; got {tuple(shape)}; do give one number, or one "
+                f"deviation a channel; got {tuple(shape)}; give one number, or one "
                 "an entry of the last axis"
             )
 
@@ -248,7 +248,7 @@ class ScaleNoise(NoiseModel):
         if parameters.shape not in ((num,), (num_rows, num)):
             raise ValueError(
                 f"expected parameters of shape ({num},) or ({num_rows}, {num}), for "
-                f"{', '.join(self.parameter_names)}; got {tuple(parameters.shape)}; do "
+                f"{', '.join(self.parameter_names)}; got {tuple(parameters.shape)}; "
                 "give one set, or one a row"
             )
         self._check(parameters)
@@ -317,6 +317,6 @@ def _broadcast(x: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
     except RuntimeError as error:
         raise ValueError(
             "expected a mean broadcastable to x; got shapes "
-            f"{tuple(mean.shape)} and {tuple(x.shape)}; do give one mean a row"
+            f"{tuple(mean.shape)} and {tuple(x.shape)}; give one mean a row"
         ) from error
     return x, mean

@@ -100,7 +100,7 @@ def estimate_noise(
     if kind not in ("gaussian", "autocorrelated", "student"):
         raise ValueError(
             "expected kind among 'gaussian', 'autocorrelated', 'student'; got "
-            f"{kind!r}; do choose one of these"
+            f"{kind!r}; choose one of these"
         )
     groups = _groups(repeats)
     shape = groups[0].shape[1:]
@@ -125,20 +125,20 @@ def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
     ):
         raise ValueError(
             "expected repeats of shape (k, *x_shape), or groups of such; got "
-            f"{[tuple(g.shape) for g in groups]}; do give a list of tensors of one "
+            f"{[tuple(g.shape) for g in groups]}; give a list of tensors of one "
             "x_shape"
         )
     groups = [g[g.flatten(1).isfinite().any(1)] for g in groups]
     freedom = sum(max(len(g) - 1, 0) for g in groups)
     if freedom == 0:
         raise ValueError(
-            f"expected at least 2 repeats of one action; got {len(groups[0])}; do "
+            f"expected at least 2 repeats of one action; got {len(groups[0])}; "
             "repeat a trial: without repeats nothing separates noise from the system"
         )
     if freedom == 1:
         warnings.warn(
             "expected at least 3 repeats to estimate noise; got 2, from which the "
-            "standard deviation is known to a factor of 30; do repeat the trial again",
+            "standard deviation is known to a factor of 30; repeat the trial again",
             UserWarning,
             stacklevel=3,
         )
@@ -170,13 +170,13 @@ def _require_scatter(square: Tensor, freedom: Tensor) -> None:
     if bool((freedom == 0).any()):
         raise ValueError(
             "expected at least 2 repeats of every channel; got none for channels "
-            f"{torch.nonzero(freedom == 0)[:, 0].tolist()}; do repeat the trial, or "
+            f"{torch.nonzero(freedom == 0)[:, 0].tolist()}; repeat the trial, or "
             "set pooled=True"
         )
     if bool((square <= 0).any()):
         raise ValueError(
             "expected repeats that differ; got identical ones in channels "
-            f"{torch.nonzero(square <= 0)[:, 0].tolist()}; do measure with more "
+            f"{torch.nonzero(square <= 0)[:, 0].tolist()}; measure with more "
             "digits, or declare the noise, GaussianNoise(sd)"
         )
 
@@ -195,7 +195,7 @@ def _autocorrelated(
     if contrast.shape[1] < 3:
         raise ValueError(
             "expected x with a time axis of at least 3 samples; got x of shape "
-            f"{tuple(contrast.shape[1:])}; do estimate kind='gaussian'"
+            f"{tuple(contrast.shape[1:])}; estimate kind='gaussian'"
         )
     stamps = time_stamps(times, (1, contrast.shape[1]))[0]
     edges = torch.logspace(

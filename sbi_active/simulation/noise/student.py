@@ -58,7 +58,7 @@ class StudentTNoise(ScaleNoise):
         if not bool((df.isfinite() & (df > 2)).all()):
             raise ValueError(
                 f"expected df > 2, below which there is no standard deviation; got "
-                f"{df.tolist()}; do use for example 4"
+                f"{df.tolist()}; use for example 4"
             )
 
     def _draw(

@@ -171,7 +171,7 @@ def _pool(simulator: Callable[..., Any], workers: Workers) -> Pool:
         raise ValueError(
             "expected the processes of this machine for time_limit; got another "
             "executor from joblib.parallel_config, whose workers cannot be killed from "
-            "here; do simulate outside that block, or limit the time in the simulator"
+            "here; simulate outside that block, or limit the time in the simulator"
         )
     return elsewhere
 

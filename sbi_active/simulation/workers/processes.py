@@ -122,7 +122,7 @@ class _Nest:
         except (EOFError, OSError) as error:
             raise RuntimeError(
                 "expected a process that starts workers; got its end (code "
-                f"{self._process.exitcode}); do look for its last words above, or "
+                f"{self._process.exitcode}); look for its last words above, or "
                 "simulate with num_workers=1"
             ) from error
 

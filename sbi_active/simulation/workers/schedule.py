@@ -197,7 +197,7 @@ class Schedule:
         if reply.fault == "not loaded":
             raise SimulationError(
                 "expected a simulator that a worker process can load; got\n"
-                f"{reply.traceback}\ndo make its module importable there, or simulate "
+                f"{reply.traceback}\nmake its module importable there, or simulate "
                 "with num_workers=1 and no time_limit"
             )
         if call.is_probe:
@@ -258,7 +258,7 @@ class Schedule:
             raise ValueError(
                 "expected x of one shape a row; got "
                 f"{tuple(self.x.shape[1:])} and {tuple(x.shape[1:])}, the latter in "
-                f"rows {index[:3].tolist()}...; do pad trajectories with NaN, which "
+                f"rows {index[:3].tolist()}...; pad trajectories with NaN, which "
                 "masks them"
             )
         if self.x is None and len(index) == n:

@@ -72,7 +72,7 @@ def bank(tmp_path):
 def test_a_bank_of_another_simulator(first, second, text, tmp_path):
     Bank(tmp_path / "bank", simulator=first)
     Bank(tmp_path / "bank", simulator=first)
-    with pytest.raises(ValueError, match=f"got another: .*{text}.*; do make a bank"):
+    with pytest.raises(ValueError, match=f"got another: .*{text}.*; make a bank"):
         Bank(tmp_path / "bank", simulator=second)
 
 
@@ -123,7 +123,7 @@ def test_other_formats_and_folders(bank, tmp_path):
     (bank.path / "bank.json").write_text("{")
     with pytest.raises(CorruptSegmentError, match=r"bank.json as it was written"):
         Bank(bank.path)
-    with pytest.raises(ValueError, match=r"got no .*bank.json; do give simulator="):
+    with pytest.raises(ValueError, match=r"got no .*bank.json; give simulator="):
         Bank(tmp_path / "none")
     assert not (tmp_path / "none").exists()
     (tmp_path / "full").mkdir()
@@ -203,7 +203,7 @@ def test_a_full_disk(small_disk):
     few = Simulations(theta[:100], action[:100], theta[:100])
     with Bank(small_disk / "bank", simulator=simulator) as bank:
         bank.append(few, seed=0)
-        text = "expected to write .* got 'No space left on device'; do make room"
+        text = "expected to write .* got 'No space left on device'; make room"
         with pytest.raises(OSError, match=text) as raised:
             simulate(simulator, theta, action, seed=1, store=bank)
         assert raised.value.errno == errno.ENOSPC
@@ -219,7 +219,7 @@ def test_a_limit_on_file_sizes(bank):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
     try:
-        with pytest.raises(OSError, match="got 'File too large'; do make room"):
+        with pytest.raises(OSError, match="got 'File too large'; make room"):
             bank.append(rows(5_000), seed=3)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -236,7 +236,7 @@ def test_a_folder_that_cannot_be_written(small_disk):
     remount = ["mount", "-o", "remount,ro", str(small_disk)]
     subprocess.run(remount, check=True)
     assert len(Bank(small_disk / "bank").read()) == 100
-    with pytest.raises(OSError, match=r"got 'Read-only file system'; do choose a pl"):
+    with pytest.raises(OSError, match=r"got 'Read-only file system'; choose a pl"):
         Bank(small_disk / "bank", simulator=simulator).append(rows(), seed=1)
     with pytest.raises(
         OSError, match="a folder that can be made for a bank; got 'Read"

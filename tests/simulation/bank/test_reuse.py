@@ -191,12 +191,12 @@ def test_a_box_that_validates_its_arguments(bank):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"proposals": {"prior": PRIOR}}, r"got none for \['round 1'\]; do give them"),
+        ({"proposals": {"prior": PRIOR}}, r"got none for \['round 1'\]; give them"),
         (
             {"proposals": {"prior": ROUND, "round 1": ROUND}},
             r"expected proposals\['prior'\] to be what its rows were drawn from",
         ),
-        ({"action": torch.tensor([0.5])}, r"got none at action \[0.5\]; do simulate"),
+        ({"action": torch.tensor([0.5])}, r"got none at action \[0.5\]; simulate"),
     ],
 )
 def test_bad_arguments(bank, options, text):
@@ -206,9 +206,7 @@ def test_bad_arguments(bank, options, text):
 
 def test_a_target_elsewhere(bank):
     far = BoxUniform(torch.tensor([50.0]), torch.tensor([51.0]))
-    with pytest.raises(
-        ValueError, match="got 4000 rows, all of density 0; do simulate"
-    ):
+    with pytest.raises(ValueError, match="got 4000 rows, all of density 0; simulate"):
         reuse(bank, far)
     empty = Bank(bank.path.parent / "empty", simulator=simulator)
     with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
