@@ -169,7 +169,8 @@ class Campaign(CampaignTrials):
             prior: Needed where it is a class of your own; else None takes the
                 directory's.
             actions: Likewise.
-            effects: As given to the constructor; functions are not stored.
+            effects: As given to the constructor, and those that were adopted since:
+                functions are not stored.
             cost: As given to the constructor.
             constraint: As given to the constructor.
             options: None takes the directory's; needed where an estimator is of your
@@ -199,7 +200,9 @@ class Campaign(CampaignTrials):
         )
         self = cls.__new__(cls)
         limits = Limits(found.actions, constraint, cost)
-        planner = Planner(limits, found.state, effects)
+        known = found.disk.manifest["effects"]
+        declared = [effect for effect in effects if effect.name in known]
+        planner = Planner(limits, found.state, declared)
         self._begin(found.state, found.actions, found.learner, planner)
         self.on_trial, self.on_update = on_trial, on_update
         self._storage = Storage(found.disk, found.state.options.bank)

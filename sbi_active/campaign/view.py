@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -69,6 +71,25 @@ class CampaignView:
     def effects(self) -> Sequence[Effect]:
         """What the simulator may lack, as the campaign was told."""
         return self._planner.effects
+
+    @property
+    def x_shape(self) -> torch.Size:
+        """Shape of an outcome."""
+        return self._learner.x_shape
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """One a parameter: the simulator's, else theta_1, ..."""
+        names = getattr(self.simulator, "parameter_names", None)
+        if names is None:
+            names = getattr(self._learner, "parameter_names", None)
+        if names is None:
+            names = [f"theta_{k + 1}" for k in range(parameter_dim(self.prior))]
+        return [*names]
+
+    def contains(self, trial: Trial) -> bool:
+        """Return whether the belief takes account of a trial as it is recorded now."""
+        return trial.index in self.state.processed and not self.state.is_stale
 
     @property
     def health(self) -> Health:

@@ -10,6 +10,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sbi_active.cli.campaign_parser import add_campaign_commands
+
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
     "numerical",
@@ -41,6 +43,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_bank(commands)
     _add_check(commands)
     _add_criticize(commands)
+    add_campaign_commands(commands, METHODS)
     return parser
 
 
@@ -169,7 +172,12 @@ def _add_criticize(commands: Any) -> None:
         ),
     )
     criticize.set_defaults(command=("criticize", "criticize"))
-    criticize.add_argument("trials", metavar="TRIALS.csv", type=Path)
+    criticize.add_argument(
+        "trials",
+        metavar="TRIALS.csv",
+        type=Path,
+        help="or the folder of a campaign, which knows its simulator and its prior",
+    )
     criticize.add_argument(
         "--columns",
         nargs="+",
@@ -183,7 +191,7 @@ def _add_criticize(commands: Any) -> None:
         metavar="NAME=UNIT",
         help="of columns without a unit in the header",
     )
-    source = criticize.add_mutually_exclusive_group(required=True)
+    source = criticize.add_mutually_exclusive_group()
     _add_task(source, "--task")
     source.add_argument("--simulator", metavar="MODULE:FUNCTION")
     criticize.add_argument("--prior", metavar="MODULE:NAME", help="with --simulator")

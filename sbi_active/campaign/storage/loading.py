@@ -52,6 +52,7 @@ class StoredLearner:
         x_shape: Of an outcome.
         state: Of the campaign.
         belief: Returns the belief, read when it is first asked for; None for none.
+        parameter_names: Of the parameters, if they have names.
 
     Attributes:
         prior: As given; without those of effects that were adopted.
@@ -66,7 +67,9 @@ class StoredLearner:
         x_shape: torch.Size,
         state: CampaignState,
         belief: Callable[[], Distribution] | None,
+        parameter_names: Sequence[str] | None,
     ) -> None:
+        self.parameter_names = parameter_names
         self.prior, self.x_shape, self._state = prior, x_shape, state
         self._saved, self._belief = belief, prior
 
@@ -124,7 +127,9 @@ def load(
     if simulator is None:
         without = {"simulator": Absent(), "prior": first_prior}
         saved = None if name is None else lambda: disk.belief(name, without)
-        reader = StoredLearner(first_prior, shape, state, saved)
+        reader = StoredLearner(
+            first_prior, shape, state, saved, manifest["parameter_names"]
+        )
         return Loaded(disk, state, space, reader)
     for what, given in (("cost", has_cost), ("constraint", has_constraint)):
         if given != manifest[f"has_{what}"]:
@@ -132,11 +137,11 @@ def load(
                 f"expected {what}= {'left out' if given else 'as declared'}; got "
                 f"{'one' if given else 'none'}; pass what the campaign was made with"
             )
-    names = [effect.name for effect in effects]
-    if names != manifest["effects"]:
+    lacking = {*manifest["effects"]} - {effect.name for effect in effects}
+    if lacking:
         raise ValueError(
-            f"expected the effects {manifest['effects']}; got {names}; pass effects= "
-            "as they were declared"
+            f"expected the effects {manifest['effects']}; got none named "
+            f"{', '.join(sorted(lacking))}; pass effects= as they were declared"
         )
     if simulator_changed:
         disk.write("simulator changed", simulator=fingerprint(simulator))
