@@ -71,34 +71,19 @@ __all__ = [
 
 #: Where the names above are defined or re-exported.
 _HOMES = {
-    "actions": ("BoxActions", "DiscreteActions", "MixedActions"),
-    "campaign": ("Campaign", "CampaignOptions", "StopRules"),
-    "criticism": (),
-    "design": ("InformationGainDesigner", "RandomDesigner"),
-    "export": ("to_inference_data",),
-    "inference": (
-        "ALHI",
-        "ASBI",
-        "Belief",
-        "MixtureDensity",
-        "RefinementOptions",
-        "SeqBED",
-        "SeqBED_B",
-        "SeqBED_C",
-    ),
-    "information_gain": (),
-    "search": (),
-    "simulation": (
-        "AutocorrelatedNoise",
-        "Bank",
-        "GaussianNoise",
-        "SimulatorModel",
-        "StudentTNoise",
-        "estimate_noise",
-        "simulate",
-    ),
+    "actions": "BoxActions DiscreteActions MixedActions",
+    "campaign": "Campaign CampaignOptions StopRules",
+    "criticism": "",
+    "design": "InformationGainDesigner RandomDesigner",
+    "export": "to_inference_data",
+    "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B "
+    "SeqBED_C",
+    "information_gain": "",
+    "search": "",
+    "simulation": "AutocorrelatedNoise Bank GaussianNoise SimulatorModel StudentTNoise "
+    "estimate_noise simulate",
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
+_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 _former = former_names(
     __name__,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -99,25 +99,16 @@ def _add_trials(
     groups["posterior_predictive"] = {"x": _draws(rows.x.reshape(*shape, *x.shape[1:]))}
     groups["observed_data"] = {"x": x.numpy()}
     groups["constant_data"] = {"action": action.numpy()}
-    log_prob = _log_likelihood(campaign.simulator)
-    if log_prob is not None:
+    noise = getattr(campaign.simulator, "noise", None)
+    if noise is not None:
         observed = x.repeat(len(theta), *[1] * (x.ndim - 1))
-        values = log_prob(observed, *pairs).reshape(shape)
+        simulator: Any = campaign.simulator
+        values = noise.log_prob(observed, simulator.mean(*pairs)).reshape(shape)
         groups["log_likelihood"] = {"x": _draws(values)}
     coords["round"] = [t.index + 1 for t in trials]
     coords["action_entry"] = campaign.actions.names
     dims["x"] = ["round", *x_dims]
     dims["action"] = ["round", "action_entry"]
-
-
-def _log_likelihood(
-    simulator: Any,
-) -> Callable[[Tensor, Tensor, Tensor], Tensor] | None:
-    """Return log p(x | theta, action) where the noise model makes it known."""
-    noise = getattr(simulator, "noise", None)
-    if noise is None:
-        return None
-    return lambda x, theta, action: noise.log_prob(x, simulator.mean(theta, action))
 
 
 def _draws(values: Tensor) -> np.ndarray:

@@ -6,7 +6,6 @@ import argparse
 import functools
 import sys
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,31 +23,21 @@ from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks import get_task  # pyright: ignore
 
 
-@dataclass(frozen=True)
-class _Source:
-    """What the trials are compared with; ``actions`` are None where not given."""
-
-    simulator: SimulatorModel
-    prior: Distribution
-    actions: ActionSpace | None
-    effects: list[Effect]
-
-
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare a simulator with measured trials, and print the report."""
     table, trials = _trials(arguments)
-    source = _source(arguments, trials)
+    simulator, prior, actions, effects = _source(arguments, trials)
     # Only scales are taken from these where the permitted actions are unknown.
-    space = source.actions or DiscreteActions(trials.action.unique(dim=0).float())
-    own = [*source.effects, *_declared(arguments)]
+    space = actions or DiscreteActions(trials.action.unique(dim=0).float())
+    own = [*effects, *_declared(arguments)]
     taken = {effect.name for effect in own}
-    generic = generic_effects(source.simulator, space, prior=source.prior)
+    generic = generic_effects(simulator, space, prior=prior)
     report = close_loop(
-        source.simulator,
-        source.prior,
+        simulator,
+        prior,
         trials,
         effects=[*own, *(e for e in generic if e.name not in taken)],
-        actions=source.actions,
+        actions=actions,
         seed=arguments.seed,
         designed=arguments.designed,
     )
@@ -107,7 +96,10 @@ def _described(path: Path, table: TrialTable, trials: Trials) -> str:
     return f"{what}; {few} to {many} samples a trial, time [s]"
 
 
-def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
+def _source(
+    arguments: argparse.Namespace, trials: Trials
+) -> tuple[SimulatorModel, Distribution, ActionSpace | None, list[Effect]]:
+    """Return what the trials are compared with."""
     if arguments.task is not None:
         for name in ("prior", "theta_low", "theta_high"):
             if getattr(arguments, name) is not None:
@@ -120,7 +112,7 @@ def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
         actions = actions_of(arguments) if arguments.actions else task.actions
         effects = getattr(task, "effects", list)()
         simulator = with_noise(task.simulator, arguments.noise)
-        return _Source(simulator, task.prior, actions, [*effects])
+        return simulator, task.prior, actions, [*effects]
     fn = load_object(arguments.simulator)
     if not callable(fn):
         raise ValueError(
@@ -133,7 +125,7 @@ def _source(arguments: argparse.Namespace, trials: Trials) -> _Source:
     actions = actions_of(arguments) if arguments.actions else None
     if actions is not None:
         _require_units(actions, trials, arguments)
-    return _Source(simulator, prior, actions, [])
+    return simulator, prior, actions, []
 
 
 def _with_times(

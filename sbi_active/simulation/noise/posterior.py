@@ -9,29 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from scipy.special import chdtri
 from torch import Tensor
 from torch.distributions import Distribution, constraints
-
-
-class ConditionalSd(Protocol):
-    """Standard deviations given the cell of the shared parameter."""
-
-    @property
-    def num_channels(self) -> int:
-        """Number of standard deviations."""
-        ...
-
-    def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
-        """Return sd at cells (n,) and levels (n, channels)."""
-        ...
-
-    def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
-        """Return log densities (n,) of sd (n, channels) at cells (n,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -157,7 +140,9 @@ class NoisePosterior(Distribution):
 
     arg_constraints: dict[str, Any] = {}  # pyright: ignore
 
-    def __init__(self, sd: ConditionalSd, *, shared: Cells | None = None) -> None:
+    def __init__(
+        self, sd: InverseChiSquare | SdGrid, *, shared: Cells | None = None
+    ) -> None:
         self.sd, self.shared = sd, shared
         num = sd.num_channels + (shared is not None)
         super().__init__(torch.Size(), torch.Size([num]), validate_args=False)
