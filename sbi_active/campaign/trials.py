@@ -11,7 +11,6 @@ from torch import Tensor
 
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.state import UNSCORED, Status, Trial
-from sbi_active.campaign.storage.storage import Storage
 from sbi_active.campaign.telling import find_trial, new_trial, told_trial
 from sbi_active.campaign.view import CampaignView
 
@@ -26,7 +25,6 @@ class CampaignTrials(CampaignView):
     """
 
     on_trial: Callable[[Trial], None] | None
-    _storage: Storage
 
     @isolated
     def tell(

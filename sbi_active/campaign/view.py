@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,6 +12,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.campaign.storage.storage import Storage
 from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.seeding import derive_seed
 
@@ -32,6 +34,7 @@ class CampaignView:
     state: CampaignState
     _learner: Any
     _planner: Any
+    _storage: Storage
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None
@@ -71,6 +74,11 @@ class CampaignView:
     def effects(self) -> Sequence[Effect]:
         """What the simulator may lack, as the campaign was told."""
         return self._planner.effects
+
+    @property
+    def directory(self) -> Path | None:
+        """Where the campaign is kept; None for in memory alone."""
+        return self._storage.path
 
     @property
     def x_shape(self) -> torch.Size:

@@ -22,6 +22,7 @@ from sbi_active.cli.folder import (
     effects_of,
     library_of,
     open_campaign,
+    read_config,
     simulator_of,
 )
 from sbi_active.cli.trials import asked, confirm, places, print_status, written
@@ -29,6 +30,8 @@ from sbi_active.cli.trials import asked, confirm, places, print_status, written
 
 def init(arguments: argparse.Namespace) -> int:
     """Make a campaign in a new folder."""
+    if arguments.config is not None:
+        read_config(arguments)
     declared = declared_by(arguments)
     options = {
         name: value
@@ -125,7 +128,7 @@ def status(arguments: argparse.Namespace) -> int:
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare the campaign's simulator with its trials, and print the report."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign, arguments))
+        report = campaign.criticize(library_of(campaign, arguments.folder))
     print(report)
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
@@ -137,7 +140,9 @@ def criticize(arguments: argparse.Namespace) -> int:
 def adopt(arguments: argparse.Namespace) -> int:
     """Go on with the simulator that the verdict names."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign, arguments), evaluate=False)
+        report = campaign.criticize(
+            library_of(campaign, arguments.folder), evaluate=False
+        )
         campaign.adopt(report)
         print(f"adopted: {report.verdict}", file=sys.stderr)
         return print_status(arguments, campaign)

@@ -1,4 +1,4 @@
-"""What ``sbi-active`` understands of a campaign's folder; nothing here imports torch."""
+"""What ``sbi-active`` understands of a campaign's folder, without importing torch."""
 
 from __future__ import annotations
 

@@ -15,7 +15,12 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import (
+    ActionSpace,
+    BoxActions,
+    DiscreteActions,
+    MixedActions,
+)
 from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.cli.loading import load_object
 from sbi_active.seeding import forked_generators
@@ -130,13 +135,36 @@ def actions_of(arguments: argparse.Namespace) -> ActionSpace:
     specs = arguments.actions
     if specs is None:
         raise ValueError(
-            "expected --actions; got none; give values as in --actions 0:5:11, one "
+            "expected --actions; got none; write values as in --actions 0:5:11, one "
             "an entry of the action"
         )
-    if len(specs) == 1 and specs[0].count(":") == 1:
+    if len(specs) == 1 and specs[0].count(":") == 1 and _range(specs[0]) is None:
         return load_object(specs[0])
+    ranges = [_range(spec) for spec in specs]
+    names = [f"action_{k}" for k in range(len(specs))] if len(specs) > 1 else ["action"]
+    if None in ranges and ranges.count(None) < len(ranges):
+        return MixedActions(
+            *[
+                DiscreteActions(_axis(spec), names=[name])
+                if limits is None
+                else BoxActions(*[[limit] for limit in limits], names=[name])
+                for spec, limits, name in zip(specs, ranges, names, strict=True)
+            ]
+        )
+    if None not in ranges:
+        low, high = zip(*[limits for limits in ranges if limits], strict=True)
+        return BoxActions([*low], [*high])
     axes = [_axis(spec) for spec in specs]
     return DiscreteActions(torch.tensor([*itertools.product(*axes)]))
+
+
+def _range(spec: str) -> tuple[float, float] | None:
+    """Return the limits that LOW:HIGH writes; None for anything else."""
+    try:
+        low, high = (float(part) for part in spec.split(":"))
+    except ValueError:
+        return None
+    return low, high
 
 
 def _axis(spec: str) -> list[float]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.cli import campaign
 from sbi_active.cli.check import actions_of, prior_of, with_noise
 from sbi_active.cli.loading import load_object
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
@@ -25,6 +26,14 @@ from sbi_active.tasks import get_task  # pyright: ignore
 
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare a simulator with measured trials, and print the report."""
+    if arguments.trials.is_dir():
+        arguments.folder = arguments.trials
+        return campaign.criticize(arguments)
+    if arguments.task is None and arguments.simulator is None:
+        raise ValueError(
+            "expected --simulator or --task with a table of trials; got neither; name "
+            "it, as in --simulator my_robot.py:simulator"
+        )
     table, trials = _trials(arguments)
     simulator, prior, actions, effects = _source(arguments, trials)
     # Only scales are taken from these where the permitted actions are unknown.

@@ -13,9 +13,57 @@ from typing import Any
 from sbi_active.campaign import Campaign
 from sbi_active.cli.check import with_noise
 from sbi_active.cli.loading import load_object
+from sbi_active.criticism import Effect, generic_effects
+from sbi_active.simulation import SimulatorModel
 
 #: How the command line made the campaign: where its simulator is.
 DECLARED = "command.json"
+#: Of ``init``, which a file may change.
+DEFAULTS = {"method": "asbi", "seed": 0}
+
+
+def read_config(arguments: argparse.Namespace) -> None:
+    """Take options from --config that the command line leaves out.
+
+    Args:
+        arguments: Changed in place.
+
+    Raises:
+        ValueError: If the file has no such options.
+    """
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+
+    try:
+        values = tomllib.loads(arguments.config.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(
+            f"expected TOML in {arguments.config}; got {error}; write options as in "
+            'theta-low = "0,1"'
+        ) from error
+    known = vars(arguments).keys() - {"folder", "config", "command"}
+    for name, value in values.items():
+        key = name.replace("-", "_")
+        if key not in known:
+            raise ValueError(
+                f"expected options among {', '.join(sorted(known))}; got {name!r} in "
+                f"{arguments.config}; remove it or write one of these"
+            )
+        given = getattr(arguments, key)
+        if given is None or (key, given) in DEFAULTS.items():
+            setattr(arguments, key, _as_written(key, value))
+
+
+def _as_written(key: str, value: Any) -> Any:
+    """Return a value of TOML as the command line writes it."""
+    if key == "actions":
+        return [str(part) for part in (value if isinstance(value, list) else [value])]
+    if isinstance(value, list):
+        return ",".join(map(str, value))
+    numbers = ("theta_low", "theta_high", "noise", "names", "units")
+    return str(value) if key in numbers else value
 
 
 def declared_by(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -33,6 +81,11 @@ def declared_by(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def simulator_of(declared: Mapping[str, Any]) -> Any:
+    """Return the simulator that was declared, without the noise of --noise.
+
+    Raises:
+        ValueError: If it is not there, or no function.
+    """
     found = load_object(_located(declared["simulator"], declared["folder"]))
     if not callable(found):
         raise ValueError(
@@ -42,11 +95,13 @@ def simulator_of(declared: Mapping[str, Any]) -> Any:
     return found
 
 
-def effects_of(declared: Mapping[str, Any]) -> list[Any]:
+def effects_of(declared: Mapping[str, Any]) -> list[Effect]:
+    """Return the effects that were declared."""
     if declared["effects"] is None:
         return []
-    found = load_object(_located(declared["effects"], declared["folder"]))
-    return [*(found() if callable(found) else found)]
+    found: Any = load_object(_located(declared["effects"], declared["folder"]))
+    listed: Any = found() if callable(found) else found
+    return [*listed]
 
 
 def _located(name: str, folder: str) -> str:
@@ -63,7 +118,7 @@ def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign
     folder = Path(arguments.folder)
     if not simulates:
         return Campaign.load(folder)
-    Campaign.load(folder)  # a folder without a campaign is an error here
+    reader = Campaign.load(folder)  # a folder without a campaign is an error here
     declared = {"simulator": None, "effects": None, "noise": None, "folder": "."}
     if (folder / DECLARED).exists():
         declared = json.loads((folder / DECLARED).read_text())
@@ -76,19 +131,28 @@ def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign
         )
     simulator = with_noise(simulator_of(declared), declared["noise"])
     effects = effects_of(declared)
-    reader = Campaign.load(folder)
     if reader.state.version.effects:
-        known = {effect.name for effect in effects}
-        generic = genericeffects_of(simulator, reader.actions, prior=reader.prior)
-        effects += [e for e in generic if e.name not in known]
+        effects = _with_usual(effects, simulator, reader)
     return Campaign.load(folder, simulator=simulator, effects=effects)
 
 
-def library_of(campaign: Campaign, arguments: argparse.Namespace) -> list[Any]:
-    """Return the effects to compare: the campaign's, and those that are usual."""
-    own = [*campaign.effects]
-    taken = {effect.name for effect in own}
+def library_of(campaign: Campaign, folder: Path) -> list[Effect]:
+    """Return the effects to compare: the campaign's own, and those that are usual."""
     # An adopted effect is declared for the simulator without it.
     base = getattr(campaign.simulator, "base", campaign.simulator)
-    generic = genericeffects_of(base, campaign.actions, prior=campaign.first_prior)
-    return [*own, *(e for e in generic if e.name not in taken)]
+    return _with_usual([*campaign.effects], base, Campaign.load(folder))
+
+
+def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:
+    """Return effects and the generic ones of other names.
+
+    Args:
+        own: Declared ones.
+        simulator: As it was before any was adopted.
+        reader: The campaign, with the prior from before.
+    """
+    if not isinstance(simulator, SimulatorModel):
+        simulator = SimulatorModel(simulator)
+    taken = {effect.name for effect in own}
+    generic = generic_effects(simulator, reader.actions, prior=reader.prior)
+    return [*own, *(effect for effect in generic if effect.name not in taken)]

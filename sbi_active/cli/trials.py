@@ -15,6 +15,7 @@ MANY = 5  # numbers, more than somebody types
 
 
 def confirm(arguments: argparse.Namespace, campaign: Campaign, trial: Trial) -> int:
+    """Print what was recorded, and what comes next."""
     if arguments.json:
         print(json.dumps(_described(campaign, trial)))
         return 0
@@ -25,6 +26,7 @@ def confirm(arguments: argparse.Namespace, campaign: Campaign, trial: Trial) -> 
 
 
 def print_status(arguments: argparse.Namespace, campaign: Campaign) -> int:
+    """Print the trials, the belief and the health."""
     told = [_described(campaign, trial) for trial in campaign.state.trials]
     waiting = [t.index for t in campaign.history if not campaign.contains(t)]
     belief = _believed(campaign)
@@ -65,6 +67,7 @@ def _believed(campaign: Campaign) -> dict[str, Any]:
 
 
 def asked(campaign: Campaign, trial: Trial) -> dict[str, Any]:
+    """Return a designed trial as JSON."""
     gain, error = None, None
     if trial.design is not None:
         gains = trial.design.expected_information_gain[trial.design.index]
@@ -100,6 +103,7 @@ def _finite(value: Tensor) -> float | None:
 
 
 def written(campaign: Campaign, trial: Trial) -> str:
+    """Return a trial's action with names and units."""
     parts = zip(
         campaign.actions.names,
         trial.action.tolist(),
@@ -110,6 +114,7 @@ def written(campaign: Campaign, trial: Trial) -> str:
 
 
 def places(campaign: Campaign) -> str:
+    """Return what stands for the numbers of an outcome on the command line."""
     count = campaign.x_shape.numel()
     return (
         "X" if count == 1 else "--file X.csv" if count > 5 else "X " * (count - 1) + "X"
