@@ -7,10 +7,11 @@ library and prints. Nothing that a user of Python might want lives here.
 from __future__ import annotations
 
 import importlib
-import sys
+import warnings
 from collections.abc import Sequence
 
 from sbi_active.cli.parser import make_parser
+from sbi_active.cli.words import say
 
 __all__ = ["main"]
 
@@ -27,8 +28,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = make_parser().parse_args(argv)
     module, function = arguments.command
     command = getattr(importlib.import_module(f"sbi_active.cli.{module}"), function)
+    folder = getattr(arguments, "folder", "DIR")
     try:
-        return command(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: say(f"note: {message}", folder)
+            return command(arguments)
     except (ValueError, OSError) as error:
-        print(f"sbi-active: {error}", file=sys.stderr)
+        say(str(error), folder)
         return 2

@@ -75,17 +75,20 @@ def tell(arguments: argparse.Namespace) -> int:
     """Record what a trial gave; it is on the disk when this ends."""
     with Campaign.load(arguments.folder) as campaign:
         number, action = arguments.trial, _action(arguments)
-        pending = campaign.pending
-        if number is None and pending is None and action is None:
-            raise ValueError(
-                "expected a pending trial; got none; ask for one by sbi-active ask "
-                f"{arguments.folder}, or add --action of the trial that was run"
-            )
         if number is not None:
             _require_trial(campaign, number)
         status = _status(arguments)
         x = None if status != "ok" else _outcome(arguments, campaign)
-        told = campaign.tell(x, trial=number, action=action, status=status)
+        try:
+            told = campaign.tell(x, trial=number, action=action, status=status)
+        except ValueError as error:
+            if not str(error).startswith("expected a pending trial"):
+                raise
+            raise ValueError(
+                "expected a pending trial; got none; ask for one by sbi-active ask "
+                f"{arguments.folder}, add --action of the trial that was run, or "
+                f"sbi-active correct {arguments.folder} TRIAL where one is wrong"
+            ) from None
         return confirm(arguments, campaign, told)
 
 
@@ -145,6 +148,12 @@ def adopt(arguments: argparse.Namespace) -> int:
         )
         campaign.adopt(report)
         print(f"adopted: {report.verdict}", file=sys.stderr)
+        return print_status(arguments, campaign)
+
+
+def repair(arguments: argparse.Namespace) -> int:
+    """Give up what is damaged, and name what has to be told again."""
+    with Campaign.load(arguments.folder, repair=True) as campaign:
         return print_status(arguments, campaign)
 
 

@@ -41,6 +41,7 @@ def add_campaign_commands(commands: Any, methods: Sequence[str]) -> None:
     withdraw.add_argument("trial", type=int, metavar="TRIAL", help="its number")
     withdraw.add_argument("--reason", default="", help="kept with the trial")
     _command(commands, "status", "show the trials, the belief and the health")
+    _command(commands, "repair", "give up what is damaged, and say what that is")
     update = _command(commands, "update", "bring the belief up to date")
     _add_simulator(update)
     adopt = _command(commands, "adopt", "go on with the effects that a verdict names")

@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from sbi_active.campaign import Campaign, Trial
+from sbi_active.cli.words import spoken
 
 MANY = 5  # numbers, more than somebody types
 
@@ -45,7 +46,7 @@ def print_status(arguments: argparse.Namespace, campaign: Campaign) -> int:
     for name, entry in belief["parameters"].items():
         print(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
     for text in belief["warnings"]:
-        print(f"note: {text}")
+        print(f"note: {spoken(text, arguments.folder)}")
     if waiting:
         print(f"not in the belief yet: {waiting}; run sbi-active update")
     return 0

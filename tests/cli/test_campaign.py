@@ -1,0 +1,142 @@
+"""A campaign driven from the command line, as a robot's program would."""
+
+import json
+import sys
+
+import pytest
+
+from sbi_active.cli import main
+
+SIMULATOR = '''
+import torch
+
+
+def slide(theta, action):
+    friction, drag = theta[:, :1], theta[:, 1:]
+    return action**2 / (2 * 9.81 * friction) / (1 + drag * action)
+'''
+CONFIG = '''
+simulator = "sled.py:slide"
+theta-low = [0.2, 0.0]
+theta-high = "1,1"
+actions = "0.5:3"
+names = "speed"
+units = "m/s"
+noise = 0.02
+method = "nsbi"
+num-simulations = 200
+seed = 4
+'''
+
+
+@pytest.fixture
+def made(tmp_path, capsys, monkeypatch):
+    monkeypatch.delitem(sys.modules, "sled", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "sled.py").write_text(SIMULATOR)
+    (tmp_path / "campaign.toml").write_text(CONFIG)
+    assert main(["init", "camp", "--config", "campaign.toml"]) == 0
+    assert "next: sbi-active ask camp" in capsys.readouterr().out
+    return tmp_path / "camp"
+
+
+def answer(capsys, *words):
+    """Return what a command prints as JSON."""
+    assert main([*words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_asked_told_and_believed(made, capsys):
+    asked = answer(capsys, "ask", "camp")
+    assert asked["trial"] == 0
+    assert asked["names"] == ["speed"]
+    assert 0.5 <= asked["action"][0] <= 3
+    assert answer(capsys, "ask", "camp")["action"] == asked["action"]
+
+    told = answer(capsys, "tell", "camp", "0.7")
+    assert told["x"] == [pytest.approx(0.7)]
+    assert answer(capsys, "status", "camp")["not_in_belief"] == [0]
+    after = answer(capsys, "update", "camp")
+    assert after["not_in_belief"] == []
+    assert after["belief"]["parameters"].keys() == {"theta_1", "theta_2"}
+    before = {"mean": 0.6, "sd": 0.8 / 12**0.5}
+    assert after["belief"]["parameters"]["theta_1"]["sd"] < before["sd"]
+
+
+def test_corrected_and_withdrawn_without_the_simulator(made, capsys, tmp_path):
+    main(["ask", "camp"])
+    (tmp_path / "sled.py").unlink()
+    assert main(["tell", "camp", "70"]) == 0
+    assert main(["correct", "camp", "0", "0.7", "--reason", "told in cm"]) == 0
+    (trial,) = answer_after(capsys, "status", "camp")["trials"]
+    assert trial["reason"] == "told in cm"
+    assert trial["x"] == [pytest.approx(0.7)]
+    assert main(["withdraw", "camp", "0", "--reason", "bumped"]) == 0
+    assert main(["tell", "camp", "--invalid", "--action", "2"]) == 0
+    capsys.readouterr()
+    statuses = [t["status"] for t in answer(capsys, "status", "camp")["trials"]]
+    assert statuses == ["withdrawn", "invalid"]
+
+
+def answer_after(capsys, *words):
+    capsys.readouterr()
+    return answer(capsys, *words)
+
+
+def test_outcomes_of_a_file(made, capsys, tmp_path):
+    main(["ask", "camp"])
+    (tmp_path / "x.csv").write_text("distance [m]\n0.71\n")
+    capsys.readouterr()
+    told = answer(capsys, "tell", "camp", "--file", "x.csv")
+    assert told["x"] == [pytest.approx(0.71)]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["tell", "camp", "0.7"], "ask for one by sbi-active ask camp"),
+        (["tell", "camp", "1", "2", "--action", "1"], "expected 1 numbers"),
+        (["tell", "camp", "fast", "--action", "1"], "write them with a point"),
+        (["tell", "camp", "1", "--missing"], "got several; write one"),
+        (["withdraw", "camp", "3"], "expected a trial from 0"),
+        (["status", "nowhere"], "make one by sbi-active init nowhere"),
+        (["init", "camp", "--config", "campaign.toml"], "choose another folder"),
+        (["init", "new", "--config", "other.toml"], "expected options among"),
+        (["init", "new"], "name it, as in --simulator my_robot.py:fn"),
+        (["criticize", "table.csv"], "expected --simulator or --task"),
+    ],
+)
+def test_errors_in_the_words_of_the_command_line(made, capsys, tmp_path, words, text):
+    (tmp_path / "other.toml").write_text("noize = 0.1\n")
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert text in error
+    assert "Campaign(" not in error
+
+
+def test_another_place_of_the_simulator(made, capsys, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "sled.py").rename(tmp_path / "elsewhere" / "sled.py")
+    del sys.modules["sled"]
+    assert main(["ask", "camp"]) == 2
+    assert "expected a file; got none" in capsys.readouterr().err
+    assert main(["ask", "camp", "--simulator", "elsewhere/sled.py:slide"]) == 0
+
+
+def test_a_slip_of_the_unit_is_named(made, capsys):
+    main(["tell", "camp", "0.9", "--action", "3"])
+    main(["tell", "camp", "70", "--action", "2.5"])
+    main(["update", "camp"])
+    shown = capsys.readouterr()
+    assert "sbi-active correct camp 1 X" in shown.out + shown.err
+    assert "tell(x" not in shown.out + shown.err
+
+
+def test_exported(made, capsys, tmp_path):
+    import arviz as az
+
+    main(["tell", "camp", "0.9", "--action", "3"])
+    main(["update", "camp"])
+    assert main(["export", "camp", "--netcdf", "out.nc"]) == 0
+    data = az.from_netcdf(tmp_path / "out.nc")
+    assert data["posterior"]["theta"].shape == (1, 2000, 2)
