@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.check import actions_of, prior_of, with_noise
+from sbi_active.cli.check import actions_of, prior_of
 from sbi_active.cli.folder import (
     DECLARED,
     declared_by,
@@ -39,7 +39,7 @@ def init(arguments: argparse.Namespace) -> int:
         if (value := getattr(arguments, name)) is not None
     }
     with Campaign(
-        with_noise(simulator_of(declared), declared["noise"]),
+        simulator_of(declared),
         prior_of(arguments),
         _labeled(actions_of(arguments), arguments),
         method=arguments.method,
@@ -73,7 +73,7 @@ def ask(arguments: argparse.Namespace) -> int:
 
 def tell(arguments: argparse.Namespace) -> int:
     """Record what a trial gave; it is on the disk when this ends."""
-    with Campaign.load(arguments.folder) as campaign:
+    with open_campaign(arguments, simulates=False) as campaign:
         number, action = arguments.trial, _action(arguments)
         if number is not None:
             _require_trial(campaign, number)
@@ -94,7 +94,7 @@ def tell(arguments: argparse.Namespace) -> int:
 
 def correct(arguments: argparse.Namespace) -> int:
     """Replace what was told of a trial."""
-    with Campaign.load(arguments.folder) as campaign:
+    with open_campaign(arguments, simulates=False) as campaign:
         _require_trial(campaign, arguments.trial)
         status = _status(arguments)
         x = None if status != "ok" else _outcome(arguments, campaign)
@@ -110,7 +110,7 @@ def correct(arguments: argparse.Namespace) -> int:
 
 def withdraw(arguments: argparse.Namespace) -> int:
     """Take a trial out."""
-    with Campaign.load(arguments.folder) as campaign:
+    with open_campaign(arguments, simulates=False) as campaign:
         _require_trial(campaign, arguments.trial)
         told = campaign.withdraw(arguments.trial, reason=arguments.reason)
         return confirm(arguments, campaign, told)
@@ -125,13 +125,13 @@ def update(arguments: argparse.Namespace) -> int:
 
 def status(arguments: argparse.Namespace) -> int:
     """Print the trials, the belief and the health."""
-    return print_status(arguments, Campaign.load(arguments.folder))
+    return print_status(arguments, open_campaign(arguments, simulates=False))
 
 
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare the campaign's simulator with its trials, and print the report."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign, arguments.folder))
+        report = campaign.criticize(library_of(campaign, arguments))
     print(report)
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
@@ -143,9 +143,7 @@ def criticize(arguments: argparse.Namespace) -> int:
 def adopt(arguments: argparse.Namespace) -> int:
     """Go on with the simulator that the verdict names."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(
-            library_of(campaign, arguments.folder), evaluate=False
-        )
+        report = campaign.criticize(library_of(campaign, arguments), evaluate=False)
         campaign.adopt(report)
         print(f"adopted: {report.verdict}", file=sys.stderr)
         return print_status(arguments, campaign)

@@ -6,13 +6,15 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign import Campaign
+from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.check import with_noise
 from sbi_active.cli.loading import load_object
+from sbi_active.cli.options import make_task
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.simulation import SimulatorModel
 
@@ -67,41 +69,68 @@ def _as_written(key: str, value: Any) -> Any:
 
 
 def declared_by(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return where the simulator and the effects are, as the other commands need it."""
+    """Return where everything is that a program wrote, as other commands need it."""
     if arguments.simulator is None:
         raise ValueError(
             "expected --simulator; got none; name it, as in --simulator my_robot.py:fn"
         )
+    actions = arguments.actions or []
+    is_named = len(actions) == 1 and not actions[0].partition(":")[0][:1].isdigit()
     return {
         "simulator": arguments.simulator,
         "effects": arguments.effects,
         "noise": arguments.noise,
+        "prior": arguments.prior,
+        "actions": actions[0] if is_named and ":" in actions[0] else None,
         "folder": os.getcwd(),
     }
 
 
+def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
+    """Return the same for a campaign on a task.
+
+    Args:
+        name: Of the task.
+        options: Of the task, each NAME=VALUE.
+    """
+    return {"task": name, "options": [*options], "noise": None, "folder": os.getcwd()}
+
+
 def simulator_of(declared: Mapping[str, Any]) -> Any:
-    """Return the simulator that was declared, without the noise of --noise.
+    """Return the simulator that was declared, with the noise of --noise.
 
     Raises:
         ValueError: If it is not there, or no function.
     """
+    if "task" in declared:
+        return make_task(declared["task"], declared["options"]).simulator
     found = load_object(_located(declared["simulator"], declared["folder"]))
     if not callable(found):
         raise ValueError(
             f"expected a function or SimulatorModel; got {type(found).__name__} under "
             f"{declared['simulator']}; name what takes (theta, action)"
         )
-    return found
+    return with_noise(found, declared["noise"])
 
 
 def effects_of(declared: Mapping[str, Any]) -> list[Effect]:
     """Return the effects that were declared."""
-    if declared["effects"] is None:
+    if declared.get("effects") is None:
         return []
-    found: Any = load_object(_located(declared["effects"], declared["folder"]))
+    found = load_object(_located(declared["effects"], declared["folder"]))
     listed: Any = found() if callable(found) else found
     return [*listed]
+
+
+def _not_described(declared: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the prior and the actions that the campaign's files do not describe."""
+    manifest = read_manifest(folder)
+    lacking = [what for what in ("prior", "actions") if manifest[what] is None]
+    if "task" in declared and lacking:
+        task = make_task(declared["task"], declared["options"])
+        return {what: getattr(task, what) for what in lacking}
+    named = [what for what in lacking if declared.get(what)]
+    return {w: load_object(_located(declared[w], declared["folder"])) for w in named}
 
 
 def _located(name: str, folder: str) -> str:
@@ -114,33 +143,43 @@ def _located(name: str, folder: str) -> str:
 
 
 def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign:
-    """Return the campaign of a folder, with its simulator where that is asked for."""
-    folder = Path(arguments.folder)
-    if not simulates:
-        return Campaign.load(folder)
-    reader = Campaign.load(folder)  # a folder without a campaign is an error here
-    declared = {"simulator": None, "effects": None, "noise": None, "folder": "."}
+    """Return the campaign of a folder.
+
+    Args:
+        arguments: With the folder.
+        simulates: Whether its simulator is needed.
+
+    Raises:
+        ValueError: If there is no campaign, or nobody knows where its simulator is.
+    """
+    folder, declared = Path(arguments.folder), {}
     if (folder / DECLARED).exists():
         declared = json.loads((folder / DECLARED).read_text())
     if getattr(arguments, "simulator", None) is not None:
         declared |= {"simulator": arguments.simulator, "folder": os.getcwd()}
-    if declared["simulator"] is None:
+        declared.pop("task", None)
+    given = _not_described(declared, folder)
+    reader = Campaign.load(folder, **given)
+    if not simulates:
+        return reader
+    if declared.keys().isdisjoint(("simulator", "task")):
         raise ValueError(
             f"expected --simulator, since the campaign in {folder} was made by a "
             "program; got none; name it, as in --simulator my_robot.py:fn"
         )
-    simulator = with_noise(simulator_of(declared), declared["noise"])
-    effects = effects_of(declared)
+    simulator, effects = simulator_of({"noise": None, **declared}), effects_of(declared)
     if reader.state.version.effects:
         effects = _with_usual(effects, simulator, reader)
-    return Campaign.load(folder, simulator=simulator, effects=effects)
+    return Campaign.load(folder, simulator=simulator, effects=effects, **given)
 
 
-def library_of(campaign: Campaign, folder: Path) -> list[Effect]:
+def library_of(campaign: Campaign, arguments: argparse.Namespace) -> list[Effect]:
     """Return the effects to compare: the campaign's own, and those that are usual."""
     # An adopted effect is declared for the simulator without it.
     base = getattr(campaign.simulator, "base", campaign.simulator)
-    return _with_usual([*campaign.effects], base, Campaign.load(folder))
+    return _with_usual(
+        [*campaign.effects], base, open_campaign(arguments, simulates=False)
+    )
 
 
 def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:

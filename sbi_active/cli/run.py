@@ -7,11 +7,13 @@ target=2 --option noise=0.01 --out DIR``.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,6 +21,7 @@ import torch
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
+from sbi_active.cli.folder import DECLARED, declared_of_task
 from sbi_active.cli.options import make_task
 from sbi_active.cli.progress import Progress
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
@@ -45,8 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
             method=arguments.method,
             seed=arguments.seed,
             options=_campaign_options(arguments),
+            directory=(folder := _new_folder(arguments.out)),
         )
-        arguments.out.mkdir(parents=True, exist_ok=True)
+        declared = declared_of_task(arguments.task, arguments.option)
+        (folder / DECLARED).write_text(json.dumps(declared, indent=2) + "\n")
         beliefs.append(campaign.belief)
         for index in range(arguments.rounds):
             progress.step("looking up what is exact")
@@ -76,6 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
         save(figure, str(figure_path))
         _save(arguments, campaign, rounds, wall)
+        campaign.close()
     print(_table(rounds))
     mean, sd = campaign.belief.mean, campaign.belief.variance.sqrt()
     for name, m, s, truth in zip(
@@ -86,7 +92,15 @@ def run(arguments: argparse.Namespace) -> int:
     for warning in (*diagnostics.warnings, *diagnostics.network_warnings):
         print(f"note: {warning}")
     print(f"{wall:.1f} s; figure: {figure_path}; results: {arguments.out}")
+    print(f"to go on with it: sbi-active ask {folder}")
     return 0
+
+
+def _new_folder(out: Path) -> Path:
+    """Return where the campaign is kept; those of earlier runs stay as they are."""
+    numbered = (f"campaign-{k}" for k in itertools.count(2))
+    names = itertools.chain(["campaign"], numbered)
+    return next(out / name for name in names if not (out / name).exists())
 
 
 def _campaign_options(arguments: argparse.Namespace) -> CampaignOptions:

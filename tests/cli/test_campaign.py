@@ -7,15 +7,15 @@ import pytest
 
 from sbi_active.cli import main
 
-SIMULATOR = '''
+SIMULATOR = """
 import torch
 
 
 def slide(theta, action):
     friction, drag = theta[:, :1], theta[:, 1:]
     return action**2 / (2 * 9.81 * friction) / (1 + drag * action)
-'''
-CONFIG = '''
+"""
+CONFIG = """
 simulator = "sled.py:slide"
 theta-low = [0.2, 0.0]
 theta-high = "1,1"
@@ -26,7 +26,7 @@ noise = 0.02
 method = "nsbi"
 num-simulations = 200
 seed = 4
-'''
+"""
 
 
 @pytest.fixture
