@@ -28,6 +28,7 @@ from sbi_active.campaign.state import (
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.storage.manifest import new_manifest, write_manifest
+from sbi_active.campaign.storage.simulations import num_rows
 from sbi_active.campaign.storage.storage import Storage, stored
 from sbi_active.campaign.trials import CampaignTrials
 
@@ -112,7 +113,7 @@ class Campaign(CampaignTrials):
     ) -> None:
         find_method(method)  # an unknown name is an error here
         actions, options = action_space(actions), CampaignOptions.of(options)
-        state = CampaignState(method=method, seed=seed, options=options)
+        state = CampaignState(method, seed, options, num_earlier=num_rows(options.bank))
         learner = Learner(simulator, prior, actions, state)
         limits = Limits(actions, constraint, cost)
         self._begin(state, actions, learner, Planner(limits, state, effects))

@@ -315,6 +315,7 @@ class CampaignState:
         processed: Indices of trials that the belief contains, in order of use.
         versions: Lineage of the simulator, the current one last.
         is_stale: Whether a trial that the belief contains was corrected since.
+        num_earlier: Rows that were in ``options.bank`` before the campaign.
     """
 
     method: str
@@ -324,6 +325,7 @@ class CampaignState:
     processed: list[int] = field(default_factory=list)
     versions: list[ModelVersion] = field(default_factory=lambda: [ModelVersion()])
     is_stale: bool = False
+    num_earlier: int = 0
 
     @property
     def version(self) -> ModelVersion:

@@ -28,6 +28,7 @@ from sbi_active.campaign.learning.indexed import (
     depends_on_index,
 )
 from sbi_active.campaign.learning.methods import find_method
+from sbi_active.campaign.learning.reused import first_round
 from sbi_active.campaign.learning.round_model import RoundModel
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import (
@@ -336,15 +337,26 @@ class Learner:
                 action = self._actions.sample(
                     (options.num_simulations,), seed=derive_seed(seed, "action", key)
                 )
+                drawn = theta
                 theta, action = self._inference.arrange(theta, action)
-                rows = simulate(
-                    self.at(index),
-                    theta,
-                    action,
-                    seed=derive_seed(seed, "x", key),
-                    workers=options.workers,
-                )
-                known = rows.without_missing()
+                x_seed, workers = derive_seed(seed, "x", key), options.workers
+                if key == 0 and theta is drawn and not self._has_index:
+                    known, num, num_missing = first_round(
+                        self.simulator,
+                        self.belief,
+                        theta,
+                        action,
+                        actions=self._actions,
+                        num_earlier=state.num_earlier,
+                        seed=x_seed,
+                        workers=workers,
+                    )
+                else:
+                    rows = simulate(
+                        self.at(index), theta, action, seed=x_seed, workers=workers
+                    )
+                    known = rows.without_missing()
+                    num, num_missing = len(rows), rows.counts["missing"]
                 if options.design_on == "training":
                     self.simulations = known
             with state.stage(index, "training"):
@@ -353,7 +365,7 @@ class Learner:
                 )
                 with forked_generators(seed, "train", key):
                     self._inference.train()
-            self._state.account(index, len(rows), rows.counts["missing"])
+            self._state.account(index, num, num_missing)
             self._round_ready = True
         return self._inference.build_posterior()
 

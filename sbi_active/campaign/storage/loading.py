@@ -119,7 +119,12 @@ def load(
     settings: CampaignOptions = _given("options", options, manifest, options_from)
     space: ActionSpace = _given("actions", actions, manifest, actions_from)
     first_prior: Distribution = _given("prior", prior, manifest, prior_from)
-    state = CampaignState(manifest["method"], manifest["seed"], settings)
+    state = CampaignState(
+        manifest["method"],
+        manifest["seed"],
+        settings,
+        num_earlier=manifest["num_earlier"],
+    )
     name = disk.restore(state)
     shape = torch.Size(manifest["x_shape"])
     for note in disk.notes:

@@ -69,6 +69,7 @@ def new_manifest(
         "packages": _packages(),
         "method": state.method,
         "seed": state.seed,
+        "num_earlier": state.num_earlier,
         "parameter_names": None if names is None else [*names],
         "channel_names": None if channels is None else [*channels],
         "x_shape": [*x_shape],

@@ -9,10 +9,21 @@ from typing import Any
 
 from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.simulation.bank.bank import Bank
+from sbi_active.simulation.bank.header import has_header
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.store import RowStore
 
-__all__ = ["CampaignBanks"]
+__all__ = ["CampaignBanks", "num_rows"]
+
+
+def num_rows(folder: str | None) -> int:
+    """Return how many rows of the simulator itself a folder of banks has.
+
+    Args:
+        folder: None for none.
+    """
+    drawn = None if folder is None else Path(folder, "drawn")
+    return 0 if drawn is None or not has_header(drawn) else len(Bank(drawn))
 
 
 class CampaignBanks:

@@ -2,18 +2,21 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
 from torch.distributions import Normal
 
-from sbi_active import Campaign, CampaignOptions
+from sbi_active import BoxActions, Campaign
 from sbi_active.criticism import Effect
 from sbi_active.simulation.bank import Bank, LockedError
 from tests.campaign.storage.campaigns import (
+    ACTIONS,
     MODEL,
     OPTIONS,
     PRIOR,
+    TRUTH,
     drawn,
     draws,
     facts,
@@ -243,23 +246,39 @@ def test_adopted_effects_come_back(tmp_path):
     go_on(again, 7)
 
 
-def test_a_bank_that_campaigns_share(tmp_path):
-    options = CampaignOptions(**{**vars(OPTIONS), "bank": tmp_path / "bank"})
+def test_a_bank_that_campaigns_share(tmp_path, caplog):
+    options = replace(OPTIONS, bank=tmp_path / "bank")
 
-    def run():
+    def run(seed):
+        CALLS.clear()
         campaign = Campaign(
-            counted, PRIOR, new().actions, method="nsbi", options=options
+            *(counted, PRIOR, new().actions), method="asbi", options=options, seed=seed
         )
-        go_on(campaign, 1)
+        assert campaign.posterior is not None  # the first round's network
         campaign.close()
-        return sum(CALLS), draws(campaign)
+        return sum(CALLS), campaign
 
-    first, before = run()
-    CALLS.clear()
-    second, after = run()
-    assert torch.equal(before, after)
+    first, _ = run(seed=0)
+    assert first >= OPTIONS.num_simulations
+    with caplog.at_level("INFO", "sbi_active"):
+        second, campaign = run(seed=1)
     assert second < first / 5
-    assert len(Bank(tmp_path / "bank" / "drawn")) > 0
+    assert "200 of 200 rows are read" in caplog.text
+    assert "worth 200 draws from the prior" in caplog.text
+    whole = draws(go_on(campaign, 1))
+    assert bool(((whole.mean(0) - TRUTH[0]).abs() < 4 * whole.std(0)).all())
+    assert len(Bank(tmp_path / "bank" / "drawn")) > 200
+
+
+def test_earlier_rows_of_other_actions_are_not_taken(tmp_path):
+    options = replace(OPTIONS, bank=tmp_path / "bank")
+    with Campaign(counted, PRIOR, ACTIONS, method="asbi", options=options) as campaign:
+        assert campaign.posterior is not None
+    CALLS.clear()
+    fast = BoxActions([3.0], [4.0])
+    with Campaign(counted, PRIOR, fast, method="asbi", options=options) as campaign:
+        assert campaign.posterior is not None
+    assert sum(CALLS) >= OPTIONS.num_simulations
 
 
 def test_a_pickled_copy_lives_in_memory(tmp_path):
