@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import METHODS, find_method
@@ -286,6 +287,8 @@ class Campaign(CampaignTrials):
                     learner.score(trial)
                 learner.learn(state.trials[trial.index])
             state.processed.append(trial.index)
+            if trial.is_measured:
+                keep_draws(state, learner.belief)
             self._storage.save(state, learner)
             if self.on_update is not None:
                 self.on_update(state.trials[trial.index])

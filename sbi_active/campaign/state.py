@@ -288,6 +288,8 @@ class CampaignState:
         processed: Indices of trials that the belief contains, in order of use.
         versions: Lineage of the simulator, the current one last.
         is_stale: Whether a trial that the belief contains was corrected since.
+        draws: Some of the belief after each trial, for pictures, by the trial's index,
+            shape (n, theta_dim); of the parameters that the model had then.
     """
 
     method: str
@@ -297,6 +299,7 @@ class CampaignState:
     processed: list[int] = field(default_factory=list)
     versions: list[ModelVersion] = field(default_factory=lambda: [ModelVersion()])
     is_stale: bool = False
+    draws: dict[int, Tensor] = field(default_factory=dict)
 
     @property
     def version(self) -> ModelVersion:

@@ -32,6 +32,7 @@ from sbi_active.campaign.learning.round_model import RoundModel
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import (
     information_gained,
+    named,
     require_support,
     require_width,
 )
@@ -136,7 +137,7 @@ class Learner:
         """The belief after the trials learned so far; the prior before any."""
         belief = self._inference.belief
         assert belief is not None
-        return belief
+        return named(belief, self.simulator)
 
     @property
     def stated_belief(self) -> Distribution:
@@ -145,7 +146,8 @@ class Learner:
         if self._state.is_stale:
             texts.append("a trial was corrected since: update() computes it again")
         if self._stated is None or self._stated[:2] != (belief, texts):
-            self._stated = belief, texts, in_doubt(belief, self.prior, texts)
+            marked = named(in_doubt(belief, self.prior, texts), self.simulator)
+            self._stated = belief, texts, marked
         return self._stated[2]
 
     def at(self, index: int) -> Callable[..., Any]:

@@ -11,6 +11,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.seeding import derive_seed
@@ -128,6 +129,7 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
         state.versions.pop()
         raise
     state.versions[-1] = replace(version, misfit=misfit)
+    keep_draws(state, revised.belief)
     return revised
 
 
@@ -180,6 +182,7 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     """
     version = state.version
     state.processed.clear()
+    state.draws.clear()
     for trial in state.trials:
         if trial.status != "pending":
             state.unscore(trial.index)
@@ -189,4 +192,5 @@ def recompute(state: CampaignState, learner: Learner) -> None:
         misfit = learner.infer(before)
         state.versions[-1] = replace(version, misfit=misfit)
         state.processed.extend(version.trials)
+        keep_draws(state, learner.belief)
     state.is_stale = False

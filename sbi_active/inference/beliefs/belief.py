@@ -23,6 +23,8 @@ __all__ = [
     "ChainedBelief",
     "UnchangedBelief",
     "information_gained",
+    "named",
+    "names_of",
     "parameter_dim",
     "require_support",
     "require_width",
@@ -50,11 +52,13 @@ class Belief(Distribution, ABC):
     Attributes:
         prior: The original prior.
         label: How the belief was made, for reports.
+        parameter_names: One a parameter, where the simulator names them; else None.
         diagnostics: What is known of its quality.
     """
 
     arg_constraints = {}  # pyright: ignore
     label: str = "belief"
+    parameter_names: tuple[str, ...] | None = None
 
     def __init__(self, prior: Distribution) -> None:
         dim = parameter_dim(prior)
@@ -80,6 +84,24 @@ class Belief(Distribution, ABC):
         shape = torch.Size(sample_shape)
         with torch.no_grad():
             return self._sample(shape.numel()).float().reshape(*shape, -1)
+
+    def quick_sample(self, num_samples: int, *, seed: int) -> Tensor:
+        """Return draws for a picture, at no cost worth a word.
+
+        They are those of :meth:`sample` but for beliefs whose draws take long.
+
+        Args:
+            num_samples: Number of draws n.
+            seed: Of the draws.
+
+        Returns:
+            Shape (n, theta_dim), float32.
+        """
+        with forked_generators(seed), torch.no_grad():
+            return self._quick_sample(num_samples).float()
+
+    def _quick_sample(self, num_samples: int) -> Tensor:
+        return self._sample(num_samples)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, (..., theta_dim) -> (...); -inf off the support."""
@@ -121,7 +143,9 @@ class Belief(Distribution, ABC):
 
     def __repr__(self) -> str:
         mean, sd = self.mean.tolist(), self.variance.sqrt().tolist()
-        cells = [f"{m:.3g} +- {s:.2g}" for m, s in zip(mean, sd, strict=True)]
+        names = [f"{name} " for name in self.parameter_names or ()] or [""] * len(mean)
+        rows = zip(names, mean, sd, strict=True)
+        cells = [f"{name}{m:.3g} +- {s:.2g}" for name, m, s in rows]
         return f"{type(self).__name__}({self.label}: {', '.join(cells)})"
 
 
@@ -236,6 +260,35 @@ def information_gained(
         getattr(b, "smooth_log_prob", b.log_prob)(theta) for b in (belief, previous)
     )
     return float((after.double() - before.double()).mean())
+
+
+def named(belief: Distribution, simulator: Any) -> Distribution:
+    """Return a belief that knows the names of a simulator's parameters.
+
+    Args:
+        belief: Changed in place, unless it is a distribution of the user's.
+        simulator: One with or without ``parameter_names``.
+    """
+    names = getattr(simulator, "parameter_names", None)
+    if isinstance(belief, Belief) and names is not None:
+        if len(names) == belief.event_shape[0]:
+            belief.parameter_names = (*names,)
+    return belief
+
+
+def names_of(belief: Distribution, num: int) -> list[str]:
+    """Return the names of a belief's parameters, theta_1, ... where it has none.
+
+    Args:
+        belief: The belief, or a prior.
+        num: Of its parameters.
+
+    Example:
+        >>> names_of(torch.distributions.Normal(0.0, 1.0), 2)
+        ['theta_1', 'theta_2']
+    """
+    names = getattr(belief, "parameter_names", None)
+    return [f"theta_{i + 1}" for i in range(num)] if names is None else [*names]
 
 
 def parameter_dim(prior: Distribution) -> int:
