@@ -52,6 +52,7 @@ FLOORS = (
     "campaign.stopping",
     "campaign.state",
     "campaign.checks",
+    "campaign.display",
     "campaign.isolation",
     "campaign.learning",
     "campaign.telling",

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.display.progress import StageWatch, rounds
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
@@ -69,6 +70,8 @@ class Campaign(CampaignTrials):
             ends the process, :meth:`load` goes on. None keeps it in memory alone.
         on_trial: Called with each trial that was told, once it is recorded.
         on_update: Called with each trial, once the belief contains it.
+        show_progress: Draw a bar of what is being done, and of the rounds of
+            :meth:`run`. The logger "sbi_active" says it of all that takes 2 s anyway.
 
     Raises:
         ValueError: If the method is unknown, the prior has no support, or no width that
@@ -109,12 +112,14 @@ class Campaign(CampaignTrials):
         directory: str | os.PathLike[str] | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         on_update: Callable[[Trial], None] | None = None,
+        show_progress: bool = False,
     ) -> None:
         find_method(method)  # an unknown name is an error here
         options = CampaignOptions() if options is None else options
         state = CampaignState(method=method, seed=seed, options=options)
         learner = Learner(simulator, prior, actions, state)
         limits = Limits(actions, constraint, cost)
+        state.watch = StageWatch(show_progress)
         self._begin(state, actions, learner, Planner(limits, state, effects))
         self.on_trial, self.on_update = on_trial, on_update
         disk = None
@@ -154,6 +159,7 @@ class Campaign(CampaignTrials):
         options: CampaignOptions | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         on_update: Callable[[Trial], None] | None = None,
+        show_progress: bool = False,
         simulator_changed: bool = False,
         repair: bool = False,
     ) -> Campaign:
@@ -176,6 +182,7 @@ class Campaign(CampaignTrials):
                 own. Sizes may be others than before.
             on_trial: As in the constructor.
             on_update: As in the constructor.
+            show_progress: As in the constructor.
             simulator_changed: Take another simulator than the campaign was made with,
                 and compute everything again with it.
             repair: Give up what is damaged. The files before are kept beside, and a
@@ -199,6 +206,7 @@ class Campaign(CampaignTrials):
         )
         self = cls.__new__(cls)
         limits = Limits(found.actions, constraint, cost)
+        found.state.watch = StageWatch(show_progress)
         planner = Planner(limits, found.state, effects)
         self._begin(found.state, found.actions, found.learner, planner)
         self.on_trial, self.on_update = on_trial, on_update
@@ -317,7 +325,7 @@ class Campaign(CampaignTrials):
         Returns:
             The belief after the last trial.
         """
-        for _ in range(num_rounds):
+        for _ in rounds(self.state, num_rounds):
             if self.stop_reason is not None:
                 break
             index = self.ask().index

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -276,6 +276,14 @@ UNSCORED: dict[str, Any] = {
 }
 
 
+Watch = Callable[["CampaignState", int, str], AbstractContextManager[None]]
+
+
+def unwatched(state: CampaignState, index: int, name: str) -> nullcontext[None]:
+    """Tell nobody of a stage."""
+    return nullcontext()
+
+
 @dataclass
 class CampaignState:
     """All that a campaign is: with the simulator, the rest can be computed again.
@@ -290,6 +298,8 @@ class CampaignState:
         is_stale: Whether a trial that the belief contains was corrected since.
         draws: Some of the belief after each trial, for pictures, by the trial's index,
             shape (n, theta_dim); of the parameters that the model had then.
+        watch: Entered around whatever may take long, with the state, the index of the
+            trial that it is for (of the next one where it is for none) and its name.
     """
 
     method: str
@@ -300,6 +310,7 @@ class CampaignState:
     versions: list[ModelVersion] = field(default_factory=lambda: [ModelVersion()])
     is_stale: bool = False
     draws: dict[int, Tensor] = field(default_factory=dict)
+    watch: Watch = field(default=unwatched, repr=False, compare=False)
 
     @property
     def version(self) -> ModelVersion:
@@ -361,9 +372,13 @@ class CampaignState:
 
         Work ahead of a trial that was not asked for yet is on no account.
         """
-        if index == len(self.trials):
-            yield
-            return
+        with self.watch(self, index, name):
+            if index == len(self.trials):
+                yield
+            else:
+                yield from self._timed(index, name)
+
+    def _timed(self, index: int, name: str) -> Iterator[None]:
         before = self.trials[index]
         wall, cpu = time.perf_counter(), time.process_time()
         yield

@@ -80,11 +80,12 @@ def criticize(
         designed: Whether the actions were chosen for information.
     """
     examined = state.version.examined
-    report = criticism.report(
-        evaluate=evaluate,
-        designed=designed,
-        exploratory=any(d != criticism.digest for d in examined),
-    )
+    with state.watch(state, len(state.trials), "criticism"):
+        report = criticism.report(
+            evaluate=evaluate,
+            designed=designed,
+            exploratory=any(d != criticism.digest for d in examined),
+        )
     state.examined(criticism.digest)
     return report
 
@@ -124,7 +125,8 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     state.versions.append(version)
     try:
         revised = Learner(report.simulator, report.prior, actions, state)
-        misfit = revised.infer(state.measured)
+        with state.watch(state, len(state.trials), "inference from all trials"):
+            misfit = revised.infer(state.measured)
     except BaseException:
         state.versions.pop()
         raise
@@ -189,7 +191,8 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     learner.restart()
     if version.trials:
         before = [t for i in version.trials if (t := state.trials[i]).is_measured]
-        misfit = learner.infer(before)
+        with state.watch(state, len(state.trials), "inference from all trials"):
+            misfit = learner.infer(before)
         state.versions[-1] = replace(version, misfit=misfit)
         state.processed.extend(version.trials)
         keep_draws(state, learner.belief)

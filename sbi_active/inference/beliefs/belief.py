@@ -270,9 +270,10 @@ def named(belief: Distribution, simulator: Any) -> Distribution:
         simulator: One with or without ``parameter_names``.
     """
     names = getattr(simulator, "parameter_names", None)
-    if isinstance(belief, Belief) and names is not None:
-        if len(names) == belief.event_shape[0]:
-            belief.parameter_names = (*names,)
+    if not isinstance(belief, Belief) or names is None:
+        return belief
+    if len(names) == belief.event_shape[0]:
+        belief.parameter_names = (*names,)
     return belief
 
 
