@@ -9,10 +9,14 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.health import Health, assess
+from sbi_active.campaign.display.frame import to_dataframe
 from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.inference.beliefs.belief import names_of, parameter_dim
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from sbi_active.criticism import Effect
 
 __all__ = ["CampaignView"]
@@ -30,6 +34,7 @@ class CampaignView:
     state: CampaignState
     _learner: Any
     _planner: Any
+    _storage: Any
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None
@@ -81,6 +86,28 @@ class CampaignView:
         return assess(self.state)
 
     @property
+    def parameter_names(self) -> list[str]:
+        """One a parameter of the current simulator; theta_1, ... where it has none."""
+        num = parameter_dim(self.prior)
+        names = self._declared("parameter_names")
+        if names is None or len(names) != num:
+            return names_of(self.belief, num)
+        return [*names]
+
+    @property
+    def channel_names(self) -> list[str] | None:
+        """One an entry of the outcome's last axis, where the simulator names them."""
+        names = self._declared("channel_names")
+        return None if names is None else [*names]
+
+    def _declared(self, what: str) -> Sequence[str] | None:
+        """Return names that the simulator has, or had where it is not given."""
+        disk = self._storage.disk
+        if self.simulator is None and disk is not None:
+            return disk.manifest[what]
+        return getattr(self.simulator, what, None)
+
+    @property
     def history(self) -> Sequence[Trial]:
         """The trials that were told, in order."""
         return tuple(t for t in self.state.trials if t.status != "pending")
@@ -102,4 +129,21 @@ class CampaignView:
         design = None if self.pending is None else self.pending.design
         return self.state.options.stop.reason(
             self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
+        )
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table, a row a trial, a pending one too.
+
+        Columns: status and target; the entries of the action, with their units; the
+        numbers of the outcome, or an array "x" where they are more than 16; those of
+        :class:`.Trial` by their names there; "expected_information" of the action and
+        "expected_information_error", its standard error, in nats; "health" when the
+        trial had been used, missing where it was not; "seconds" and "cpu_seconds" over all
+        stages. The index is the trial's. Units stand in ``attrs["units"]``.
+        """
+        return to_dataframe(
+            self.state,
+            self.actions,
+            parameter_names=self.parameter_names,
+            channel_names=self.channel_names,
         )
