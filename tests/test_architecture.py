@@ -19,6 +19,7 @@ MOST_LINES = 400  # of a file
 FLOORS = (
     "seeding",
     "threads",
+    "notebook",
     "arviz_versions",
     "actions",
     "simulation.noise",
@@ -50,6 +51,7 @@ FLOORS = (
     "criticism.report",
     "criticism",
     "campaign.stopping",
+    "campaign.display.html",
     "campaign.state",
     "campaign.checks",
     "campaign.display",

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from sbi_active.campaign.display.html import trial_html
 from sbi_active.campaign.stopping import StopRules
 from sbi_active.design.designer import Design
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
@@ -229,6 +230,9 @@ class Trial:
     cpu_seconds: dict[str, float] = field(default_factory=dict)
     num_simulations: int = 0
     num_missing: int = 0
+
+    def _repr_html_(self) -> str:
+        return trial_html(self)
 
     @property
     def is_measured(self) -> bool:

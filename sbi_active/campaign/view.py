@@ -10,6 +10,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.display.frame import to_dataframe
+from sbi_active.campaign.display.html import campaign_html
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
 from sbi_active.seeding import derive_seed
@@ -42,6 +43,9 @@ class CampaignView:
             f"Campaign({self.state.method}, {done} trials"
             f"{', one pending' if pending else ''})"
         )
+
+    def _repr_html_(self) -> str:
+        return campaign_html(self)
 
     @property
     def belief(self) -> Distribution:
@@ -138,8 +142,8 @@ class CampaignView:
         numbers of the outcome, or an array "x" where they are more than 16; those of
         :class:`.Trial` by their names there; "expected_information" of the action and
         "expected_information_error", its standard error, in nats; "health" when the
-        trial had been used, missing where it was not; "seconds" and "cpu_seconds" over all
-        stages. The index is the trial's. Units stand in ``attrs["units"]``.
+        trial had been used, missing where it was not; "seconds" and "cpu_seconds" over
+        all stages. The index is the trial's. Units stand in ``attrs["units"]``.
         """
         return to_dataframe(
             self.state,

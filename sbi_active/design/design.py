@@ -9,10 +9,14 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
+from sbi_active.design.drawing import draw, labels_of
 from sbi_active.information_gain.base import Bound
+from sbi_active.notebook import Markup, card, facts, items, number, table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+MOST_SHOWN = 5  # candidates in a notebook, the best ones
 
 __all__ = ["Design", "action_labels", "action_name", "are_categories"]
 
@@ -102,6 +106,30 @@ class Design:
         error = float(self.standard_error[self.index])
         return f"Design(action [{action}], EIG {gain:.2f} +- {error:.2f} nats)"
 
+    def _repr_html_(self) -> str:
+        gain, error = self.expected_information_gain, self.standard_error
+        best = gain.nan_to_num(nan=-torch.inf).argsort(descending=True, stable=True)
+        rows = [
+            [
+                Markup("<b>chosen</b>") if k == self.index else "",
+                *[f"{v:.4g}" for v in self.candidates[k].tolist()],
+                number(float(gain[k])),
+                number(float(error[k])),
+                number(float(self.probability_best[k])),
+            ]
+            for k in dict.fromkeys([self.index, *best[:MOST_SHOWN].tolist()])
+        ]
+        ends = ("EIG [nats]", "standard error", "probability best")
+        header = ["", *labels_of(self), *ends]
+        left = len(gain) - len(rows)
+        pairs = [
+            ("estimator", self.estimator if self.estimator != "none" else None),
+            ("side of the estimates", self.bound if self.bound != "none" else None),
+            ("simulations", self.num_simulations or None),
+            ("further candidates", left or None),
+        ]
+        return card(repr(self), table(header, rows), facts(pairs), items(self.notes))
+
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the expected information gain of the candidates.
 
@@ -117,8 +145,6 @@ class Design:
             The axes; where there are several panels the ones around them, whose
             ``child_axes`` they are.
         """
-        from sbi_active.design.drawing import draw
-
         return draw(self, ax)
 
 

@@ -16,6 +16,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.notebook import card, parameters
 from sbi_active.seeding import forked_generators
 
 __all__ = [
@@ -36,6 +37,7 @@ NUM_DRAWS = 20_000
 MINIMAL_ACCEPTANCE = 1e-3
 #: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
 FEWEST_STEPS = 64
+NUM_SHOWN = 2_000  # draws behind the page of a notebook
 NUM_COMPARED = 5_000  # draws behind a realized information gain
 
 
@@ -147,6 +149,14 @@ class Belief(Distribution, ABC):
         rows = zip(names, mean, sd, strict=True)
         cells = [f"{name}{m:.3g} +- {s:.2g}" for name, m, s in rows]
         return f"{type(self).__name__}({self.label}: {', '.join(cells)})"
+
+    def _repr_html_(self) -> str:
+        draws = self.quick_sample(NUM_SHOWN, seed=0)
+        return card(
+            f"Belief: {self.label}",
+            parameters(names_of(self, draws.shape[1]), draws),
+            self.diagnostics._repr_html_(),
+        )
 
 
 class ChainedBelief(Belief):
