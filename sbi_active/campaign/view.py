@@ -9,6 +9,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.health import Health, assess
+from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.frame import to_dataframe
 from sbi_active.campaign.display.html import campaign_html
 from sbi_active.campaign.state import CampaignState, Trial
@@ -16,7 +17,9 @@ from sbi_active.inference.beliefs.belief import names_of, parameter_dim
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
+    from torch import Tensor
 
     from sbi_active.criticism import Effect
 
@@ -150,4 +153,31 @@ class CampaignView:
             self.actions,
             parameter_names=self.parameter_names,
             channel_names=self.channel_names,
+        )
+
+    def plot(
+        self, *, theta_true: Tensor | None = None, num_predicted: int = 64
+    ) -> Figure:
+        """Draw the campaign so far, in one figure.
+
+        The belief of each parameter by round; what each action was expected to tell,
+        the last map where actions have several entries; each outcome with what the
+        belief before it predicted; what each trial was expected to tell and told, under
+        a watch or an alarm in another color.
+
+        Args:
+            theta_true: The truth where it is known, shape (theta_dim,).
+            num_predicted: Simulations of each trial behind the predictions; with 0, or
+                without the simulator, the surprise of each trial takes their place.
+
+        Raises:
+            ValueError: If ``theta_true`` has more numbers than there are parameters.
+        """
+        return plot_campaign(
+            self.state,
+            None if self.simulator is None else self._learner.at,
+            self.prior,
+            parameter_names=self.parameter_names,
+            theta_true=theta_true,
+            num_predicted=num_predicted,
         )
