@@ -125,6 +125,7 @@ def _split(ax: Axes, num: int, *, has_colors: bool) -> list[Axes]:
 
 def _outer_labels(panel: Axes, k: int, columns: int, num: int) -> None:
     panel.tick_params(labelsize=8)
+    panel.locator_params(axis="x", nbins=4)
     if k % columns:
         panel.set_ylabel("")
         panel.set_yticklabels([])

@@ -68,7 +68,7 @@ def plot_campaign(
     columns = min(max(len(shown), 2), 4 if len(shown) <= 12 else 5)
     rows = -(-len(shown) // columns)
     high = 2.0 * rows if rows > 1 else 2.7
-    figure = plt.figure(figsize=(12, high + 3.6), layout="constrained")
+    figure: Any = plt.figure(figsize=(12, high + 3.6), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=[high, 3.6])
     panels = upper.subplots(rows, columns, squeeze=False)
     beliefs = _quantiles(state, prior, len(parameter_names))
@@ -144,11 +144,13 @@ def _belief(
     room = 0.08 * (ends[1] - ends[0]) or 1e-6 + 0.01 * abs(ends[0])
     ax.set_ylim(ends[0] - room, ends[1] + room)
     last = levels[-1]
-    numbers = f"{last[2]:.3g} ({last[0]:.3g} to {last[4]:.3g})"
+    digits = _digits(last[2], last[4] - last[0])
+    middle, low, high = (f"{v:.{digits}g}" for v in last[[2, 0, 4]])
+    numbers = f"{middle} ({low} to {high})"
     ax.set_title(f"{_cut(name)}\n{numbers}", fontsize=8)
-    ax.yaxis.get_major_locator().set_params(nbins=5)
+    ax.locator_params(axis="y", nbins=5)
     ax.tick_params(labelsize=8)
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.locator_params(axis="x", integer=True)
 
 
 def _gain_by_action(ax: Axes, state: CampaignState) -> None:
@@ -252,7 +254,8 @@ def _surprises(ax: Axes, state: CampaignState) -> None:
     """Draw the tail probabilities, which rest on simulations of then."""
     known = [t for t in state.trials if t.surprise is not None]
     ax.set_title("surprise, uniform where the simulator is right", fontsize=10)
-    ax.plot([t.index for t in known], [t.surprise for t in known], "o", color="C0")
+    surprises = np.array([t.surprise for t in known], dtype=float)
+    ax.plot([t.index for t in known], surprises, "o", color="C0")
     ax.set(ylim=(-0.03, 1.03), ylabel="tail probability of the outcome")
 
 
@@ -281,5 +284,17 @@ def _information(ax: Axes, state: CampaignState) -> None:
     ax.set(xlabel="trial", ylabel="information [nats]")
 
 
+def _digits(value: float, width: float) -> int:
+    """Return the digits at which a number shows where in an interval it lies.
+
+    Example:
+        >>> _digits(0.1, 0.5), _digits(150.0, 1.0)
+        (3, 5)
+    """
+    if not (np.isfinite(value) and width > 0):
+        return 3
+    return int(np.clip(np.ceil(np.log10(max(abs(value) / width, 1e-9))) + 2, 3, 5))
+
+
 def _cut(name: str) -> str:
-    return name if len(name) <= 24 else f"{name[:23]}…"
+    return name if len(name) <= 24 else f"{name[:12]}…{name[-11:]}"

@@ -139,10 +139,9 @@ def to_html(report: Contents) -> str:
 def to_notebook(report: Contents) -> str:
     """Return the verdict, the error before and after, and the warnings, small."""
     scored = report.before_after
-    rows = [
-        (row.metric, number(row.before), number(row.after), number(row.ratio))
-        for row in scored.itertuples()
-    ]
+    names, columns = [*scored["metric"]], ["before", "after", "ratio"]
+    values = scored[columns].to_numpy(dtype=float)
+    rows = [(n, *map(number, row)) for n, row in zip(names, values, strict=True)]
     likely = sorted(report.probabilities.items(), key=lambda item: -item[1])[:5]
     return card(
         verdict_line(report),
