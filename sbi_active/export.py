@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arviz_versions import inference_data
+from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
@@ -35,7 +36,8 @@ def to_inference_data(
 
     Args:
         source: A belief or a campaign.
-        parameter_names: One a parameter; None takes the simulator's, else theta_1, ...
+        parameter_names: One a parameter; None takes the simulator's, which beliefs
+            remember, else theta_1, ...
         num_samples: Draws.
         seed: Of the draws.
 
@@ -56,7 +58,7 @@ def to_inference_data(
     if parameter_names is None and campaign is not None:
         parameter_names = getattr(campaign.simulator, "parameter_names", None)
     if parameter_names is None:
-        parameter_names = [f"theta_{i + 1}" for i in range(theta.shape[1])]
+        parameter_names = names_of(belief, theta.shape[1])
     if len(parameter_names) != theta.shape[1]:
         raise ValueError(
             f"expected {theta.shape[1]} parameter names; got {[*parameter_names]}; "

@@ -94,6 +94,18 @@ def test_closing_the_loop(run, capsys):
     assert ((belief.mean - truth).abs() < 4 * belief.variance.sqrt()).all()
 
 
+def test_seeing(run, capsys, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    (page,) = run("docs/seeing.md")
+    assert "speed [m/s]  distance  information_gained health" in capsys.readouterr().out
+    assert len(page.table) == 4
+    for name in ("campaign.png", "design.png"):
+        assert Path(name).stat().st_size > 10_000
+    belief = page.campaign.belief
+    assert belief.parameter_names == ("friction", "loss")
+    assert ((belief.mean - page.truth).abs() < 4 * belief.variance.sqrt()).all()
+
+
 def test_no_page_is_forgotten():
     pages = {
         page.name
@@ -104,5 +116,6 @@ def test_no_page_is_forgotten():
         "README.md",
         "simulations.md",
         "methods.md",
+        "seeing.md",
         "closing_the_loop.md",
     }

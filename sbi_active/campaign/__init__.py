@@ -5,7 +5,8 @@ designs or criticizes lives in the packages it calls.
 """
 
 from sbi_active.campaign.campaign import Campaign
-from sbi_active.campaign.state import CampaignOptions, Trial
+from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.state import Trial
 from sbi_active.campaign.stopping import StopRules
 from sbi_active.renamed import former_names
 

@@ -14,17 +14,16 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
+from sbi_active.campaign.display.progress import StageWatch, rounds
 from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import METHODS, find_method
 from sbi_active.campaign.learning.planner import Planner
 from sbi_active.campaign.learning.revision import criticize, recompute, revise
-from sbi_active.campaign.state import (
-    CampaignOptions,
-    CampaignState,
-    Trial,
-)
+from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.storage.manifest import new_manifest, write_manifest
@@ -70,6 +69,8 @@ class Campaign(CampaignTrials):
             ends the process, :meth:`load` goes on. None keeps it in memory alone.
         on_trial: Called with each trial that was told, once it is recorded.
         on_update: Called with each trial, once the belief contains it.
+        show_progress: Draw a bar of what is being done, and of the rounds of
+            :meth:`run`. The logger "sbi_active" says it of all that takes 2 s anyway.
 
     Raises:
         ValueError: If the method is unknown, the prior has no support, or no width that
@@ -110,12 +111,14 @@ class Campaign(CampaignTrials):
         directory: str | os.PathLike[str] | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         on_update: Callable[[Trial], None] | None = None,
+        show_progress: bool = False,
     ) -> None:
         find_method(method)  # an unknown name is an error here
         actions, options = action_space(actions), CampaignOptions.of(options)
         state = CampaignState(method, seed, options, num_earlier=num_rows(options.bank))
         learner = Learner(simulator, prior, actions, state)
         limits = Limits(actions, constraint, cost)
+        state.watch = StageWatch(show_progress)
         self._begin(state, actions, learner, Planner(limits, state, effects))
         self.on_trial, self.on_update = on_trial, on_update
         disk = None
@@ -155,6 +158,7 @@ class Campaign(CampaignTrials):
         options: CampaignOptions | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         on_update: Callable[[Trial], None] | None = None,
+        show_progress: bool = False,
         simulator_changed: bool = False,
         repair: bool = False,
     ) -> Campaign:
@@ -178,6 +182,7 @@ class Campaign(CampaignTrials):
                 own. Sizes may be others than before.
             on_trial: As in the constructor.
             on_update: As in the constructor.
+            show_progress: As in the constructor.
             simulator_changed: Take another simulator than the campaign was made with,
                 and compute everything again with it.
             repair: Give up what is damaged. The files before are kept beside, and a
@@ -204,6 +209,7 @@ class Campaign(CampaignTrials):
         known = found.disk.manifest["effects"]
         declared = [effect for effect in effects if effect.name in known]
         planner = Planner(limits, found.state, declared)
+        found.state.watch = StageWatch(show_progress)
         self._begin(found.state, found.actions, found.learner, planner)
         self.on_trial, self.on_update = on_trial, on_update
         self._storage = Storage(found.disk, found.state.options.bank)
@@ -291,6 +297,8 @@ class Campaign(CampaignTrials):
                     learner.score(trial)
                 learner.learn(state.trials[trial.index])
             state.processed.append(trial.index)
+            if trial.is_measured:
+                keep_draws(state, learner.belief)
             self._storage.save(state, learner)
             if self.on_update is not None:
                 self.on_update(state.trials[trial.index])
@@ -319,7 +327,7 @@ class Campaign(CampaignTrials):
         Returns:
             The belief after the last trial.
         """
-        for _ in range(num_rounds):
+        for _ in rounds(self.state, num_rounds):
             if self.stop_reason is not None:
                 break
             index = self.ask().index

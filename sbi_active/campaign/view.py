@@ -11,12 +11,19 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.health import Health, assess
+from sbi_active.campaign.display.figures import plot_campaign
+from sbi_active.campaign.display.frame import to_dataframe
+from sbi_active.campaign.display.html import campaign_html
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
-from sbi_active.inference.beliefs.belief import parameter_dim
+from sbi_active.inference.beliefs.belief import names_of, parameter_dim
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+    from torch import Tensor
+
     from sbi_active.criticism import Effect
 
 __all__ = ["CampaignView"]
@@ -42,6 +49,9 @@ class CampaignView:
             f"Campaign({self.state.method}, {done} trials"
             f"{', one pending' if pending else ''})"
         )
+
+    def _repr_html_(self) -> str:
+        return campaign_html(self)
 
     @property
     def belief(self) -> Distribution:
@@ -85,16 +95,6 @@ class CampaignView:
         """Shape of an outcome."""
         return self._learner.x_shape
 
-    @property
-    def parameter_names(self) -> list[str]:
-        """One a parameter: the simulator's, else theta_1, ..."""
-        names = getattr(self.simulator, "parameter_names", None)
-        if names is None:
-            names = getattr(self._learner, "parameter_names", None)
-        if names is None:
-            names = [f"theta_{k + 1}" for k in range(parameter_dim(self.prior))]
-        return [*names]
-
     def contains(self, trial: Trial) -> bool:
         """Return whether the belief takes account of a trial as it is recorded now."""
         return trial.index in self.state.processed and not self.state.is_stale
@@ -108,6 +108,28 @@ class CampaignView:
         and wrong: do :meth:`criticize`.
         """
         return assess(self.state)
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """One a parameter of the current simulator; theta_1, ... where it has none."""
+        num = parameter_dim(self.prior)
+        names = self._declared("parameter_names")
+        if names is None or len(names) != num:
+            return names_of(self.belief, num)
+        return [*names]
+
+    @property
+    def channel_names(self) -> list[str] | None:
+        """One an entry of the outcome's last axis, where the simulator names them."""
+        names = self._declared("channel_names")
+        return None if names is None else [*names]
+
+    def _declared(self, what: str) -> Sequence[str] | None:
+        """Return names that the simulator has, or had where it is not given."""
+        disk = self._storage.disk
+        if self.simulator is None and disk is not None:
+            return disk.manifest[what]
+        return getattr(self.simulator, what, None)
 
     @property
     def history(self) -> Sequence[Trial]:
@@ -131,4 +153,48 @@ class CampaignView:
         design = None if self.pending is None else self.pending.design
         return self.state.options.stop.reason(
             self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
+        )
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table, a row a trial, a pending one too.
+
+        Columns: status and target; the entries of the action, with their units; the
+        numbers of the outcome, or an array "x" where they are more than 16; those of
+        :class:`.Trial` by their names there; "expected_information" of the action and
+        "expected_information_error", its standard error, in nats; "health" when the
+        trial had been used, missing where it was not; "seconds" and "cpu_seconds" over
+        all stages. The index is the trial's. Units stand in ``attrs["units"]``.
+        """
+        return to_dataframe(
+            self.state,
+            self.actions,
+            parameter_names=self.parameter_names,
+            channel_names=self.channel_names,
+        )
+
+    def plot(
+        self, *, theta_true: Tensor | None = None, num_predicted: int = 64
+    ) -> Figure:
+        """Draw the campaign so far, in one figure.
+
+        The belief of each parameter by round; what each action was expected to tell,
+        the last map where actions have several entries; each outcome with what the
+        belief before it predicted; what each trial was expected to tell and told, under
+        a watch or an alarm in another color.
+
+        Args:
+            theta_true: The truth where it is known, shape (theta_dim,).
+            num_predicted: Simulations of each trial behind the predictions; with 0, or
+                without the simulator, the surprise of each trial takes their place.
+
+        Raises:
+            ValueError: If ``theta_true`` has more numbers than there are parameters.
+        """
+        return plot_campaign(
+            self.state,
+            None if self.simulator is None else self._learner.at,
+            self.prior,
+            parameter_names=self.parameter_names,
+            theta_true=theta_true,
+            num_predicted=num_predicted,
         )

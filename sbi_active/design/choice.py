@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
-from sbi_active.design.design import Design, action_name
+from sbi_active.design.design import Design, action_labels, action_name, are_categories
 from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.information_gain.base import Bound
@@ -67,6 +67,8 @@ def choose(
         index=chosen,
         num_simulations=num_simulations,
         name=action_name(limits.actions),
+        labels=action_labels(limits.actions),
+        categorical=are_categories(limits.actions),
         estimator=estimator,
         num_samples=estimates.num_samples,
         stopped=estimates.stopped,

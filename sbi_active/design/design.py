@@ -9,12 +9,16 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
+from sbi_active.design.drawing import draw, labels_of
 from sbi_active.information_gain.base import Bound
+from sbi_active.notebook import Markup, card, facts, items, number, table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Design", "action_name"]
+MOST_SHOWN = 5  # candidates in a notebook, the best ones
+
+__all__ = ["Design", "action_labels", "action_name", "are_categories"]
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class Design:
         index: Which candidate was chosen.
         num_simulations: Simulations spent.
         name: Name of the action, with its unit.
+        labels: Names of its entries, with their units.
+        categorical: Which entries are those of a list beside a space without end.
         estimator: Class that estimated.
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.
@@ -73,6 +79,8 @@ class Design:
     notes: tuple[str, ...] = ()
     cost: Tensor | None = None
     steps: tuple[Design, ...] = ()
+    labels: tuple[str, ...] = ()
+    categorical: tuple[bool, ...] = ()
 
     @property
     def utility(self) -> Tensor:
@@ -98,32 +106,46 @@ class Design:
         error = float(self.standard_error[self.index])
         return f"Design(action [{action}], EIG {gain:.2f} +- {error:.2f} nats)"
 
+    def _repr_html_(self) -> str:
+        gain, error = self.expected_information_gain, self.standard_error
+        best = gain.nan_to_num(nan=-torch.inf).argsort(descending=True, stable=True)
+        rows = [
+            [
+                Markup("<b>chosen</b>") if k == self.index else "",
+                *[f"{v:.4g}" for v in self.candidates[k].tolist()],
+                number(float(gain[k])),
+                number(float(error[k])),
+                number(float(self.probability_best[k])),
+            ]
+            for k in dict.fromkeys([self.index, *best[:MOST_SHOWN].tolist()])
+        ]
+        ends = ("EIG [nats]", "standard error", "probability best")
+        header = ["", *labels_of(self), *ends]
+        left = len(gain) - len(rows)
+        pairs = [
+            ("estimator", self.estimator if self.estimator != "none" else None),
+            ("side of the estimates", self.bound if self.bound != "none" else None),
+            ("simulations", self.num_simulations or None),
+            ("further candidates", left or None),
+        ]
+        return card(repr(self), table(header, rows), facts(pairs), items(self.notes))
+
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Plot the expected information gain of the candidates with two errors.
+        """Plot the expected information gain of the candidates.
+
+        Over one entry of the action with two standard errors; over two as a map with
+        the candidates that were evaluated; over more as the best of them in order.
+        Entries of a list beside a space without end have a panel for each of their
+        values.
 
         Args:
             ax: Where to draw; None makes a figure.
 
         Returns:
-            The axes.
+            The axes; where there are several panels the ones around them, whose
+            ``child_axes`` they are.
         """
-        import matplotlib.pyplot as plt
-
-        ax = plt.subplots()[1] if ax is None else ax
-        scalar = self.candidates.shape[1] == 1
-        place = self.candidates[:, 0] if scalar else torch.arange(len(self.candidates))
-        order = place.argsort()
-        gain, error = (
-            part[order].numpy()
-            for part in (self.expected_information_gain, self.standard_error)
-        )
-        ax.errorbar(place[order].numpy(), gain, 2 * error, fmt="o-", ms=4, capsize=2)
-        ax.axvline(float(place[self.index]), ls=":", color="k", label="chosen")
-        ax.set_xlabel(self.name if scalar else "candidate")
-        note = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}
-        ax.set_ylabel(f"EIG{note[self.bound]} [nats]")
-        ax.legend()
-        return ax
+        return draw(self, ax)
 
 
 def action_name(actions: ActionSpace) -> str:
@@ -132,3 +154,16 @@ def action_name(actions: ActionSpace) -> str:
         return "action"
     unit = actions.units[0]
     return actions.names[0] + (f" [{unit}]" if unit else "")
+
+
+def action_labels(actions: ActionSpace) -> tuple[str, ...]:
+    """Return the names of an action's entries with their units."""
+    pairs = zip(actions.names, actions.units, strict=True)
+    return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
+
+
+def are_categories(actions: ActionSpace) -> tuple[bool, ...]:
+    """Return which entries of an action are of a list, where others have no end."""
+    listed = [(part.listed() is not None, part.action_dim) for part in actions.parts()]
+    mixed = len({is_listed for is_listed, _ in listed}) > 1
+    return tuple(mixed and is_listed for is_listed, dim in listed for _ in range(dim))

@@ -315,7 +315,7 @@ def test_plot_names_the_action():
     assert ax.get_xlabel() == "push [m/s]"
     assert ax.get_ylabel() == "EIG (lower bound) [nats]"
     pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]])
-    assert RandomDesigner(pairs).select(seed=0).plot().get_xlabel() == "candidate"
+    assert RandomDesigner(pairs).select(seed=0).plot().get_xlabel() == "action_1"
 
 
 def test_errors():

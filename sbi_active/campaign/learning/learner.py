@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.checks.misfit import error_nats, misfit
 from sbi_active.campaign.checks.score import score_outcome
 from sbi_active.campaign.checks.unexplained import (
     doubts,
@@ -33,12 +34,12 @@ from sbi_active.campaign.learning.round_model import RoundModel
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import (
     information_gained,
+    named,
     require_support,
     require_width,
 )
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.models.posterior import ActionPosterior
-from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.seeding import derive_seed, forked_generators
@@ -137,7 +138,7 @@ class Learner:
         """The belief after the trials learned so far; the prior before any."""
         belief = self._inference.belief
         assert belief is not None
-        return belief
+        return named(belief, self.simulator)
 
     @property
     def stated_belief(self) -> Distribution:
@@ -146,7 +147,8 @@ class Learner:
         if self._state.is_stale:
             texts.append("a trial was corrected since: update() computes it again")
         if self._stated is None or self._stated[:2] != (belief, texts):
-            self._stated = belief, texts, in_doubt(belief, self.prior, texts)
+            marked = named(in_doubt(belief, self.prior, texts), self.simulator)
+            self._stated = belief, texts, marked
         return self._stated[2]
 
     def at(self, index: int) -> Callable[..., Any]:
@@ -172,7 +174,7 @@ class Learner:
             score.num_simulations,
             score.num_missing,
             surprise=score.surprise,
-            belief_error=_error(getattr(self.belief, "diagnostics", Diagnostics())),
+            belief_error=error_nats(getattr(self.belief, "diagnostics", Diagnostics())),
             log_score=score.log_score,
             version=state.version.number,
         )
@@ -384,24 +386,3 @@ class Learner:
             workers=self._state.options.workers,
         )
         return rows.x.shape[1:]
-
-
-def misfit(diagnostics: Diagnostics) -> float | None:
-    """Return a belief's tail probability, of all trials or the worst, both counted.
-
-    Args:
-        diagnostics: Of the belief; without tail probabilities there is none, nor where
-            it is off by more than a test of the simulator can bear.
-    """
-    each, joint = diagnostics.tail_probability_of_trial, diagnostics.tail_probability
-    if joint is None or _error(diagnostics) > LARGE:
-        return None
-    return min(1.0, 2 * min(joint, len(each) * min(each)))
-
-
-def _error(diagnostics: Diagnostics) -> float:
-    """Return the nats that a belief is off as its simulations are few, 0 if unknown."""
-    modes = diagnostics.assumptions.get("few_modes")
-    if modes is not None and not modes.holds:
-        return math.inf  # whatever the other figures say of those that were found
-    return diagnostics.error_nats_if_explained or 0.0

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch.distributions import Distribution
 
-from sbi_active.campaign.state import CampaignOptions
+from sbi_active.campaign.options import CampaignOptions
 from sbi_active.inference import (
     ALHI,
     ASBI,

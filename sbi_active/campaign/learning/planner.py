@@ -14,7 +14,7 @@ from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.design.design import Design, action_name
+from sbi_active.design.design import Design, action_labels, action_name, are_categories
 from sbi_active.design.designer import InformationGainDesigner, RandomDesigner
 from sbi_active.information_gain.estimators.automatic import ESTIMATORS
 from sbi_active.seeding import derive_seed
@@ -225,6 +225,8 @@ def _model_design(
         index=index,
         num_simulations=criticism.rivals.simulator.num_simulations - spent,
         name=action_name(limits.actions),
+        labels=action_labels(limits.actions),
+        categorical=are_categories(limits.actions),
         estimator="ModelIndexGain",
         stopped="budget spent",
         notes=(f"about which is right: {', '.join(found.separates)}",),

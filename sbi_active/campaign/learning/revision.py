@@ -11,6 +11,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.seeding import derive_seed
@@ -79,11 +80,12 @@ def criticize(
         designed: Whether the actions were chosen for information.
     """
     examined = state.version.examined
-    report = criticism.report(
-        evaluate=evaluate,
-        designed=designed,
-        exploratory=any(d != criticism.digest for d in examined),
-    )
+    with state.watch(state, len(state.trials), "criticism"):
+        report = criticism.report(
+            evaluate=evaluate,
+            designed=designed,
+            exploratory=any(d != criticism.digest for d in examined),
+        )
     state.examined(criticism.digest)
     return report
 
@@ -127,11 +129,13 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     state.versions.append(version)
     try:
         revised = Learner(report.simulator, report.prior, actions, state)
-        misfit = revised.infer(state.measured)
+        with state.watch(state, len(state.trials), "inference from all trials"):
+            misfit = revised.infer(state.measured)
     except BaseException:
         state.versions.pop()
         raise
     state.versions[-1] = replace(version, misfit=misfit)
+    keep_draws(state, revised.belief)
     return revised
 
 
@@ -184,13 +188,16 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     """
     version = state.version
     state.processed.clear()
+    state.draws.clear()
     for trial in state.trials:
         if trial.status != "pending":
             state.unscore(trial.index)
     learner.restart()
     if version.trials:
         before = [t for i in version.trials if (t := state.trials[i]).is_measured]
-        misfit = learner.infer(before)
+        with state.watch(state, len(state.trials), "inference from all trials"):
+            misfit = learner.infer(before)
         state.versions[-1] = replace(version, misfit=misfit)
         state.processed.extend(version.trials)
+        keep_draws(state, learner.belief)
     state.is_stale = False

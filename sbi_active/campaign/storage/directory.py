@@ -104,6 +104,7 @@ class CampaignDirectory:
             "lines": len(self._log),
             "trials": state.trials,
             "processed": state.processed,
+            "draws": state.draws,
             "versions": state.versions,
             "is_stale": state.is_stale,
             "belief": name,
@@ -129,6 +130,7 @@ class CampaignDirectory:
             lines, name = saved["lines"], saved["belief"]
             state.trials[:] = saved["trials"]
             state.processed[:] = saved["processed"]
+            state.draws |= saved.get("draws", {})  # earlier files have none
             state.versions[:] = saved["versions"]
             state.is_stale = saved["is_stale"]
         for entry in self._log.entries[lines:]:

@@ -16,7 +16,8 @@ from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.unexplained import doubts, in_doubt
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.revision import rebuilt
-from sbi_active.campaign.state import CampaignOptions, CampaignState
+from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent
 from sbi_active.campaign.storage.described import (
     actions_from,

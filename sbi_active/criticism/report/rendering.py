@@ -19,12 +19,13 @@ from sbi_active.criticism.report.figures import (
 from sbi_active.criticism.report.headline import added, verdict_line
 from sbi_active.criticism.report.section import Section
 from sbi_active.criticism.report.sections import sections
+from sbi_active.notebook import card, items, number, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-__all__ = ["figures", "to_html", "to_markdown", "to_text"]
+__all__ = ["figures", "to_html", "to_markdown", "to_notebook", "to_text"]
 
 WIDTH = 88  # of lines of text; tables are as wide as they are
 CAPTIONS = {
@@ -133,6 +134,24 @@ def to_html(report: Contents) -> str:
                 f"<figcaption>{e(caption)}</figcaption></figure>"
             )
     return "\n".join([*parts, "</body>\n</html>\n"]).replace(" +- ", " &plusmn; ")
+
+
+def to_notebook(report: Contents) -> str:
+    """Return the verdict, the error before and after, and the warnings, small."""
+    scored = report.before_after
+    names, columns = [*scored["metric"]], ["before", "after", "ratio"]
+    values = scored[columns].to_numpy(dtype=float)
+    rows = [(n, *map(number, row)) for n, row in zip(names, values, strict=True)]
+    likely = sorted(report.probabilities.items(), key=lambda item: -item[1])[:5]
+    return card(
+        verdict_line(report),
+        f"<p>{html.escape(first_paragraph(report))}</p>",
+        table(("model", "probability"), [(n, f"{p:.2f}") for n, p in likely]),
+        table(("metric", "before", "after", "ratio or difference"), rows)
+        if rows
+        else "",
+        items(report.warnings),
+    )
 
 
 def _html_table(section: Section) -> str:

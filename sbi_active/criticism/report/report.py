@@ -31,6 +31,9 @@ class Report(Contents):
     def __repr__(self) -> str:
         return f"Report({verdict_line(self)!r})"
 
+    def _repr_html_(self) -> str:
+        return rendering.to_notebook(self)
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Effects are lambdas and local functions as a rule, which pickle refuses.
         parts = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -16,6 +16,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.notebook import card, parameters
 from sbi_active.seeding import forked_generators
 
 __all__ = [
@@ -23,6 +24,8 @@ __all__ = [
     "ChainedBelief",
     "UnchangedBelief",
     "information_gained",
+    "named",
+    "names_of",
     "parameter_dim",
     "require_support",
     "require_width",
@@ -34,6 +37,7 @@ NUM_DRAWS = 20_000
 MINIMAL_ACCEPTANCE = 1e-3
 #: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
 FEWEST_STEPS = 64
+NUM_SHOWN = 2_000  # draws behind the page of a notebook
 NUM_COMPARED = 5_000  # draws behind a realized information gain
 
 
@@ -50,11 +54,13 @@ class Belief(Distribution, ABC):
     Attributes:
         prior: The original prior.
         label: How the belief was made, for reports.
+        parameter_names: One a parameter, where the simulator names them; else None.
         diagnostics: What is known of its quality.
     """
 
     arg_constraints = {}  # pyright: ignore
     label: str = "belief"
+    parameter_names: tuple[str, ...] | None = None
 
     def __init__(self, prior: Distribution) -> None:
         dim = parameter_dim(prior)
@@ -80,6 +86,24 @@ class Belief(Distribution, ABC):
         shape = torch.Size(sample_shape)
         with torch.no_grad():
             return self._sample(shape.numel()).float().reshape(*shape, -1)
+
+    def quick_sample(self, num_samples: int, *, seed: int) -> Tensor:
+        """Return draws for a picture, at no cost worth a word.
+
+        They are those of :meth:`sample` but for beliefs whose draws take long.
+
+        Args:
+            num_samples: Number of draws n.
+            seed: Of the draws.
+
+        Returns:
+            Shape (n, theta_dim), float32.
+        """
+        with forked_generators(seed), torch.no_grad():
+            return self._quick_sample(num_samples).float()
+
+    def _quick_sample(self, num_samples: int) -> Tensor:
+        return self._sample(num_samples)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, (..., theta_dim) -> (...); -inf off the support."""
@@ -121,8 +145,18 @@ class Belief(Distribution, ABC):
 
     def __repr__(self) -> str:
         mean, sd = self.mean.tolist(), self.variance.sqrt().tolist()
-        cells = [f"{m:.3g} +- {s:.2g}" for m, s in zip(mean, sd, strict=True)]
+        names = [f"{name} " for name in self.parameter_names or ()] or [""] * len(mean)
+        rows = zip(names, mean, sd, strict=True)
+        cells = [f"{name}{m:.3g} +- {s:.2g}" for name, m, s in rows]
         return f"{type(self).__name__}({self.label}: {', '.join(cells)})"
+
+    def _repr_html_(self) -> str:
+        draws = self.quick_sample(NUM_SHOWN, seed=0)
+        return card(
+            f"Belief: {self.label}",
+            parameters(names_of(self, draws.shape[1]), draws),
+            self.diagnostics._repr_html_(),
+        )
 
 
 class ChainedBelief(Belief):
@@ -236,6 +270,36 @@ def information_gained(
         getattr(b, "smooth_log_prob", b.log_prob)(theta) for b in (belief, previous)
     )
     return float((after.double() - before.double()).mean())
+
+
+def named(belief: Distribution, simulator: Any) -> Distribution:
+    """Return a belief that knows the names of a simulator's parameters.
+
+    Args:
+        belief: Changed in place, unless it is a distribution of the user's.
+        simulator: One with or without ``parameter_names``.
+    """
+    names = getattr(simulator, "parameter_names", None)
+    if not isinstance(belief, Belief) or names is None:
+        return belief
+    if len(names) == belief.event_shape[0]:
+        belief.parameter_names = (*names,)
+    return belief
+
+
+def names_of(belief: Distribution, num: int) -> list[str]:
+    """Return the names of a belief's parameters, theta_1, ... where it has none.
+
+    Args:
+        belief: The belief, or a prior.
+        num: Of its parameters.
+
+    Example:
+        >>> names_of(torch.distributions.Normal(0.0, 1.0), 2)
+        ['theta_1', 'theta_2']
+    """
+    names = getattr(belief, "parameter_names", None)
+    return [f"theta_{i + 1}" for i in range(num)] if names is None else [*names]
 
 
 def parameter_dim(prior: Distribution) -> int:

@@ -8,8 +8,15 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
+from sbi_active.notebook import badge, card, facts, items, number
+
 __all__ = ["Assumption", "Diagnostics"]
 
+VERDICTS = {
+    True: ("good", "trustworthy"),
+    False: ("bad", "not trustworthy"),
+    None: ("plain", "not checked"),
+}
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -91,9 +98,8 @@ class Diagnostics:
         return {name: v for name, v in known.items() if not _is_any_of(v, empty)}
 
     def __str__(self) -> str:
-        verdicts = {True: "trustworthy", False: "not trustworthy", None: "not checked"}
-        lines = [verdicts[self.trustworthy], *(f"- {text}" for text in self.warnings)]
-        lines += [f"- {text}" for text in self.network_warnings]
+        texts = (*self.warnings, *self.network_warnings)
+        lines = [VERDICTS[self.trustworthy][1], *(f"- {text}" for text in texts)]
         broken = [name for name, a in self.assumptions.items() if not a.holds]
         if broken:
             lines.append(f"assumptions that do not hold: {', '.join(broken)}")
@@ -106,6 +112,21 @@ class Diagnostics:
         if self.tail_probability is not None:
             lines.append(f"tail probability of the trials {self.tail_probability:.2g}")
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        kind, verdict = VERDICTS[self.trustworthy]
+        broken = [name for name, a in self.assumptions.items() if not a.holds]
+        texts = (*self.warnings, *self.network_warnings)
+        effective, tail = self.effective_sample_size, self.tail_probability
+        pairs = [
+            ("assumptions that do not hold", ", ".join(broken) or None),
+            ("simulations", self.num_simulations or None),
+            ("lost of them", self.num_missing or None),
+            ("effective draws", None if effective is None else f"{effective:.0f}"),
+            ("off by [nats]", number(self.error_nats) or None),
+            ("tail probability of the trials", number(tail) or None),
+        ]
+        return card(badge(verdict, kind), items(texts), facts(pairs))
 
     def __getattr__(self, name: str) -> Any:
         figures = self.__dict__.get("figures", {})

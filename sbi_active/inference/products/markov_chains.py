@@ -50,6 +50,9 @@ class MarkovChainBelief(Belief):
     def _log_prob(self, theta: Tensor) -> Tensor:
         return self._product.log_prob(theta)
 
+    def _quick_sample(self, num_samples: int) -> Tensor:
+        return self._product._sample(num_samples)
+
     def _sample(self, num_samples: int) -> Tensor:
         vectorized = self._method == "slice_np_vectorized"
         posterior = MCMCPosterior(

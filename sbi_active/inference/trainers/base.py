@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.beliefs.belief import Belief, named
 from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.inference.rounds.rows import Observation
@@ -177,6 +177,7 @@ class ActiveInference(ABC):
     def _conclude(self, told: Told) -> Belief:
         """End the round with a belief: its network belongs to the one before."""
         self._belief = belief = self._infer(told)
+        named(belief, told.simulator)
         self.trials = [*told.trials]
         self._forget_round()
         return belief

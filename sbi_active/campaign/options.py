@@ -1,0 +1,175 @@
+"""Sizes and estimators of a campaign."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import cloudpickle
+
+from sbi_active.campaign.stopping import StopRules
+from sbi_active.inference.beliefs.kernel_belief import Bandwidth
+from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.inference.refinement.settings import RefinementOptions
+from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
+
+__all__ = ["CampaignOptions"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignOptions:
+    """Sizes and estimators of a campaign.
+
+    Attributes:
+        num_simulations: Rows a round to train on.
+        num_samples: Simulations a candidate action for the expected information gain,
+            half to choose and half to report.
+        density_estimator: What is learned: as in :class:`.ASBI` and
+            :class:`.ALHI`; for "seqbed" a classifier as in
+            :class:`.SeqBED_C`, or :class:`.LFIRE`.
+        posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
+            :class:`.ALHI`.
+        bandwidth: Of kernels, where a belief has them.
+        estimator: Of the expected information gain, as in
+            :class:`.InformationGainDesigner`; "posterior" is the paper's.
+        eliminate: Whether candidates far behind the leader get no further samples.
+        exponent: Of the choice, as in :class:`.InformationGainDesigner`; inf
+            takes the best.
+        design_on: "fresh" simulations, or those of the "training", which costs none
+            further; the estimates are then too high, the more so the fewer rows.
+        min_probability_valid: Actions that give a measurement less often are chosen
+            neither for the parameters nor at random.
+        repeat: Whether an action may be chosen again.
+        refine: Whether a belief is refined with the simulator after each trial; without
+            it, beliefs are chained as in the paper.
+        network: When a round's network is trained: "each round", so that the amortized
+            posterior is at hand and refined beliefs are compared with it; or "on
+            demand", when something asks: :attr:`.Campaign.posterior`, an estimator of
+            the information gain that rests on it, a belief that is not refined. With
+            declared noise nothing in a round does, which then takes a fraction of the
+            time (``benchmarks/cost/network.json``). Beliefs are refined without the
+            network whoever asked for it, so that asking changes nothing.
+        refinement: Settings of the refinement, whose simulations run as all others.
+        num_scored: Simulations of each executed action, from the belief before the
+            trial, that its outcome is compared with.
+        check_every: Every so many-th trial goes where none was, instead of where most
+            is to be learned about the parameters: at as many settings as parameters
+            any simulator fits, and nothing tells that it is wrong. None never checks.
+            A campaign that is given effects turns to the model by itself.
+        stop: When :meth:`.Campaign.run` ends before its last round.
+        num_workers: Of all simulations, as in :class:`.Workers`.
+        time_limit: As in :class:`.Workers`.
+        num_retries: As in :class:`.Workers`.
+        bank: Folder of simulations, which campaigns on the same simulator may share one
+            after another: what one has simulated the next reads, and its first round
+            begins with the rows of others, weighted by :func:`.reuse`. None keeps them
+            in the campaign's directory, if it has one.
+    """
+
+    num_simulations: int = 5_000
+    num_samples: int = 1_500
+    density_estimator: Any = None
+    posterior: str = "importance"
+    bandwidth: Bandwidth = "scott"
+    estimator: Any = "auto"
+    eliminate: bool = True
+    exponent: float = math.inf
+    design_on: Literal["fresh", "training"] = "fresh"
+    min_probability_valid: float = 0.0
+    repeat: bool = True
+    refine: bool = True
+    network: Literal["each round", "on demand"] = "each round"
+    refinement: RefinementOptions = RefinementOptions()
+    num_scored: int = 2_000
+    check_every: int | None = None
+    stop: StopRules = StopRules()
+    num_workers: int = 1
+    time_limit: float | None = None
+    num_retries: int = 0
+    bank: str | None = None
+
+    @property
+    def workers(self) -> Workers:
+        """Where all simulations run."""
+        return Workers(self.num_workers, self.time_limit, self.num_retries)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Builders of sbi's are local functions, which pickle refuses.
+        estimator = cloudpickle.dumps(self.density_estimator)
+        return {**vars(self), "density_estimator": estimator}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        estimator = cloudpickle.loads(state["density_estimator"])
+        vars(self).update(state, density_estimator=estimator)
+
+    @classmethod
+    def of(cls, options: Any) -> CampaignOptions:
+        """Return options as they are, or from a dict of their fields; None is default.
+
+        Raises:
+            TypeError: If they are neither, or a field has another name.
+        """
+        if options is None or isinstance(options, cls):
+            return options or cls()
+        known = {f.name for f in fields(cls)}
+        if not isinstance(options, Mapping) or not {*options} <= known:
+            raise TypeError(
+                f"expected options among {', '.join(sorted(known))}; got {options!r}; "
+                "pass CampaignOptions(...), or a dict of these"
+            )
+        return cls(**options)
+
+    @classmethod
+    def faithful(cls) -> CampaignOptions:
+        """Return the setting of the paper's numerical experiment.
+
+        Section 5.2 of Kim & Matsubara (2025): 2000 steps of batch 50, M = 1000 samples
+        to choose an action, the network's value as the next belief. The number of rows
+        a round is not given there; 10,000 reproduce the paper's level.
+        """
+        return cls(
+            num_simulations=10_000,
+            num_samples=2_000,
+            density_estimator=MixtureDensity.faithful(),
+            estimator="posterior",
+            eliminate=False,
+            refine=False,
+        )
+
+    def __post_init__(self) -> None:
+        if self.bank is not None:
+            object.__setattr__(self, "bank", os.fspath(self.bank))
+        if self.refinement.workers not in (IN_PROCESS, self.workers):
+            raise ValueError(
+                "expected the refinement's simulations to run as all others of a "
+                f"campaign, {self.workers}; got {self.refinement.workers} for them; "
+                "pass num_workers, time_limit and num_retries to CampaignOptions alone"
+            )
+        if self.num_simulations < 100:
+            raise ValueError(
+                f"expected num_simulations >= 100; got {self.num_simulations}; do use "
+                "about 5000 a round"
+            )
+        if self.design_on not in ("fresh", "training"):
+            raise ValueError(
+                "expected design_on 'fresh' or 'training'; got "
+                f"{self.design_on!r}; do choose one of these"
+            )
+        if self.network not in ("each round", "on demand"):
+            raise ValueError(
+                "expected network 'each round' or 'on demand'; got "
+                f"{self.network!r}; pass one of these"
+            )
+        if self.num_scored < 100:
+            raise ValueError(
+                f"expected num_scored >= 100; got {self.num_scored}; do use about "
+                "2000, since no tail probability is below 1 / (num_scored + 1)"
+            )
+        if self.check_every is not None and self.check_every < 1:
+            raise ValueError(
+                f"expected check_every >= 1 or None; got {self.check_every}; do use 2 "
+                "or 3 where the simulator may lack something"
+            )

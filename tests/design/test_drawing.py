@@ -1,0 +1,155 @@
+"""What the picture of a design draws, for each kind of action."""
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+
+from sbi_active import BoxActions, DiscreteActions, MixedActions
+from sbi_active.design.design import Design, action_labels, are_categories
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
+
+
+def design(actions, num=30, index=4, candidates=None, **changes):
+    rows = actions.sample((num,), seed=0) if candidates is None else candidates
+    gain = rows.double().square().sum(1)
+    error = torch.full_like(gain, 0.05)
+    made = {
+        "action": rows[index],
+        "candidates": rows,
+        "expected_information_gain": gain,
+        "standard_error": error,
+        "difference_standard_error": error,
+        "probability_best": error,
+        "probability_valid": torch.ones(len(rows)),
+        "bound": "lower",
+        "index": index,
+        "num_simulations": 30,
+        "labels": action_labels(actions),
+        "categorical": are_categories(actions),
+    }
+    return Design(**(made | changes))
+
+
+BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "tilt"], units=["m/s", ""])
+TOOLS = DiscreteActions([1.0, 2.0, 3.0], names=["tool"])
+
+
+def offsets(marks):
+    return np.asarray(marks.get_offsets())
+
+
+def map_marks(ax):
+    """Return the points of the map in the order of the candidates."""
+    (marks,) = [c for c in ax.collections if len(c.get_offsets()) > 1]
+    return marks
+
+
+def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
+    made = design(BOX)
+    ax = made.plot()
+    marks = map_marks(ax)
+    np.testing.assert_allclose(offsets(marks), made.candidates)
+    np.testing.assert_allclose(marks.get_array(), made.expected_information_gain)
+    (chosen,) = [each for each in ax.lines if each.get_label() == "chosen"]
+    np.testing.assert_allclose(chosen.get_xydata()[0], made.action)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "tilt")
+    assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
+
+
+def test_candidates_on_a_line_are_not_filled_in():
+    line = torch.linspace(0, 1, 20)
+    ax = design(BOX, candidates=torch.stack([line, 2 * line], 1)).plot()
+    assert len(ax.collections) == 1
+
+
+def test_all_of_a_batch_are_marked():
+    made = design(BOX)
+    ax = design(BOX, action=made.candidates[[1, 4]]).plot()
+    chosen = [line.get_xydata()[0] for line in ax.lines]
+    np.testing.assert_allclose(chosen, made.candidates[[1, 4]])
+
+
+@pytest.mark.parametrize("own", [BoxActions(0.0, 1.0, names=["speed"]), BOX])
+def test_each_category_has_a_panel(own):
+    made = design(MixedActions(own, TOOLS))
+    assert made.categorical == (False,) * own.action_dim + (True,)
+    ax = made.plot()
+    panels = [a for a in ax.child_axes if a.get_title()]
+    assert [p.get_title() for p in panels] == ["tool = 1", "tool = 2", "tool = 3"]
+    chosen = [p for p in panels if any(k.get_label() == "chosen" for k in p.lines)]
+    assert [p.get_title() for p in chosen] == [f"tool = {made.action[-1]:g}"]
+    seen = 0
+    for k, panel in enumerate(panels):
+        member = made.candidates[:, -1] == k + 1
+        seen += int(member.sum())
+        if own.action_dim == 2:
+            np.testing.assert_allclose(
+                offsets(map_marks(panel)), made.candidates[member][:, :2]
+            )
+        else:
+            points = np.sort(panel.lines[0].get_xdata())
+            np.testing.assert_allclose(points, made.candidates[member][:, 0].sort()[0])
+    assert seen == len(made.candidates)
+
+
+def test_of_many_categories_the_best_and_the_chosen_have_panels():
+    many = DiscreteActions(torch.arange(30.0), names=["place"])
+    actions = MixedActions(BoxActions(0.0, 1.0, names=["speed"]), many)
+    rows = torch.cat([torch.rand(60, 1), torch.arange(60.0)[:, None] % 30], 1)
+    ax = design(actions, candidates=rows, index=2).plot()
+    titles = [panel.get_title() for panel in ax.child_axes if panel.get_title()]
+    assert titles == ["place = 2", *[f"place = {k}" for k in range(19, 30)]]
+
+
+def test_a_product_of_lists_is_a_map():
+    actions = MixedActions(TOOLS, DiscreteActions([1.0, 5.0], names=["place"]))
+    made = design(actions, candidates=actions.listed())
+    assert made.categorical == (False, False)
+    np.testing.assert_allclose(offsets(map_marks(made.plot())), made.candidates)
+
+
+@pytest.mark.parametrize("dim", [3, 7])
+def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
+    actions = BoxActions([0.0] * dim, [1.0] * dim)
+    worst = int(design(actions).expected_information_gain.argmin())
+    made = design(actions, index=worst)
+    ax = made.plot()
+    widths = [bar.get_width() for bar in ax.patches]
+    assert len(widths) == 15
+    assert widths[1:] == sorted(widths[1:])
+    assert widths[-1] == pytest.approx(float(made.expected_information_gain.max()))
+    assert widths[0] == pytest.approx(float(made.expected_information_gain.min()))
+    assert ax.get_title() == "red: chosen; 15 further candidates"
+
+
+def test_a_random_choice_has_places_and_no_colors():
+    unknown = torch.full((30,), torch.nan)
+    made = design(BOX, expected_information_gain=unknown, standard_error=unknown)
+    ax = made.plot()
+    assert not ax.collections
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), made.candidates)
+    three = BoxActions([0.0] * 3, [1.0] * 3)
+    ax = design(three, expected_information_gain=unknown, standard_error=unknown).plot()
+    assert ax.get_title().startswith("chosen at random")
+
+
+def test_a_design_without_names_numbers_the_entries():
+    ax = design(BOX, labels=(), categorical=()).plot()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("action 1", "action 2")
+
+
+def test_it_is_drawn_where_it_is_told_to():
+    figure, axes = plt.subplots(1, 2)
+    made = design(MixedActions(BOX, TOOLS))
+    assert made.plot(axes[1]) is axes[1]
+    assert not axes[0].child_axes
+    figure.savefig("panels.png")

@@ -1,0 +1,178 @@
+"""The small pages that notebooks show."""
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+from sbi_active import (
+    BoxActions,
+    Campaign,
+    DiscreteActions,
+    InformationGainDesigner,
+    RandomDesigner,
+    SimulatorModel,
+)
+from sbi_active.campaign import Trial
+from sbi_active.inference.beliefs.belief import UnchangedBelief
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.notebook import card, facts, items, parameters, table
+from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, outcome
+from tests.criticism.report.reports import report
+
+EVIL = '<script>alert("&")</script>'
+VOID = {"br", "img"}
+
+
+class Page(HTMLParser):
+    """Text and tags of a page, which must be balanced."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.open, self.texts = [], [], []
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        for name, value in attrs:
+            assert name in ("style", "title"), name
+            # On a dark page nothing may be black, on a light one nothing white.
+            for color in re.findall(r"(?:color|background):([^;]*)", value):
+                assert color not in ("black", "white", "#000", "#fff"), color
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    @property
+    def text(self):
+        return " ".join(self.texts)
+
+
+def page_of(thing):
+    html = thing._repr_html_()
+    assert len(html) < 20_000
+    assert "http" not in html
+    page = Page(html)
+    assert "script" not in page.tags
+    return page
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    model = SimulatorModel(
+        MODEL.fn, noise=MODEL.noise, parameter_names=["mass", EVIL[:8]]
+    )
+    actions = BoxActions([0.5], [2.0], names=[f"speed {EVIL}"], units=["m/s"])
+    c = Campaign(model, PRIOR, actions, options=OPTIONS)
+    c.ask()
+    c.tell(outcome(c.pending.action, 0))
+    c.update()
+    c.ask()
+    return c
+
+
+def test_a_campaign_has_its_health_belief_and_trials(campaign):
+    page = page_of(campaign)
+    assert "Campaign: asbi, 1 trials, trial 1 pending" in page.text
+    assert "ok" in page.texts
+    assert "mass" in page.texts
+    assert EVIL[:8] in page.texts
+    assert any(text.startswith(f"speed {EVIL}") for text in page.texts)
+    mean = f"{campaign.belief.quick_sample(2_000, seed=0)[:, 0].double().mean():.4g}"
+    assert mean in page.texts
+
+
+def test_a_campaign_without_trials_has_no_table_of_them():
+    c = Campaign(MODEL, PRIOR, BoxActions([0.5], [2.0]), options=OPTIONS)
+    assert "the belief is the prior" in page_of(c).text
+    assert "surprise" not in page_of(c).text
+
+
+def test_a_long_campaign_is_small(campaign):
+    c = Campaign(MODEL, PRIOR, campaign.actions, options=OPTIONS)
+    for _ in range(40):
+        c.attach([1.0], [0.1, 0.2, 0.3, 0.4])
+    page = page_of(c)
+    assert "and 28 before" in page.texts
+    assert "39" in page.texts
+
+
+def test_a_trial_says_what_was_asked_and_told(campaign):
+    told, pending = campaign.state.trials
+    page = page_of(told)
+    assert "Trial 0: ok" in page.texts
+    assert f"{told.information_gained:.3g} nats" in page.texts
+    assert f"{float(told.x[0]):.4g}" in page.text
+    assert "Trial 1: pending" in page_of(pending).texts
+    assert "outcome" not in page_of(pending).texts
+    away = Trial(3, torch.ones(1), status="withdrawn", reason=EVIL)
+    assert EVIL in page_of(away).texts
+
+
+def test_a_belief_has_each_parameter_and_what_speaks_against_it():
+    belief = UnchangedBelief(PRIOR, PRIOR)
+    belief.parameter_names = ("mass", "friction")
+    belief.diagnostics = Diagnostics().warned(f"beware of {EVIL}")
+    page = page_of(belief)
+    assert {"mass", "friction", "not trustworthy", f"beware of {EVIL}"} <= {*page.texts}
+
+
+def test_looking_at_a_belief_draws_nothing_from_the_global_generator(campaign):
+    before = torch.get_rng_state()
+    campaign.belief._repr_html_()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_diagnostics_have_figures_in_words():
+    page = page_of(
+        Diagnostics(trustworthy=True, num_simulations=4_000, error_nats=0.01)
+    )
+    assert {"trustworthy", "4000"} <= {*page.texts}
+    assert "not checked" in page_of(Diagnostics()).texts
+
+
+def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
+    design = campaign.pending.design
+    page = page_of(design)
+    assert page.texts.count("chosen") == 1
+    assert f"{float(design.expected_information_gain[design.index]):.3g}" in page.texts
+    pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]], names=["a", "b"])
+    page = page_of(RandomDesigner(pairs).select(seed=0))
+    assert {"a", "b", "chosen"} <= {*page.texts}
+
+
+def test_a_batch_has_a_page():
+    designer = InformationGainDesigner(DiscreteActions([0.5, 1.0]), num_samples=40)
+    designs = designer.select(None, MODEL, belief=PRIOR, num_actions=2, seed=0)
+    assert "2 actions" in page_of(designs).text
+
+
+def test_a_report_has_its_verdict():
+    page = page_of(report())
+    assert "Verdict" in page.text
+    assert "probability" in page.text
+
+
+def test_pieces_are_escaped():
+    pieces = [
+        card(EVIL),
+        table([EVIL], [[EVIL]]),
+        facts([(EVIL, EVIL)]),
+        items([EVIL]),
+        parameters([EVIL], torch.randn(20, 1)),
+    ]
+    for piece in pieces:
+        assert EVIL in Page(piece).texts
+
+
+def test_many_parameters_are_cut():
+    page = Page(parameters([f"p{i}" for i in range(40)], torch.randn(50, 40)))
+    assert "and 10 more" in page.texts
