@@ -11,7 +11,17 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from torch import Tensor
 
-__all__ = ["Markup", "badge", "card", "facts", "items", "number", "parameters", "table"]
+__all__ = [
+    "Markup",
+    "badge",
+    "card",
+    "escaped",
+    "facts",
+    "items",
+    "number",
+    "parameters",
+    "table",
+]
 
 LINE = "1px solid rgba(128,128,128,.35)"
 CELL = f"text-align:right;padding:.15em .7em .15em 0;border-bottom:{LINE};"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,6 +94,12 @@ class CampaignView:
     def x_shape(self) -> torch.Size:
         """Shape of an outcome."""
         return self._learner.x_shape
+
+    @property
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """The lines of the log on the disk so far, without one in memory alone."""
+        disk = self._storage.disk
+        return () if disk is None else disk.events
 
     def contains(self, trial: Trial) -> bool:
         """Return whether the belief takes account of a trial as it is recorded now."""

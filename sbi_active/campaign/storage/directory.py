@@ -9,7 +9,7 @@ all else can be computed again: ``state.bin`` and ``belief-*.bin`` save that wor
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,11 @@ class CampaignDirectory:
         self.acquire()
         facts = {} if trial is None else {"trial": _facts(trial)}
         self._log.append({"event": event, **facts, **entries})
+
+    @property
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """The lines of the log so far."""
+        return (*self._log.entries,)
 
     @property
     def simulations(self) -> Path:
