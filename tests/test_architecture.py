@@ -21,6 +21,7 @@ FLOORS = (
     "threads",
     "arviz_versions",
     "actions",
+    "combinations",
     "simulation.noise",
     "simulation",
     "simulation.workers",
