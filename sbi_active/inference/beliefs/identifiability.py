@@ -34,8 +34,9 @@ OPEN = 0.3
 #: known: a uniform belief over half of a uniform prior has as much.
 WIDE = 0.5
 BINS = 20  # equally probable ones of the prior
-#: Share of them that the belief occupies, below which it is several narrow modes.
-SPREAD = 0.25
+#: Share of them that the belief fills, in prior deviations and at most 1 of them, below
+#: which it is several narrow modes: one Gaussian hump fills 1.2.
+FILLED = 0.5
 AS_PRIOR = 0.9
 #: Effective draws a parameter below which their covariance has narrow directions that
 #: the belief has not.
@@ -182,8 +183,8 @@ def combinations_of(
     everything = np.concatenate([before, after])
     low, span = everything.min(0), np.ptp(before, 0)
     own = kept.std(0) / np.maximum(before.std(0), 1e-300)
-    spread = _occupied(after, before)
-    is_open = (own > OPEN) & (spread > SPREAD)
+    filled = _filled(after, before)
+    is_open = (own > OPEN) & (filled > FILLED * own.clip(max=1.0))
     found = search(moments, np.flatnonzero(is_open).tolist(), low, span)
     groups = linked([c for c, _ in found])
     widths = {id(c): w for c, w in found}
@@ -231,7 +232,7 @@ def _without_outliers(draws: Array) -> Array:
     return draws[distance <= np.quantile(distance, 1 - OUTLIERS)]
 
 
-def _occupied(draws: Array, prior: Array) -> Array:
+def _filled(draws: Array, prior: Array) -> Array:
     """Return the share of the prior's bins that each parameter fills, shape (d,)."""
     edges = np.quantile(prior, np.linspace(0, 1, BINS + 1)[1:-1], axis=0)
     shares = []
