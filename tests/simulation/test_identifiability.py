@@ -5,6 +5,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.actions import ActionSpace
 from sbi_active.cli import main
 from sbi_active.simulation import check_simulator
 from sbi_active.simulation.identifiability import find_undetermined
@@ -65,7 +66,7 @@ OPEN = {
 }
 
 
-def run(fn, bounds, *, actions=SPEEDS, seed=0, sd=0.02):
+def run(fn, bounds, *, actions: ActionSpace = SPEEDS, seed=0, sd=0.02):
     simulator = noisy(fn, sd)
     simulator.parameter_names = [*"abcde"[: len(bounds)]]  # pyright: ignore
     return check_simulator(simulator, box(*bounds), actions, seed=seed)

@@ -21,6 +21,7 @@ __all__ = [
     "KnownCombination",
     "UnknownCombination",
     "combinations_of",
+    "combinations_of_draws",
     "note_combinations",
 ]
 
@@ -164,6 +165,13 @@ def combinations_of(
         the profile likelihood, Bioinformatics 2009.
     """
     before, after = _draws(prior, seed, "prior"), _draws(belief, seed, "belief")
+    return combinations_of_draws(after, before, names)
+
+
+def combinations_of_draws(
+    after: Array, before: Array, names: Sequence[str] | None = None
+) -> Combinations:
+    """Return the same from draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
     if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
         return Combinations()

@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import MultivariateNormal
+from torch.distributions import Distribution, MultivariateNormal
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.identifiability import (
@@ -17,13 +17,15 @@ from sbi_active.inference.beliefs.identifiability import (
 POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
 
 
-class Draws:
+class Draws(Distribution):
     """An exact posterior, as resampled draws of the prior."""
 
     def __init__(self, draws):
+        super().__init__(event_shape=draws.shape[1:], validate_args=False)
         self.draws = draws
 
-    def sample(self, shape):
+    def sample(self, sample_shape=torch.Size()):  # noqa: B008
+        shape = torch.Size(sample_shape)
         return self.draws[torch.randint(len(self.draws), shape)]
 
 
