@@ -16,6 +16,7 @@ from sbi_active.combinations.formula import Combination, Term, linked
 from sbi_active.combinations.search import search
 from sbi_active.simulation.level_sets import moved_along
 from sbi_active.simulation.sensitivities import (
+    EQUAL,
     SAME,
     STEP,
     Sensitivities,
@@ -28,6 +29,11 @@ Array = NDArray[Any]
 
 OPEN = 0.3  # deviations, as in the belief's
 FLOOR = 3e-3  # width, in prior deviations, below which differences are no better
+#: What a direction does to x, exactly nothing or about.
+WHAT = {
+    True: "changes nothing",
+    False: "changes x by less than a tenth of the noise in a prior deviation",
+}
 FEW = 3  # parameter sets that say anything about the others
 MAX_ACTIONS = 16
 MAX_THETA = 32
@@ -190,8 +196,13 @@ def _local(
     step[:, probe.free] = small * direction * probe.deviation[probe.free]
     moves = torch.from_numpy(step).float()
     gap = probe.x(probe.theta + moves) - probe.x(probe.theta - moves)
-    limit = 2 * small * SAME * probe.noise + 2 * probe.rounding
-    if not (np.isfinite(gap) & (np.abs(gap) <= limit))[np.isfinite(probe.base)].all():
+    there = np.isfinite(probe.base)
+    gap = np.where(np.isfinite(gap), np.abs(gap), np.inf)
+    about, exactly = (
+        bool((gap <= 2 * small * share * probe.noise + 2 * probe.rounding)[there].all())
+        for share in (SAME, EQUAL)
+    )
+    if not about:
         return ()
     shares = np.sqrt((direction**2).mean(0))
     at = [k for k in range(len(probe.free)) if shares[k] > SAME]
@@ -204,10 +215,10 @@ def _local(
     move = ", ".join(f"{n} by {c:+.2g}" for n, c in zip(own, changes, strict=True))
     text = (
         f"{where} determines all of {_and(own)}: at each of {len(direction)} draws of "
-        f"the prior one direction changes nothing, such as {move} at {place}; fix one "
+        f"the prior one direction {WHAT[exactly]}, such as {move} at {place}; fix one "
         "of them, or permit actions that they change differently"
     )
-    return (Undetermined(own, (), True, text),)
+    return (Undetermined(own, (), exactly, text),)
 
 
 def _where(num: int, num_permitted: int | None) -> str:

@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 
-__all__ = ["SAME", "STEP", "Sensitivities", "Simulate"]
+__all__ = ["EQUAL", "SAME", "STEP", "Sensitivities", "Simulate"]
 
 Array = NDArray[Any]
 #: Returns x (n, ...) of parameters (n, theta_dim) and actions (n, action_dim), row i
@@ -30,6 +30,7 @@ TRIALS = 100.0
 #: Standard deviations of the noise by which x may differ at places that are said not to
 #: be told apart; TRIALS trials of an action see that at one standard error.
 SAME = 0.1
+EQUAL = 1e-3  # of them, which no number of trials that is ever run sees
 NUM_DRAWS = 2_000
 EPS = float(np.finfo(np.float32).eps)
 
@@ -124,7 +125,7 @@ class Sensitivities:
         gap = np.nan_to_num(np.abs(x - self.base))
         rounding = 2 * self.rounding
         about = bool((gap <= SAME * self.noise + rounding).all())
-        return about, bool((gap <= 1e-3 * self.noise + rounding).all())
+        return about, bool((gap <= EQUAL * self.noise + rounding).all())
 
 
 def _mean(values: Array, axis: Any) -> Array:

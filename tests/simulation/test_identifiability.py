@@ -104,6 +104,14 @@ def test_linear_parameters_are_all_determined(num, seed):
     assert report.undetermined == ()
 
 
+def test_a_direction_below_the_noise_is_not_said_to_change_nothing():
+    """A random matrix whose smallest singular value is 1.6e-4 of the largest."""
+    report = check_simulator(linear(20, 104), box(*[CENTERED] * 20), SPEEDS, seed=4)
+    (group,) = report.undetermined
+    assert not group.is_exact
+    assert "less than a tenth of the noise" in str(group)
+
+
 DETERMINED = {
     "fall with drag": (
         lambda mu, k, v: torch.log1p(k * v**2 / (9.81 * mu)) / (2 * k),
