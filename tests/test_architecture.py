@@ -23,6 +23,7 @@ FLOORS = (
     "arviz_versions",
     "arrays",
     "actions",
+    "combinations",
     "simulation.noise",
     "simulation",
     "simulation.workers",

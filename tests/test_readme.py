@@ -49,9 +49,14 @@ def run(tmp_path, monkeypatch):
 def test_readme(run, capsys):
     campaign, style, loop = run("README.md")
     printed = capsys.readouterr().out
-    assert "Design(action [3], EIG" in printed
+    assert "Design(action [4], EIG" in printed
     assert "theta[theta_1]" in printed
     assert len(campaign.campaign.history) == 3
+    deviation = campaign.belief.variance.sqrt()
+    assert (deviation < torch.tensor([0.03, 0.06])).all()  # of priors .26 wide
+    truth = torch.tensor([0.4, 0.3])
+    assert ((campaign.belief.mean - truth).abs() < 4 * deviation).all()
+    assert not campaign.belief.diagnostics.combinations
     assert len(style.inference.trials) == 2
     assert loop.report.verdict == "bias"
     assert "Verdict: bias (P" in printed
@@ -65,6 +70,17 @@ def test_simulations(run, capsys):
     assert "{'ok': 3, 'invalid': 0, 'missing': 0}" in printed
     # A quarter of the prior's rows lie in the narrower box, all with the same weight.
     assert 80 < bank.reused.effective_sample_size < 170
+
+
+def test_identifiability(run, capsys):
+    campaign, apart = run("docs/identifiability.md")
+    printed = capsys.readouterr().out
+    through = "friction * (mass + 0.5)"
+    assert f"x depends on them through {through} alone" in printed
+    assert f"known: {through} = " in printed
+    (known,) = campaign.belief.diagnostics.combinations.known
+    assert abs(known.value - 0.6) < 3 * (known.high - known.low)
+    assert apart.report.undetermined == ()
 
 
 @pytest.mark.slow
@@ -118,4 +134,5 @@ def test_no_page_is_forgotten():
         "methods.md",
         "seeing.md",
         "closing_the_loop.md",
+        "identifiability.md",
     }

@@ -47,11 +47,21 @@ class CampaignView:
         done, pending = len(self.history), self.pending is not None
         return (
             f"Campaign({self.state.method}, {done} trials"
-            f"{', one pending' if pending else ''})"
+            f"{', one pending' if pending else ''}{self._known_together()})"
         )
 
     def _repr_html_(self) -> str:
         return campaign_html(self)
+
+    def _known_together(self) -> str:
+        """Return what the belief knows of parameters that it does not know alone.
+
+        A belief that was not read from the directory yet is not read for this.
+        """
+        learner = self._learner
+        is_here = self.state.processed and learner._saved is None
+        found = getattr(learner.belief if is_here else None, "diagnostics", None)
+        return f"; {found.combinations}" if found and found.combinations else ""
 
     @property
     def belief(self) -> Distribution:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -15,6 +16,11 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.simulation.identifiability import (
+    MAX_ACTIONS,
+    Undetermined,
+    find_undetermined,
+)
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
 from sbi_active.simulation.report import SimulatorReport
@@ -42,7 +48,8 @@ def check_simulator(
 
     A defect keeps a campaign from working: the simulator raises, gives rows of another
     number or shape, is deterministic, has no measurement at all, mixes its rows, or
-    depends on no parameter. Everything else is a warning.
+    depends on no parameter. Everything else is a warning, such as parameters that no
+    permitted action tells apart, see :func:`.find_undetermined`.
 
     Args:
         simulator: ``simulator(theta, action)``, see
@@ -82,7 +89,7 @@ def check_simulator(
     if report.defects:
         return report
     assert report.seconds_batch is not None
-    num_runs = RUNS + theta.shape[1] + action.shape[1]
+    num_runs = RUNS + 3 * theta.shape[1] + action.shape[1] + RUNS
     affordable = max_seconds / num_runs / (report.seconds_batch / MIN_ROWS + 1e-9)
     report = replace(report, num_rows=max(MIN_ROWS, min(num_rows, int(affordable))))
     theta, action = run.draw(report.num_rows)
@@ -222,6 +229,9 @@ def _compare(
             idle_parameters=_idle(run, rows.x, (theta, action), 0, fresh[0]),
             idle_actions=_idle(run, rows.x, (theta, action), 1, fresh[1]),
         )
+        report = replace(
+            report, undetermined=_undetermined(run, theta.shape[1], report)
+        )
     return _judge(run, report, theta, action, rows)
 
 
@@ -240,6 +250,36 @@ def _idle(
         if _same(run.simulate(changed[0], changed[1]).x, x):
             idle.append(name)
     return tuple(idle)
+
+
+def _undetermined(
+    run: _Runs, num_parameters: int, report: SimulatorReport
+) -> tuple[Undetermined, ...]:
+    """Return parameters that no action tells apart, beside those that do nothing."""
+    actions, num = run.actions.listed(), None
+    if actions is None:
+        seed = derive_seed(run.seed, "undetermined")
+        actions = run.actions.sample((MAX_ACTIONS,), seed=seed)
+    else:
+        num = len(actions)
+        with forked_generators(run.seed, "undetermined"):
+            actions = actions[torch.randperm(num)]
+    fewest = max(report.num_rows // 4, 1)  # as many sets of parameters as actions
+    names = _names(run, 0, num_parameters)
+    try:
+        return find_undetermined(
+            lambda theta, action, key: run.simulate(theta, action, key).x,
+            run.prior,
+            actions[:fewest],
+            names,
+            skip=[i for i, name in enumerate(names) if name in report.idle_parameters],
+            num_rows=report.num_rows,
+            num_numbers=math.prod(report.x_shape or (1,)),
+            num_permitted=num,
+            seed=run.seed,
+        )
+    except SimulationError:  # at parameters next to others that it could simulate
+        return ()
 
 
 def _names(run: _Runs, which: int, num: int) -> Sequence[str]:
@@ -300,6 +340,7 @@ def _judge(
         notes.append(f"changing {', '.join(report.idle_parameters)} leaves x as it is")
     if report.idle_actions:
         notes.append(f"changing {', '.join(report.idle_actions)} leaves x as it is")
+    notes += [str(group) for group in report.undetermined]
     return replace(report, defects=tuple(defects), warnings=tuple(notes))
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from sbi_active.simulation.identifiability import Undetermined
+
 LINES = 10  # of actions without a measurement
 
 
@@ -25,6 +27,8 @@ class SimulatorReport:
             largest first, where any were lost.
         idle_parameters: Parameters that change nothing.
         idle_actions: Entries of the action that change nothing.
+        undetermined: Parameters that no permitted action tells apart, as far as was
+            tried, and the combinations of them that actions do determine.
         seconds_batch: Time of ``num_rows`` rows at once.
         seconds_row: Time of a call with one row.
         seconds_round: Measured wall time of a campaign's round; None where it was not.
@@ -48,6 +52,7 @@ class SimulatorReport:
     lost_by_action: tuple[tuple[tuple[float, ...], float], ...] = ()
     idle_parameters: tuple[str, ...] = ()
     idle_actions: tuple[str, ...] = ()
+    undetermined: tuple[Undetermined, ...] = ()
     seconds_batch: float | None = None
     seconds_row: float | None = None
     seconds_round: float | None = None

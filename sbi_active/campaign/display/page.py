@@ -22,6 +22,8 @@ h2 { font-size: 1.1em; margin: 1.6em 0 .4em; }
 footer { opacity: .65; margin-top: 2em; font-size: .9em; }
 """
 NUM_DRAWS = 4_000
+#: Columns of the table of trials that a reader of the page does not need.
+LEFT_OUT = ("cpu_seconds", "log_score", "num_missing", "version")
 
 
 def page(campaign: Any) -> str:
@@ -81,7 +83,7 @@ def _belief(campaign: Any) -> str:
 
 
 def _trials(campaign: Any) -> str:
-    frame = campaign.to_dataframe()
+    frame = campaign.to_dataframe().drop(columns=[*LEFT_OUT], errors="ignore")
     kept = frame.loc[:, [c for c in frame.columns if not frame[c].isna().all()]]
     rows = [[_cell(value) for value in row] for row in kept.itertuples(index=False)]
     return table([*kept.columns], rows) if rows else ""

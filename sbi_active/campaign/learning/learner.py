@@ -39,6 +39,7 @@ from sbi_active.inference.beliefs.belief import (
     require_width,
 )
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.beliefs.identifiability import note_combinations
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.trainers.base import ActiveInference
@@ -80,8 +81,8 @@ class Learner:
     ) -> None:
         self.simulator, self.prior = simulator, require_support(prior)
         self._actions, self._state = actions, state
-        names = getattr(simulator, "parameter_names", None)
-        require_width(prior, names, seed=derive_seed(state.seed, "width"))
+        self._names = getattr(simulator, "parameter_names", None)
+        require_width(prior, self._names, seed=derive_seed(state.seed, "width"))
         self.restart()
         self.x_shape = self._probe() if x_shape is None else x_shape
 
@@ -244,6 +245,7 @@ class Learner:
                         refinement=replace(options.refinement, workers=options.workers),
                         seed=derive_seed(seed, "refine", trial.index),
                     )
+                note_combinations(belief, self._names, seed=seed)
             gained = information_gained(
                 belief, before, seed=derive_seed(seed, "gain", trial.index)
             )
@@ -276,12 +278,14 @@ class Learner:
             simulator = IndexedSimulator(simulator)
         state = self._state
         options = state.options
-        return self._inference.update_all(
+        belief = self._inference.update_all(
             [self._observation(trial) for trial in trials],
             simulator,
             refinement=replace(options.refinement, workers=options.workers),
             seed=derive_seed(state.seed, "infer", state.version.number, key),
         )
+        note_combinations(belief, self._names, seed=state.seed)
+        return belief
 
     def note(self, index: int, *by: str) -> None:
         """Write down what asked this round's network, see :class:`.Trial`."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+import torch
 from torch.distributions import Distribution
 
 from sbi_active.criticism.results import (
@@ -19,9 +20,16 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
+from sbi_active.inference.beliefs.identifiability import (
+    Combinations,
+    combinations_of_draws,
+)
+from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 
 __all__ = ["Contents"]
+
+NUM_PRIOR = 2_000  # draws that a width is compared with
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,6 +136,19 @@ class Contents:
         names = ["before", "before_sd", "after", "after_sd"]
         table = pd.DataFrame.from_dict(rows, orient="index", columns=pd.Index(names))
         return table.rename_axis("parameter").reset_index()
+
+    @property
+    def combinations(self) -> Combinations:
+        """What the model of the verdict knows of parameters together, and what not."""
+        evidences = self.tracing.evidences
+        evidence = evidences.get(self.verdict, evidences[NONE])
+        with forked_generators(0, "report"):
+            prior = self.prior.sample(torch.Size([NUM_PRIOR])).double().numpy()
+        dim = prior.shape[1]
+        draws = evidence.draws[:, :dim]  # beyond these there may be those of errors
+        if draws.shape[1] < dim:
+            return Combinations()
+        return combinations_of_draws(draws, prior, evidence.names[:dim])
 
 
 def _moments(draws: np.ndarray) -> list[float]:

@@ -88,13 +88,17 @@ def parameters(report: Contents) -> Section:
         label = f"{name} [{units[name]}]" if name in units else str(name)
         cells = with_error(before, before_sd), with_error(after, after_sd)
         rows.append((label, *cells))
+    together = report.combinations
+    text = (f"Of parameters together, {together}.",) if together else ()
     if report.verdict == NONE:
         return Section(
             "Parameters",
+            text,
             header=(*header[:2],),
             rows=tuple(row[:2] for row in rows),
         )
-    return Section("Parameters before and after", header=(*header,), rows=tuple(rows))
+    title = "Parameters before and after"
+    return Section(title, text, header=(*header,), rows=tuple(rows))
 
 
 def next_action(report: Contents) -> Section:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
+from sbi_active.inference.beliefs.identifiability import Combinations
 from sbi_active.notebook import badge, card, facts, items, number
 
 __all__ = ["Assumption", "Diagnostics"]
@@ -53,6 +54,8 @@ class Diagnostics:
         tail_probability: How often a simulation from the belief lies as far out as all
             trials together do.
         tail_probability_of_trial: The same of each trial.
+        combinations: What is known of parameters that are not known one by one, and
+            what is not; says nothing where each is.
         figures: Further ones, by the method; each is an attribute as well.
     """
 
@@ -67,6 +70,7 @@ class Diagnostics:
     error_nats_if_explained: float | None = None
     tail_probability: float | None = None
     tail_probability_of_trial: tuple[float, ...] = ()
+    combinations: Combinations = Combinations()
     figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
 
     def extended(self, **changes: Any) -> Diagnostics:
@@ -93,6 +97,7 @@ class Diagnostics:
         }
         for name in ("warnings", "network_warnings", "tail_probability_of_trial"):
             known[name] = [*known[name]]
+        known["combinations"] = self.combinations.to_dict()
         known |= self.figures
         empty = (None, (), [], {})
         return {name: v for name, v in known.items() if not _is_any_of(v, empty)}
@@ -103,6 +108,8 @@ class Diagnostics:
         broken = [name for name, a in self.assumptions.items() if not a.holds]
         if broken:
             lines.append(f"assumptions that do not hold: {', '.join(broken)}")
+        if self.combinations:
+            lines.append(str(self.combinations))
         if self.num_simulations:
             lines.append(f"{self.num_simulations} simulations")
         if self.effective_sample_size is not None:

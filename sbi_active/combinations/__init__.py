@@ -1,0 +1,7 @@
+"""Combinations of parameters that are known while the parameters are not, as formulas.
+
+Outcomes may pin down some directions of the parameters and leave others open
+(Gutenkunst et al., PLoS Comput. Biol. 2007; Transtrum et al., J. Chem. Phys. 2015).
+Here such directions become short formulas. What they are found from, a belief's draws
+or a simulator's derivatives, does not live here.
+"""

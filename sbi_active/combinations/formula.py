@@ -1,0 +1,141 @@
+"""A combination of parameters, its value and its formula in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["SIMPLE", "Combination", "Term", "linked"]
+
+Array = NDArray[Any]
+
+SHOWN = 4  # terms of a formula that are written out
+SIMPLE = (1.0, 2.0, 0.5, 3.0, 1.5)  # weights and exponents, the simplest first
+
+
+@dataclass(frozen=True)
+class Term:
+    """One parameter in a combination: weight times theta, or log(theta + shift).
+
+    Attributes:
+        index: Of the parameter.
+        weight: Of the term, or exponent of the factor.
+        log: Whether it is a factor of a product.
+        shift: Added to the parameter before the logarithm.
+    """
+
+    index: int
+    weight: float = 1.0
+    log: bool = False
+    shift: float = 0.0
+
+    def coordinate(self, theta: Array) -> Array:
+        """Return theta or its logarithm, not weighed, shape (n,)."""
+        own = theta[:, self.index]
+        return np.log(own + self.shift) if self.log else own
+
+    def slope(self, theta: Array) -> Array:
+        """Return the derivative of the coordinate, shape (n,)."""
+        own = theta[:, self.index]
+        return 1 / (own + self.shift) if self.log else np.ones(len(own))
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum of terms; with a logarithm among them, the product that it stands for.
+
+    Attributes:
+        terms: One a parameter.
+    """
+
+    terms: tuple[Term, ...]
+
+    @property
+    def index(self) -> tuple[int, ...]:
+        """Its parameters."""
+        return tuple(term.index for term in self.terms)
+
+    @property
+    def weight(self) -> Array:
+        """Of the terms."""
+        return np.array([term.weight for term in self.terms])
+
+    @property
+    def is_product(self) -> bool:
+        """Whether it is one, rather than a sum."""
+        return any(term.log for term in self.terms)
+
+    def coordinate(self, theta: Array) -> Array:
+        """Return the sum of the terms, the logarithm of a product, (n, d) -> (n,)."""
+        return sum(t.weight * t.coordinate(theta) for t in self.terms)  # pyright: ignore
+
+    def value(self, theta: Array) -> Array:
+        """Return what the formula says, (n, d) -> (n,)."""
+        sums = self.coordinate(theta)
+        return np.exp(sums) if self.is_product else sums
+
+    def mirrored(self) -> Combination:
+        """Return the one in which all terms but the first have the other sign."""
+        first, *others = self.terms
+        return Combination((first, *(replace(t, weight=-t.weight) for t in others)))
+
+    def text(self, names: Sequence[str]) -> str:
+        """Return the formula, with the names of all parameters of the simulator."""
+        shown = sorted(self.terms, key=lambda t: not t.log)[:SHOWN]
+        if self.is_product:
+            text = "".join(_factor(t, names[t.index], i) for i, t in enumerate(shown))
+            return text + " * ..." * (len(shown) < len(self.terms))
+        text = "".join(_summand(t, names[t.index], i) for i, t in enumerate(shown))
+        return text + " + ..." * (len(shown) < len(self.terms))
+
+    @property
+    def complexity(self) -> float:
+        """Digits that it takes to write it; a sum is simpler than a product."""
+        digits = sum(_digits(t.weight) + (t.shift != 0) for t in self.terms)
+        digits += sum(_digits(t.shift) for t in self.terms if t.shift)
+        logs = [t.log for t in self.terms]
+        return digits + (0.25 if all(logs) else 1.5 * any(logs))
+
+
+def linked(combinations: Sequence[Combination]) -> list[list[Combination]]:
+    """Return combinations in groups, those together that share parameters."""
+    groups: list[list[Combination]] = []
+    for combination in combinations:
+        own = {*combination.index}
+        touched = [g for g in groups if any(own & {*c.index} for c in g)]
+        groups = [g for g in groups if g not in touched]
+        groups.append([*(c for g in touched for c in g), combination])
+    return sorted((sorted(g, key=_place) for g in groups), key=lambda g: _place(g[0]))
+
+
+def _place(combination: Combination) -> tuple[int, ...]:
+    return combination.index
+
+
+def _digits(value: float) -> int:
+    if abs(value) == 1:
+        return 0
+    return 1 if abs(value) in SIMPLE else len(f"{abs(value):.4g}".strip("0.")) or 1
+
+
+def _summand(term: Term, name: str, place: int) -> str:
+    sign = (" + ", " - ") if place else ("", "-")
+    size = abs(term.weight)
+    factor = "" if size == 1 else f"{size:.4g} * "
+    return f"{sign[term.weight < 0]}{factor}{name}"
+
+
+def _factor(term: Term, name: str, place: int) -> str:
+    if not term.log:
+        factor = {1.0: "", -1.0: "-"}.get(term.weight, f"{term.weight:.4g} * ")
+        return f"{' * ' if place else ''}exp({factor}{name})"
+    if term.shift:
+        name = f"({name} {'+' if term.shift > 0 else '-'} {abs(term.shift):.4g})"
+    size = abs(term.weight)
+    power = "" if size == 1 else f"^{size:.4g}"
+    sign = (" * ", " / ") if place else ("", "1 / ")
+    return f"{sign[term.weight < 0]}{name}{power}"

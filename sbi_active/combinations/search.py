@@ -1,0 +1,237 @@
+"""The search for combinations that are known while their parameters are not."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from sbi_active.combinations.formula import Combination, Term
+from sbi_active.combinations.rounding import AS_GOOD, rounded, roundings, width
+
+__all__ = ["KNOWN", "Moments", "search"]
+
+Array = NDArray[Any]
+
+#: A combination is known where it is at least so much narrower, in prior deviations,
+#: than each of its parameters: a tenth, so that three decimals of sampling error or a
+#: strong correlation (.99) are not taken for it.
+KNOWN = 0.1
+#: The same of formulas of different kinds, each of which was rounded before.
+ABOUT_AS_GOOD = 1.3
+#: Width of the best pair from which a shift, as in a * (b + 0.5), is looked for.
+WORTH_A_SHIFT = 0.5
+SHIFTS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0, 4.0)  # in ranges of the parameter
+MOST_TRIPLES = 20  # parameters up to which all triples are tried
+DEPENDENT = 0.1  # share of a direction that is new, below which it is none
+
+
+#: Returns the covariance of the terms, not weighed, and that under the prior: (m, m).
+Moments = Callable[[Sequence[Term]], tuple[Array, Array]]
+
+
+def search(
+    moments: Moments,
+    open_parameters: Sequence[int],
+    low: Array,
+    span: Array,
+    *,
+    floor: float = 0.0,
+) -> list[tuple[Combination, float]]:
+    r"""Return combinations that are known though their parameters are not.
+
+    Of all sums :math:`g = \sum_i w_i t_i(\theta_i)`, t the identity or a logarithm, the
+    one with the smallest :math:`\sqrt{w^T C w / w^T S w}`, C the covariance and S that
+    of the prior, is the last eigenvector of a generalized eigenproblem. Pairs come
+    first, then triples, then all parameters at once, each independent of those before.
+    Of the formulas that are about as narrow as the best the simplest is taken.
+
+    Args:
+        moments: Of any terms.
+        open_parameters: Indices of those that are not known by themselves.
+        low: Smallest value of each parameter under the prior, shape (d,).
+        span: Range of each under the prior, shape (d,).
+        floor: Width below which combinations are as good as each other.
+
+    Returns:
+        Each with its width; empty where there are none.
+    """
+    found: list[tuple[Combination, float]] = []
+    rows: list[Array] = []  # directions that are known, in prior deviations
+    if len(open_parameters) < 2:
+        return found
+    plain = [Term(i) for i in open_parameters]
+    covariance, prior = moments(plain)
+    place = {index: k for k, index in enumerate(open_parameters)}
+    alone = np.sqrt(covariance.diagonal() / prior.diagonal())
+    deviation = np.sqrt(prior.diagonal())
+    middle = low + 0.5 * span
+
+    def keep(combination: Combination, own: float) -> None:
+        at = [place[i] for i in combination.index]
+        if own > KNOWN * alone[at].min():
+            return
+        row = np.zeros(len(plain))
+        slopes = [float(t.slope(middle[None])[0]) for t in combination.terms]
+        row[at] = combination.weight * slopes * deviation[at]
+        row /= np.linalg.norm(row)
+        rest = row - sum((r @ row) * r for r in rows)
+        if np.linalg.norm(rest) > DEPENDENT:
+            rows.append(rest / np.linalg.norm(rest))
+            found.append((combination, own))
+
+    sizes = (2, 3) if len(plain) <= MOST_TRIPLES else (2,)
+    for size in sizes:
+        ranked = _ranked(moments, open_parameters, size, low)
+        for best, subset in ranked:
+            if len(rows) >= len(plain) - 1:
+                return found
+            if best > (WORTH_A_SHIFT if size == 2 else KNOWN):
+                break
+            known_pair = any({*c.index} <= {*subset} for c, _ in found)
+            if not known_pair:
+                keep(*_best_formula(moments, subset, low, span, floor))
+    for log in (False, True):
+        if len(plain) > 3 and (not log or (low[list(open_parameters)] > 0).all()):
+            terms = [Term(i, log=log) for i in open_parameters]
+            c, s = moments(terms)
+            for vector in _eigenvectors(c, s)[1].T:
+                combination = rounded(terms, vector, c, s, floor)
+                keep(combination, _own_width(combination, moments))
+    return found
+
+
+def _own_width(combination: Combination, moments: Moments) -> float:
+    return width(combination.weight, *moments(combination.terms))
+
+
+def _ranked(
+    moments: Moments, indices: Sequence[int], size: int, low: Array
+) -> list[tuple[float, tuple[int, ...]]]:
+    """Return subsets of parameters and their smallest width, smallest first."""
+    best: dict[tuple[int, ...], float] = {}
+    for log in (False, True):
+        usable = [i for i in indices if not log or low[i] > 0]
+        subsets = [*itertools.combinations(range(len(usable)), size)]
+        if not subsets:
+            continue
+        c, s = moments([Term(i, log=log) for i in usable])
+        at = np.array(subsets)
+        rows, columns = at[:, :, None], at[:, None, :]
+        scale = np.sqrt(s.diagonal())
+        c, s = (m / np.outer(scale, scale) for m in (c, s))
+        widths = np.sqrt(_smallest(c[rows, columns], s[rows, columns]).clip(0))
+        for subset, own in zip(subsets, widths.tolist(), strict=True):
+            key = tuple(usable[k] for k in subset)
+            best[key] = min(own, best.get(key, np.inf))
+    return sorted((own, subset) for subset, own in best.items())
+
+
+def _smallest(covariance: Array, prior: Array) -> Array:
+    """Return the smallest generalized eigenvalue of each pair, (k, m, m) -> (k,)."""
+    ridge = 1e-9 * np.eye(prior.shape[-1])
+    inverse = np.linalg.inv(np.linalg.cholesky(prior + ridge))
+    return np.linalg.eigvalsh(inverse @ covariance @ inverse.swapaxes(1, 2))[:, 0]
+
+
+def _eigenvectors(covariance: Array, prior: Array) -> tuple[Array, Array]:
+    """Return widths, smallest first, and the weights of each as a column."""
+    scale = np.sqrt(prior.diagonal())
+    c, s = (m / np.outer(scale, scale) for m in (covariance, prior))
+    inverse = np.linalg.inv(np.linalg.cholesky(s + 1e-9 * np.eye(len(s))))
+    values, vectors = np.linalg.eigh(inverse @ c @ inverse.T)
+    return np.sqrt(values.clip(0)), (inverse.T @ vectors) / scale[:, None]
+
+
+def _best_formula(
+    moments: Moments, subset: tuple[int, ...], low: Array, span: Array, floor: float
+) -> tuple[Combination, float]:
+    """Return the simplest formula about as narrow as the best, and its width."""
+    tried: list[tuple[Combination, float]] = []
+
+    def attempt(terms: Sequence[Term], limit: float) -> None:
+        c, s = moments(terms)
+        weight = _eigenvectors(c, s)[1][:, 0]
+        combination = rounded(terms, weight, c, s, limit)
+        tried.append((combination, _own_width(combination, moments)))
+
+    for terms in _forms(subset, low):
+        attempt(terms, floor)
+    if len(subset) == 2:
+        shifted = _shifted(moments, subset, low, span, floor)
+        tried += [(c, _own_width(c, moments)) for c in shifted]
+    limit = max(ABOUT_AS_GOOD * min(own for _, own in tried), floor)
+    good = [pair for pair in tried if pair[1] <= limit]
+    return min(good, key=lambda pair: (pair[0].complexity, pair[1]))
+
+
+def _forms(subset: tuple[int, ...], low: Array) -> Iterator[list[Term]]:
+    """Sums and products; of pairs also products with an exponential."""
+    mixed = len(subset) == 2
+    for logs in itertools.product((False, True), repeat=len(subset)):
+        if (len({*logs}) > 1 and not mixed) or (logs[0] and low[subset[0]] <= 0):
+            continue
+        if all(low[i] > 0 or not log for i, log in zip(subset, logs, strict=True)):
+            yield [Term(i, log=log) for i, log in zip(subset, logs, strict=True)]
+
+
+def _shifted(
+    moments: Moments, subset: tuple[int, ...], low: Array, span: Array, floor: float
+) -> Iterator[Combination]:
+    """Products in which one of two parameters has a number added, at its best.
+
+    One with its best exponents, and one with exponents 1 and 1, or 1 and -1.
+    """
+    for k, i in enumerate(subset):
+        other = subset[1 - k]
+        if low[other] <= 0:
+            continue
+
+        def pair(shift: float, k: int = k, i: int = i, other: int = other) -> Any:
+            terms = [Term(other, log=True), Term(i, log=True, shift=float(shift))]
+            return terms if k else terms[::-1]
+
+        def free(shift: float, pair: Any = pair) -> Combination:
+            c, s = moments(pair(shift))
+            return rounded(pair(shift), _eigenvectors(c, s)[1][:, 0], c, s, floor)
+
+        def plain(shift: float, pair: Any = pair) -> Combination:
+            product = Combination(tuple(pair(shift)))
+            both = (product, product.mirrored())
+            return min(both, key=lambda one: _own_width(one, moments))
+
+        for made in (free, plain):
+            best = _best_shift(made, moments, low[i], span[i], floor)
+            if best is not None:
+                yield best
+
+
+def _best_shift(
+    made: Callable[[float], Combination],
+    moments: Moments,
+    low: float,
+    span: float,
+    floor: float,
+) -> Combination | None:
+    """Return the product of the roundest shift that is about as narrow as the best."""
+
+    def narrowest(shift: float) -> float:
+        return _own_width(made(shift), moments)
+
+    sizes = span * np.array(SHIFTS)
+    grid = np.sort(np.concatenate([-sizes, sizes]))
+    grid = grid[grid > -low + 0.02 * span]
+    at = int(np.argmin([narrowest(shift) for shift in grid]))
+    ends = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
+    best: Any = minimize_scalar(
+        narrowest, bounds=ends, method="bounded", options={"xatol": 1e-4 * span}
+    )
+    limit = max(AS_GOOD * best.fun, floor)
+    for shift in roundings(float(best.x)):
+        if shift > -low + 0.01 * span and narrowest(shift) <= limit:
+            return made(shift)
+    return None

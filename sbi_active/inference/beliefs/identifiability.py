@@ -1,0 +1,277 @@
+"""Which combinations of parameters a belief knows, and which it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.distributions import Distribution
+
+from sbi_active.combinations.formula import Combination, Term, linked
+from sbi_active.combinations.rounding import width
+from sbi_active.combinations.search import KNOWN, search
+from sbi_active.seeding import forked_generators
+
+__all__ = [
+    "Combinations",
+    "KnownCombination",
+    "UnknownCombination",
+    "combinations_of",
+    "combinations_of_draws",
+    "note_combinations",
+]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 2_000  # an interval's ends to a twentieth of its length
+#: Prior deviations above which a parameter is not known by itself: what a product that
+#: is known exactly leaves of one of its factors may be no more, by the other's bounds.
+OPEN = 0.3
+#: Prior deviations above which a parameter that is in no combination is said not to be
+#: known: a uniform belief over half of a uniform prior has as much.
+WIDE = 0.5
+BINS = 20  # equally probable ones of the prior
+#: Share of them that the belief fills, in prior deviations and at most 1 of them, below
+#: which it is several narrow modes: one Gaussian hump fills 1.2.
+FILLED = 0.5
+AS_PRIOR = 0.9
+#: Effective draws a parameter below which their covariance has narrow directions that
+#: the belief has not.
+ENOUGH = 10
+SHOWN = 3  # combinations that are written out
+NAMED = 6  # parameters that are
+OUTLIERS = 0.01  # share of draws left out: a belief may hold a little of the prior
+LEVEL = 0.9
+
+
+@dataclass(frozen=True)
+class KnownCombination:
+    """A combination that the belief knows while its parameters are open.
+
+    Attributes:
+        text: The formula.
+        value: Its median.
+        low: End of its central 90 % interval.
+        high: The other end.
+        width: Standard deviation of the sum, or of a product's logarithm, in those of
+            the prior.
+    """
+
+    text: str
+    value: float
+    low: float
+    high: float
+    width: float
+
+    def __str__(self) -> str:
+        step = (self.high - self.low) / 20  # a digit that says something
+        largest = max(abs(self.low), abs(self.high), 1e-300)
+        ratio = largest / step if step > 0 else 1e6
+        digits = int(np.clip(np.ceil(np.log10(ratio)), 2, 6))
+        value, low, high = (
+            f"{v:.{digits}g}" for v in (self.value, self.low, self.high)
+        )
+        return f"{self.text} = {value} [{low}, {high}] ({LEVEL:.0%})"
+
+
+@dataclass(frozen=True)
+class UnknownCombination:
+    """A combination, or parameters by themselves, that the belief does not know.
+
+    Attributes:
+        text: The formula, or names.
+        width: As of :class:`KnownCombination`; the smallest of several parameters.
+        several: Whether these are parameters, each by itself.
+    """
+
+    text: str
+    width: float
+    several: bool = False
+
+    def __str__(self) -> str:
+        if self.width > AS_PRIOR:
+            return f"{self.text} (as wide as the prior)"
+        least = "at least " if self.several else ""
+        return f"{self.text} ({least}{self.width:.0%} as wide as the prior)"
+
+
+@dataclass(frozen=True)
+class Combinations:
+    """What a belief knows of parameters that it does not know one by one.
+
+    False where there is nothing to say: every parameter is known by itself, or nothing
+    is known much better than anything else.
+
+    Attributes:
+        known: Combinations with their intervals.
+        unknown: What is left open.
+    """
+
+    known: tuple[KnownCombination, ...] = ()
+    unknown: tuple[UnknownCombination, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.known or self.unknown)
+
+    def __str__(self) -> str:
+        parts = []
+        if self.known:
+            known = [*map(str, self.known[:SHOWN])]
+            if len(self.known) > SHOWN:
+                known.append(f"and {len(self.known) - SHOWN} combinations more")
+            parts.append(f"known: {', '.join(known)}")
+        if self.unknown:
+            parts.append(f"not known: {', '.join(map(str, self.unknown))}")
+        return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it in a form that JSON can hold."""
+        parts = {"known": self.known, "unknown": self.unknown}
+        return {k: [dict(vars(c)) for c in own] for k, own in parts.items() if own}
+
+
+def combinations_of(
+    belief: Distribution,
+    prior: Distribution,
+    names: Sequence[str] | None = None,
+    *,
+    seed: int = 0,
+) -> Combinations:
+    r"""Return which combinations of parameters a belief knows, and which it does not.
+
+    From 2,000 draws of each: a parameter is open where its standard deviation is above
+    0.3 of the prior's; a combination of open parameters is known where it has, in prior
+    deviations of its own, at most a tenth of the width of any of them. The formulas are
+    sums, products and ratios with weights, products with an exponential, and products
+    of the kind a (b + c), see :func:`.search`. A parameter that is in none of them is
+    not known where it has more than half of the prior's deviation while something else
+    has a tenth of that. It is the belief that speaks: a further trial may determine
+    what this says is open; :func:`.check_simulator` tells whether any action could.
+
+    Args:
+        belief: After some trials.
+        prior: Before any.
+        names: One a parameter; None is theta_1, theta_2, ...
+        seed: Of the draws.
+
+    References:
+        Gutenkunst et al., Universally sloppy parameter sensitivities in systems biology
+        models, PLoS Comput. Biol. 2007; Raue et al., Structural and practical
+        identifiability analysis of partially observed dynamical models by exploiting
+        the profile likelihood, Bioinformatics 2009.
+    """
+    before, after = _draws(prior, seed, "prior"), _draws(belief, seed, "belief")
+    return combinations_of_draws(after, before, names)
+
+
+def combinations_of_draws(
+    after: Array, before: Array, names: Sequence[str] | None = None
+) -> Combinations:
+    """Return the same from draws of a belief and of the prior, (m, d) and (n, d)."""
+    dim = before.shape[1]
+    if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
+        return Combinations()
+    if _effective(after) < ENOUGH * dim:
+        return Combinations()
+    if names is None:
+        names = [f"theta_{i + 1}" for i in range(dim)]
+    kept = _without_outliers(after)
+
+    def moments(terms: Sequence[Term]) -> tuple[Array, Array]:
+        own, old = (
+            np.stack([t.coordinate(rows) for t in terms]) for rows in (kept, before)
+        )
+        n = len(terms)
+        return np.cov(own).reshape(n, n), np.cov(old).reshape(n, n)
+
+    everything = np.concatenate([before, after])
+    low, span = everything.min(0), np.ptp(before, 0)
+    own = kept.std(0) / np.maximum(before.std(0), 1e-300)
+    filled = _filled(after, before)
+    is_open = (own > OPEN) & (filled > FILLED * own.clip(max=1.0))
+    found = search(moments, np.flatnonzero(is_open).tolist(), low, span)
+    groups = linked([c for c, _ in found])
+    widths = {id(c): w for c, w in found}
+    known = [_known(c, widths[id(c)], after, names) for g in groups for c in g]
+    unknown = [_left(group, moments, own, names) for group in groups]
+    named = {i for c, _ in found for i in c.index}
+    best = min([*own[~is_open].tolist(), *(w for _, w in found)], default=np.inf)
+    for i in np.flatnonzero(is_open & (own > WIDE)).tolist():
+        if i not in named and best < KNOWN * own[i]:
+            unknown.append(UnknownCombination(names[i], float(own[i])))
+    return Combinations(tuple(known), tuple(unknown))
+
+
+def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) -> None:
+    """Write what a belief knows together into its diagnostics.
+
+    Args:
+        belief: A :class:`.Belief`.
+        names: One a parameter, or None.
+        seed: Of the draws.
+    """
+    try:
+        found = combinations_of(belief, belief.prior, names, seed=seed)
+    except np.linalg.LinAlgError:  # of draws without a covariance nothing is said
+        return
+    belief.diagnostics = belief.diagnostics.extended(combinations=found)
+
+
+def _draws(distribution: Distribution, seed: int, key: str) -> Array:
+    with forked_generators(seed, "combinations", key):
+        return distribution.sample(torch.Size([NUM_DRAWS])).double().numpy()
+
+
+def _effective(draws: Array) -> float:
+    """Return how many different draws there are, repetitions weighed."""
+    count = np.unique(draws, axis=0, return_counts=True)[1]
+    return float(count.sum() ** 2 / (count**2).sum())
+
+
+def _without_outliers(draws: Array) -> Array:
+    """Return the draws nearest to their mean, by their covariance."""
+    step = draws - draws.mean(0)
+    inverse = np.linalg.pinv(np.cov(step.T), hermitian=True)
+    distance = np.einsum("ni,ij,nj->n", step, inverse, step)
+    return draws[distance <= np.quantile(distance, 1 - OUTLIERS)]
+
+
+def _filled(draws: Array, prior: Array) -> Array:
+    """Return the share of the prior's bins that each parameter fills, shape (d,)."""
+    edges = np.quantile(prior, np.linspace(0, 1, BINS + 1)[1:-1], axis=0)
+    shares = []
+    for own, inner in zip(draws.T, edges.T, strict=True):
+        count = np.bincount(np.searchsorted(inner, own), minlength=BINS) / len(own)
+        entropy = -(count[count > 0] * np.log(count[count > 0])).sum()
+        shares.append(np.exp(entropy) / BINS)
+    return np.array(shares)
+
+
+def _known(
+    combination: Combination, own: float, draws: Array, names: Sequence[str]
+) -> KnownCombination:
+    tail = 0.5 * (1 - LEVEL)
+    value = combination.value(draws)
+    low, middle, high = np.quantile(value, [tail, 0.5, 1 - tail]).tolist()
+    return KnownCombination(combination.text(names), middle, low, high, own)
+
+
+def _left(
+    group: Sequence[Combination], moments: Any, own: Array, names: Sequence[str]
+) -> UnknownCombination:
+    """Return what known combinations leave open of their parameters."""
+    if len(group) == 1 and len(group[0].terms) == 2:
+        other = group[0].mirrored()
+        wide = width(other.weight, *moments(other.terms))
+        if wide > OPEN:
+            return UnknownCombination(other.text(names), wide)
+    index = sorted({i for c in group for i in c.index})
+    each = ", ".join(names[i] for i in index[:NAMED])
+    if len(index) > NAMED:
+        each += f" and {len(index) - NAMED} others"
+    least = float(own[index].min())
+    return UnknownCombination(f"{each}, each by itself", least, several=True)

@@ -1,0 +1,247 @@
+"""Which parameters of a simulator no permitted action tells apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.combinations.formula import Combination, Term, linked
+from sbi_active.combinations.search import search
+from sbi_active.simulation.level_sets import moved_along
+from sbi_active.simulation.sensitivities import (
+    EQUAL,
+    SAME,
+    STEP,
+    Sensitivities,
+    Simulate,
+)
+
+__all__ = ["Undetermined", "find_undetermined"]
+
+Array = NDArray[Any]
+
+OPEN = 0.3  # deviations, as in the belief's
+FLOOR = 3e-3  # width, in prior deviations, below which differences are no better
+#: What a direction does to x, exactly nothing or about.
+WHAT = {
+    True: "changes nothing",
+    False: "changes x by less than a tenth of the noise in a prior deviation",
+}
+FEW = 3  # parameter sets that say anything about the others
+MAX_ACTIONS = 16
+MAX_THETA = 32
+MOST_NUMBERS = 8_000_000  # derivatives that are held in memory
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """Parameters that no permitted action determines, as far as was tried.
+
+    Attributes:
+        parameters: Their names.
+        known: The combinations through which the outcome depends on them; empty where
+            it does not, or where there is no short formula.
+        is_exact: Whether the outcome is the same, rather than within a tenth of the
+            noise.
+        text: In words, with what to do.
+    """
+
+    parameters: tuple[str, ...]
+    known: tuple[str, ...]
+    is_exact: bool
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def find_undetermined(
+    simulate: Simulate,
+    prior: Distribution,
+    actions: Tensor,
+    names: Sequence[str],
+    *,
+    skip: Sequence[int] = (),
+    num_rows: int = 256,
+    num_numbers: int = 1,
+    num_permitted: int | None = None,
+    seed: int = 0,
+) -> tuple[Undetermined, ...]:
+    r"""Return parameters that no permitted action tells apart, and what it would see.
+
+    Parameters and actions are drawn, and the rows simulated with the same random
+    numbers at parameters a little apart. The derivatives J of x, in noise units by
+    prior deviations and stacked over all actions, give the directions that change
+    nothing, and with them :math:`C = (S^{-1} + n J^T J)^{-1}`, the covariance that n
+    trials of each action would leave at a set of parameters (the Fisher information,
+    where noise is added to the outcome). Its mean over the sets gives formulas by
+    :func:`.search`.
+
+    Each formula is then put to the test: parameters are moved along it, most of a prior
+    deviation where the support allows that, and where x moves by more than a tenth of
+    the noise nothing is said. The same outcome under the same random numbers is the
+    same distribution, so that what is said holds at the places that were tried,
+    whatever the noise; the reverse is not true, and more may be undetermined.
+
+    Args:
+        simulate: The simulator.
+        prior: Over its parameters.
+        actions: To try, shape (a, action_dim); the first 16 are.
+        names: One a parameter.
+        skip: Parameters that are left alone, since they change nothing anyhow.
+        num_rows: Rows a call of the simulator; it is called 2 d + 2 times, and twice
+            for what is found.
+        num_numbers: Of an outcome; many of them get fewer rows.
+        num_permitted: Actions that are permitted; None is endless.
+        seed: Of the draws.
+
+    Returns:
+        One a group of parameters; empty where all are told apart.
+
+    References:
+        Rothenberg, Identification in parametric models, Econometrica 1971; Raue et al.,
+        Bioinformatics 2009; Gutenkunst et al., PLoS Comput. Biol. 2007.
+    """
+    free = [i for i in range(len(names)) if i not in skip]
+    actions = actions[:MAX_ACTIONS]
+    num_rows = min(num_rows, MOST_NUMBERS // (num_numbers * max(len(free), 1)))
+    num_theta = min(num_rows // len(actions), MAX_THETA)
+    if num_theta < FEW or not free:
+        return ()
+    probe = Sensitivities(simulate, prior, actions, free, num_theta, seed)
+    if not np.isfinite(probe.base).any():
+        return ()
+    where = _where(len(actions), num_permitted)
+    for practical in (False, True):
+        found = _formulas(probe, names, where, practical)
+        if found:
+            return found
+    return _local(probe, names, where)
+
+
+def _formulas(
+    probe: Sensitivities, names: Sequence[str], where: str, practical: bool
+) -> tuple[Undetermined, ...]:
+    """Return what has a formula that holds where it was tried."""
+    covariances = probe.covariances(practical)
+    place = {i: k for k, i in enumerate(probe.free)}
+    theta = probe.theta.double().numpy()
+    alone = np.sqrt(covariances.diagonal(axis1=1, axis2=2).mean(0))
+    open_parameters = [i for i in probe.free if alone[place[i]] > OPEN]
+
+    def moments(terms: Sequence[Term]) -> tuple[Array, Array]:
+        at = [place[t.index] for t in terms]
+        slopes = np.stack([t.slope(theta) * probe.deviation[t.index] for t in terms], 1)
+        own = covariances[:, at][:, :, at] * slopes[:, :, None] * slopes[:, None, :]
+        prior = np.cov(np.stack([t.coordinate(probe.draws) for t in terms]))
+        return own.mean(0), prior.reshape(len(terms), len(terms))
+
+    low, span = probe.draws.min(0), np.ptp(probe.draws, 0)
+    combinations = [
+        c for c, _ in search(moments, open_parameters, low, span, floor=FLOOR)
+    ]
+    groups = linked(combinations)
+    lonely = {*open_parameters} - {
+        i for group in groups for c in group for i in c.index
+    }
+    candidates = [(sorted({i for c in g for i in c.index}), g) for g in groups]
+    candidates += [([i], []) for i in sorted(lonely) if alone[place[i]] > 0.5]
+    found = []
+    for indices, group in candidates:
+        about, exactly = _holds(probe, indices, group)
+        if about and len(indices) > len(group):
+            own = tuple(names[i] for i in indices)
+            known = tuple(c.text(names) for c in group)
+            text = _sentence(own, known, exactly, where)
+            found.append(Undetermined(own, known, exactly, text))
+    return tuple(found)
+
+
+def _holds(
+    probe: Sensitivities, indices: Sequence[int], group: Sequence[Combination]
+) -> tuple[bool, bool]:
+    """Return whether x is about, or exactly, the same where the combinations are."""
+    about, exactly = True, True
+    for turn in range(2):
+        moved = moved_along(probe, indices, group, turn)
+        if moved is None:
+            return False, False
+        same = probe.same(moved)
+        about, exactly = about and same[0], exactly and same[1]
+        if not about:
+            break
+    return about, exactly
+
+
+def _local(
+    probe: Sensitivities, names: Sequence[str], where: str
+) -> tuple[Undetermined, ...]:
+    """Return what changes nothing at each of the parameters, without a formula."""
+    size, vectors = probe.singular()
+    if not (size == 0).any(1).all():
+        return ()
+    direction = vectors[:, :, -1]
+    direction *= np.sign(
+        direction[np.arange(len(direction)), np.abs(direction).argmax(1)]
+    )[:, None]
+    step = np.zeros_like(probe.draws[: len(direction)])
+    small = 3 * STEP
+    step[:, probe.free] = small * direction * probe.deviation[probe.free]
+    moves = torch.from_numpy(step).float()
+    gap = probe.x(probe.theta + moves) - probe.x(probe.theta - moves)
+    there = np.isfinite(probe.base)
+    gap = np.where(np.isfinite(gap), np.abs(gap), np.inf)
+    about, exactly = (
+        bool((gap <= 2 * small * share * probe.noise + 2 * probe.rounding)[there].all())
+        for share in (SAME, EQUAL)
+    )
+    if not about:
+        return ()
+    shares = np.sqrt((direction**2).mean(0))
+    at = [k for k in range(len(probe.free)) if shares[k] > SAME]
+    if len(at) < 2:
+        return ()
+    indices = [probe.free[k] for k in at]
+    own = tuple(names[i] for i in indices)
+    place = ", ".join(f"{names[i]} = {float(probe.theta[0, i]):.3g}" for i in indices)
+    changes = 0.1 * direction[0, at] * probe.deviation[indices]
+    move = ", ".join(f"{n} by {c:+.2g}" for n, c in zip(own, changes, strict=True))
+    text = (
+        f"{where} determines all of {_and(own)}: at each of {len(direction)} draws of "
+        f"the prior one direction {WHAT[exactly]}, such as {move} at {place}; fix one "
+        "of them, or permit actions that they change differently"
+    )
+    return (Undetermined(own, (), exactly, text),)
+
+
+def _where(num: int, num_permitted: int | None) -> str:
+    if num_permitted is not None and num_permitted <= num:
+        return "no permitted action"
+    return f"none of {num} actions that were tried"
+
+
+def _sentence(
+    own: tuple[str, ...], known: tuple[str, ...], exactly: bool, where: str
+) -> str:
+    if not known:
+        return (
+            f"{where} determines {own[0]}: all over the prior it changes x by less "
+            "than a tenth of the noise; fix it, or permit actions that it changes more"
+        )
+    through = _and(known)
+    what = "" if exactly else ", to a tenth of the noise,"
+    return (
+        f"{where} tells {_and(own)} apart: x depends on them{what} through {through} "
+        "alone; fix one of them, or permit actions that they change differently"
+    )
+
+
+def _and(texts: Sequence[str]) -> str:
+    return f"{', '.join(texts[:-1])} and {texts[-1]}" if texts[1:] else texts[0]

@@ -1,0 +1,94 @@
+"""Formulas from covariances that are known exactly."""
+
+import numpy as np
+import pytest
+
+from sbi_active.combinations.formula import Combination, Term, linked
+from sbi_active.combinations.search import KNOWN, search
+
+NAMES = [*"abcdef"]
+
+
+def product(*weights, shifts=()):
+    shifts = dict(shifts)
+    return Combination(
+        tuple(
+            Term(i, w, log=True, shift=shifts.get(i, 0.0))
+            for i, w in enumerate(weights)
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("combination", "text"),
+    [
+        (product(1, 1), "a * b"),
+        (product(1, -1), "a / b"),
+        (product(2, -0.5), "a^2 / b^0.5"),
+        (product(-1, 1), "1 / a * b"),
+        (product(1, 1, shifts={1: 0.5}), "a * (b + 0.5)"),
+        (product(1, -1, shifts={0: -0.25}), "(a - 0.25) / b"),
+        (Combination((Term(0), Term(1, -0.8))), "a - 0.8 * b"),
+        (Combination((Term(0, -1.0), Term(1))), "-a + b"),
+        (Combination((Term(0, log=True), Term(1, -2.0))), "a * exp(-2 * b)"),
+        (Combination((Term(0), Term(1, log=True))), "b * exp(a)"),
+        (Combination(tuple(map(Term, range(5)))), "a + b + c + d + ..."),
+        (product(1, 1, 1, 1, 1), "a * b * c * d * ..."),
+    ],
+)
+def test_formulas_read_as_they_compute(combination, text):
+    assert combination.text(NAMES) == text
+    if "..." in text:
+        return
+    theta = np.random.default_rng(0).uniform(0.5, 2.0, (7, 2))
+    scope = {"a": theta[:, 0], "b": theta[:, 1], "exp": np.exp}
+    value = eval(text.replace("^", "**"), scope)
+    assert combination.value(theta) == pytest.approx(value)
+
+
+def gaussian(num, num_trials, seed, sd=0.05):
+    """Moments of sums under a linear model; logarithms are not to be had."""
+    rng = np.random.default_rng(seed)
+    design = rng.standard_normal((num_trials, num))
+    covariance = np.linalg.inv(np.eye(num) + design.T @ design / sd**2)
+
+    def moments(terms):
+        at = [t.index for t in terms]
+        return covariance[np.ix_(at, at)], np.eye(len(at))
+
+    return moments, covariance
+
+
+@pytest.mark.parametrize("num", [2, 5, 20])
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_what_is_found_is_known_and_new(num, share):
+    for seed in range(10):
+        num_trials = max(int(share * num), 1)
+        moments, covariance = gaussian(num, num_trials, seed)
+        low, span = np.full(num, -3.0), np.full(num, 6.0)
+        found = search(moments, range(num), low, span)
+        rows = np.zeros((len(found), num))
+        for row, (combination, own) in zip(rows, found, strict=True):
+            row[[*combination.index]] = combination.weight
+            row /= np.linalg.norm(row)
+            assert own == pytest.approx(np.sqrt(row @ covariance @ row), rel=1e-6)
+            alone = np.sqrt(covariance.diagonal()[[*combination.index]])
+            assert own <= KNOWN * alone.min()
+        assert np.linalg.matrix_rank(rows, tol=1e-4) == len(found) <= num_trials
+
+
+def test_all_that_is_known_of_two_is_found():
+    for seed in range(30):
+        moments, covariance = gaussian(2, 1, seed)
+        low, span = np.full(2, -3.0), np.full(2, 6.0)
+        best = np.sqrt(np.linalg.eigvalsh(covariance)[0])
+        found = search(moments, range(2), low, span)
+        is_there = best < 0.8 * KNOWN * np.sqrt(covariance.diagonal().min())
+        assert len(found) == 1 or not is_there
+        assert all(own < 1.1 * best for _, own in found)
+
+
+def test_combinations_that_share_parameters_go_together():
+    first, last = Combination((Term(0), Term(1))), Combination((Term(1), Term(2)))
+    other = Combination((Term(3), Term(4)))
+    assert linked([last, other, first]) == [[first, last], [other]]

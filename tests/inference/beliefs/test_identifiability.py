@@ -1,0 +1,196 @@
+"""What beliefs know of parameters together, from exact posteriors."""
+
+import json
+import pickle
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Distribution, MultivariateNormal
+
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.beliefs.identifiability import (
+    Combinations,
+    combinations_of,
+)
+
+POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
+
+
+class Draws(Distribution):
+    """An exact posterior, as resampled draws of the prior."""
+
+    def __init__(self, draws):
+        super().__init__(event_shape=draws.shape[1:], validate_args=False)
+        self.draws = draws
+
+    def sample(self, sample_shape=torch.Size()):  # noqa: B008
+        shape = torch.Size(sample_shape)
+        return self.draws[torch.randint(len(self.draws), shape)]
+
+
+def box(*bounds):
+    low, high = zip(*bounds, strict=True)
+    return BoxUniform(torch.tensor(low), torch.tensor(high))
+
+
+def posterior(fn, prior, truth, *, sd=0.01, seed=0):
+    """Importance resampling of 300,000 draws of the prior, under Gaussian noise."""
+    torch.manual_seed(seed)
+    theta = prior.sample((300_000,)).double()
+    x = fn(*torch.tensor([truth]).double().split(1, 1))
+    x = x + sd * torch.randn_like(x)
+    miss = (fn(*theta.split(1, 1)) - x) / sd
+    weight = (-0.5 * miss.square().sum(1)).softmax(0)
+    assert 1 / weight.square().sum() > 150
+    return Draws(theta[torch.multinomial(weight, 8_000, replacement=True)].float())
+
+
+#: Outcome, prior, truth, what is known of it, what is not.
+OPEN = {
+    "product": (lambda a, b: a * b, [POSITIVE] * 2, [0.5, 0.7], ["a * b"], ["a / b"]),
+    "ratio": (lambda a, b: a / b, [POSITIVE] * 2, [0.5, 0.7], ["a / b"], ["a * b"]),
+    "sum": (lambda a, b: a + b, [CENTERED] * 2, [0.5, -0.2], ["a + b"], ["a - b"]),
+    "shift": (
+        lambda a, b: a * (b + 0.5),
+        [POSITIVE] * 2,
+        [0.5, 0.7],
+        ["a * (b + 0.5)"],
+        ["a / (b + 0.5)"],
+    ),
+    "power": (
+        lambda a, b: a**2 * b,
+        [(0.5, 2.0)] * 2,
+        [1.2, 1.0],
+        ["a^2 * b"],
+        ["a^2 / b"],
+    ),
+    "no effect": (lambda a, b: a + 0 * b, [CENTERED] * 2, [0.5, -0.2], [], ["b"]),
+    "three": (
+        lambda a, b, c: a * b / c,
+        [(0.5, 2.0)] * 3,
+        [1.2, 1.0, 0.8],
+        ["a * b / c"],
+        ["a, b, c, each by itself"],
+    ),
+    "beside a known one": (
+        lambda a, b, c: torch.cat([a * b, c], 1),
+        [POSITIVE, POSITIVE, CENTERED],
+        [0.5, 0.6, -0.2],
+        ["a * b"],
+        ["a / b"],
+    ),
+}
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("case", OPEN)
+def test_the_combination_is_named_with_its_interval(case, seed):
+    fn, bounds, truth, known, unknown = OPEN[case]
+    prior = box(*bounds)
+    belief = posterior(fn, prior, truth, seed=seed)
+    found = combinations_of(belief, prior, [*"abc"], seed=seed)
+    assert [c.text for c in found.known] == known
+    assert [c.text for c in found.unknown] == unknown
+    for c in found.known:
+        value = float(fn(*torch.tensor([truth]).split(1, 1)).flatten()[0])
+        assert c.low < c.value < c.high
+        assert abs(c.value - value) < 2.5 * (c.high - c.low)  # 8 standard deviations
+        assert f"{c.text} = " in str(found)
+        assert "(90%)" in str(found)
+    assert f"not known: {unknown[0]} (" in str(found)
+
+
+def linear_posterior(num, num_trials, seed, sd=0.05):
+    rng = torch.Generator().manual_seed(seed)
+    design = torch.randn(num_trials, num, generator=rng, dtype=torch.float64)
+    covariance = torch.linalg.inv(torch.eye(num) + design.T @ design / sd**2)
+    covariance = 0.5 * (covariance + covariance.T).float()
+    prior = MultivariateNormal(torch.zeros(num), torch.eye(num))
+    belief = MultivariateNormal(torch.zeros(num), covariance + 1e-8 * torch.eye(num))
+    return belief, prior, covariance
+
+
+@pytest.mark.parametrize("num", [2, 5, 20])
+def test_nothing_is_said_where_all_parameters_are_known(num):
+    for seed in range(30):
+        belief, prior, _ = linear_posterior(num, 2 * num, seed)
+        assert not combinations_of(belief, prior, seed=seed)
+
+
+NONLINEAR = {
+    "drag": lambda a, b: torch.cat(
+        [torch.log1p(b * v**2 / a) / (2 * b) for v in (0.5, 1.0, 4.0)], 1
+    ),
+    "decay": lambda a, b: torch.cat([a * torch.exp(-b * t) for t in (0.1, 3.0)], 1),
+    "two modes": lambda a, b: torch.cat([(a - 0.6) ** 2, b], 1),
+}
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("case", NONLINEAR)
+def test_nor_of_others_that_are(case, seed):
+    """Two narrow modes as far apart as the prior is wide are not unknown."""
+    prior = box(POSITIVE, POSITIVE)
+    belief = posterior(NONLINEAR[case], prior, [0.3, 0.7], sd=0.02, seed=seed)
+    assert not combinations_of(belief, prior, seed=seed)
+
+
+@pytest.mark.parametrize("num", [2, 5, 20])
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+def test_what_is_said_after_few_trials_is_true(num, share):
+    """Compared with the exact standard deviations."""
+    for seed in range(10):
+        num_trials = max(int(share * num), 1)
+        belief, prior, covariance = linear_posterior(num, num_trials, seed)
+        found = combinations_of(belief, prior, seed=seed)
+        deviation = covariance.diagonal().sqrt()
+        assert all(c.width < 0.11 * float(deviation.max()) for c in found.known)
+        for c in found.unknown:
+            if c.text.startswith("theta") and " " not in c.text:
+                i = int(c.text.removeprefix("theta_")) - 1
+                assert float(deviation[i]) == pytest.approx(c.width, rel=0.1)
+                assert float(deviation[i]) > 0.4
+
+
+def test_before_any_trial_nothing_is_said():
+    prior = box(POSITIVE, POSITIVE, CENTERED)
+    assert not combinations_of(prior, prior)
+
+
+def test_one_parameter_and_few_draws_say_nothing():
+    one = box(POSITIVE)
+    assert not combinations_of(one, one)
+    prior = box(POSITIVE, POSITIVE)
+    few = Draws(posterior(lambda a, b: a * b, prior, [0.5, 0.7]).draws[:15])
+    assert not combinations_of(few, prior)
+
+
+def test_a_little_of_the_prior_in_a_belief_does_not_hide_it():
+    prior = box(POSITIVE, POSITIVE)
+    own = posterior(lambda a, b: a * b, prior, [0.5, 0.7]).draws
+    mixed = Draws(torch.cat([own, prior.sample((len(own) // 200,))]))
+    assert combinations_of(mixed, prior).known[0].text == "theta_1 * theta_2"
+
+
+def test_draws_are_seeded():
+    prior = box(POSITIVE, POSITIVE)
+    belief = posterior(lambda a, b: a * b, prior, [0.5, 0.7])
+    state = torch.get_rng_state()
+    first = combinations_of(belief, prior, seed=3)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert combinations_of(belief, prior, seed=3) == first
+
+
+def test_as_part_of_diagnostics():
+    prior = box(POSITIVE, POSITIVE)
+    belief = posterior(lambda a, b: a * b, prior, [0.5, 0.7])
+    found = combinations_of(belief, prior, ["friction", "mass"])
+    diagnostics = Diagnostics(trustworthy=True).extended(combinations=found)
+    assert str(diagnostics).splitlines()[1].startswith("known: friction * mass = ")
+    plain = diagnostics.to_dict()
+    assert json.loads(json.dumps(plain)) == plain
+    assert plain["combinations"]["unknown"][0]["text"] == "friction / mass"
+    assert pickle.loads(pickle.dumps(diagnostics)) == diagnostics
+    assert "combinations" not in Diagnostics().to_dict()
+    assert str(Combinations()) == ""

@@ -1,0 +1,227 @@
+"""Parameters that no action tells apart: named where they are, and nowhere else."""
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.actions import ActionSpace
+from sbi_active.cli import main
+from sbi_active.simulation import check_simulator
+from sbi_active.simulation.identifiability import find_undetermined
+
+SPEEDS = DiscreteActions([0.5, 1.0, 2.0, 3.0], names=["speed"])
+POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
+
+
+def box(*bounds):
+    low, high = zip(*bounds, strict=True)
+    return BoxUniform(torch.tensor(low), torch.tensor(high))
+
+
+def noisy(fn, sd=0.02):
+    def simulator(theta, action):
+        x = fn(*theta.split(1, 1), action)
+        return x + sd * torch.randn_like(x)
+
+    return simulator
+
+
+def friction(friction, mass, speed):
+    return speed**2 / (2 * 9.81 * friction) / (mass + 0.5)
+
+
+#: Outcome, prior, and the combinations through which the parameters enter it.
+OPEN = {
+    "product": (lambda a, b, v: v * a * b, [POSITIVE] * 2, ["a * b"]),
+    "ratio": (lambda a, b, v: torch.sin(v * a / b), [POSITIVE] * 2, ["a / b"]),
+    "sum": (
+        lambda a, b, v: torch.sin(v * (a + 0.8 * b)),
+        [CENTERED] * 2,
+        ["a + 0.8 * b"],
+    ),
+    "power": (lambda a, b, v: v * a**2 * b, [POSITIVE] * 2, ["a^2 * b"]),
+    "shift": (friction, [POSITIVE] * 2, ["a * (b + 0.5)"]),
+    "exponential": (
+        lambda a, b, v: v * a * torch.exp(-b),
+        [POSITIVE, CENTERED],
+        ["a * exp(-b)"],
+    ),
+    "three": (lambda a, b, c, v: v * a * b / c, [POSITIVE] * 3, ["a * b / c"]),
+    "two of three": (
+        lambda a, b, c, v: torch.cat([v * a * b, v * b * c], 1),
+        [POSITIVE] * 3,
+        ["a * b", "b * c"],
+    ),
+    "beside a known one": (
+        lambda a, b, c, v: torch.cat([v * a * b, c + 0 * v], 1),
+        [POSITIVE, POSITIVE, CENTERED],
+        ["a * b"],
+    ),
+    "of five": (
+        lambda a, b, c, d, e, v: torch.cat([v * (a + b + c + d), e + 0 * v], 1),
+        [CENTERED] * 5,
+        ["a + b + c + d"],
+    ),
+}
+
+
+def run(fn, bounds, *, actions: ActionSpace = SPEEDS, seed=0, sd=0.02):
+    simulator = noisy(fn, sd)
+    simulator.parameter_names = [*"abcde"[: len(bounds)]]  # pyright: ignore
+    return check_simulator(simulator, box(*bounds), actions, seed=seed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("case", OPEN)
+def test_the_combination_is_named(case, seed):
+    fn, bounds, known = OPEN[case]
+    report = run(fn, bounds, seed=seed)
+    (group,) = report.undetermined
+    assert [*group.known] == known
+    assert group.is_exact
+    assert {*group.parameters} <= {*"abcde"}
+    assert report.is_ready
+    assert str(group).startswith("no permitted action tells")
+    assert f"warning: {group}" in str(report)
+
+
+def linear(num, seed):
+    weights = torch.randn(num, num, generator=torch.Generator().manual_seed(seed))
+
+    def simulator(theta, action):
+        x = theta @ weights * (1 + action)
+        return x + 0.1 * torch.randn_like(x)
+
+    return simulator
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("num", [2, 5, 20])
+def test_linear_parameters_are_all_determined(num, seed):
+    prior = box(*[CENTERED] * num)
+    report = check_simulator(linear(num, seed), prior, SPEEDS, seed=seed)
+    assert report.undetermined == ()
+
+
+def test_a_direction_below_the_noise_is_not_said_to_change_nothing():
+    """A random matrix whose smallest singular value is 1.6e-4 of the largest."""
+    report = check_simulator(linear(20, 104), box(*[CENTERED] * 20), SPEEDS, seed=4)
+    (group,) = report.undetermined
+    assert not group.is_exact
+    assert "less than a tenth of the noise" in str(group)
+
+
+DETERMINED = {
+    "fall with drag": (
+        lambda mu, k, v: torch.log1p(k * v**2 / (9.81 * mu)) / (2 * k),
+        [POSITIVE] * 2,
+    ),
+    "decay": (lambda a, b, v: a * torch.exp(-b * v), [POSITIVE] * 2),
+    "mean and spread": (
+        lambda a, b, v: a * v + b * torch.randn_like(a),
+        [CENTERED, POSITIVE],
+    ),
+    "one far stronger": (lambda a, b, v: 1e3 * a * v + b, [CENTERED] * 2),
+    "too much stronger for float32": (
+        lambda a, b, v: 1e5 * a * v + b,
+        [CENTERED] * 2,
+    ),
+    "weights that may vanish": (lambda a, b, v: a * b + a * v, [CENTERED] * 2),
+    "only by failing": (
+        lambda a, b, v: torch.where(b > 0.5, torch.nan, a * v),
+        [POSITIVE] * 2,
+    ),
+}
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("case", DETERMINED)
+def test_nothing_is_said_of_parameters_that_are_determined(case, seed):
+    assert run(*DETERMINED[case], seed=seed).undetermined == ()
+
+
+def test_an_action_that_tells_them_apart_is_all_it_takes():
+    def fn(a, b, v):
+        return torch.where(v > 2.5, a * v, a * b * v)
+
+    assert run(fn, [POSITIVE] * 2).undetermined == ()
+    (group,) = run(fn, [POSITIVE] * 2, actions=DiscreteActions([1.0, 2.0])).undetermined
+    assert group.known == ("a * b",)
+
+
+def test_without_a_short_formula_one_place_is_an_example():
+    report = run(lambda a, b, v: v * (a**2 + b**2), [CENTERED] * 2)
+    (group,) = report.undetermined
+    assert group.known == ()
+    assert group.parameters == ("a", "b")
+    assert "one direction changes nothing" in str(group)
+
+
+def test_a_parameter_below_the_noise_is_hardly_determined():
+    (group,) = run(lambda a, b, v: v * (a + 1e-4 * b), [CENTERED] * 2).undetermined
+    assert group.parameters == ("b",)
+    assert not group.is_exact
+    assert "less than a tenth of the noise" in str(group)
+
+
+def test_parameters_that_change_nothing_are_named_once():
+    report = run(lambda a, b, v: v * a + 0 * b, [CENTERED] * 2)
+    assert report.idle_parameters == ("b",)
+    assert report.undetermined == ()
+
+
+def test_of_many_actions_those_that_were_tried_are_counted():
+    (group,) = run(
+        lambda a, b, v: v * a * b, [POSITIVE] * 2, actions=BoxActions([0.5], [3.0])
+    ).undetermined
+    assert str(group).startswith("none of 16 actions that were tried tells")
+
+
+@pytest.mark.parametrize("sd", [1e-6, 10.0])
+def test_the_noise_does_not_matter(sd):
+    model = SimulatorModel(
+        lambda theta, v: friction(theta[:, :1], theta[:, 1:], v),
+        noise=GaussianNoise(sd),
+        parameter_names=["friction", "mass"],
+    )
+    (group,) = check_simulator(model, box(POSITIVE, POSITIVE), SPEEDS).undetermined
+    assert group.known == ("friction * (mass + 0.5)",)
+
+
+def test_few_rows_and_many_numbers_say_nothing():
+    def simulate(theta, action, key):
+        return theta[:, :1] * theta[:, 1:]
+
+    prior, actions = box(POSITIVE, POSITIVE), torch.ones(4, 1)
+    names = ["a", "b"]
+    assert find_undetermined(simulate, prior, actions, names, num_rows=8) == ()
+    assert find_undetermined(simulate, prior, actions, names, num_numbers=10**9) == ()
+    assert find_undetermined(simulate, prior, actions, names)
+
+
+def test_a_slow_simulator_is_run_less():
+    calls = []
+
+    def simulator(theta, action):
+        calls.append(len(theta))
+        return theta[:, :1] * theta[:, 1:] + 0.01 * torch.randn(len(theta), 1)
+
+    report = check_simulator(simulator, box(POSITIVE, POSITIVE), SPEEDS, num_rows=16)
+    assert max(calls) == 16
+    assert report.undetermined[0].known == ("theta_1 * theta_2",)
+
+
+def test_the_command_says_it(tmp_path, capsys):
+    file = tmp_path / "my_body.py"
+    file.write_text(
+        "import torch\n"
+        "def simulator(theta, action):\n"
+        "    x = action * theta[:, :1] / theta[:, 1:]\n"
+        "    return x + 0.01 * torch.randn_like(x)\n"
+    )
+    space = ["--theta-low=0.2,0.2", "--theta-high=1,1", "--actions", "1:3:3"]
+    assert main(["check", f"{file}:simulator", *space]) == 0
+    printed = capsys.readouterr().out
+    assert "warning: no permitted action tells theta_1 and theta_2 apart" in printed
+    assert "theta_1 / theta_2 alone" in printed
