@@ -11,18 +11,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from torch import Tensor
 
-__all__ = [
-    "Markup",
-    "badge",
-    "card",
-    "escaped",
-    "facts",
-    "items",
-    "number",
-    "parameters",
-    "table",
-]
-
 LINE = "1px solid rgba(128,128,128,.35)"
 CELL = f"text-align:right;padding:.15em .7em .15em 0;border-bottom:{LINE};"
 #: Readable on white and on black.

@@ -41,7 +41,7 @@ def get_task(name: str, **options: Any) -> Task:
     """
     if name not in TASKS:
         raise ValueError(
-            f"expected a task among {', '.join(map(repr, TASKS))}; got {name!r}; do "
+            f"expected a task among {', '.join(map(repr, TASKS))}; got {name!r}; "
             "choose one of these"
         )
     return TASKS[name](**options)

@@ -332,12 +332,12 @@ def parse() -> argparse.Namespace:
     arguments = parser.parse_args()
     if arguments.noise <= 0:
         parser.error(
-            f"expected --noise > 0; got {arguments.noise}; do use 0.005: without noise "
+            f"expected --noise > 0; got {arguments.noise}; use 0.005: without noise "
             "there is no posterior density, and nothing to estimate"
         )
     if arguments.bank and arguments.workers > 1:
         parser.error(
-            f"expected --workers 1 beside --bank; got {arguments.workers}; do drop one"
+            f"expected --workers 1 beside --bank; got {arguments.workers}; drop one"
         )
     is_coverage = arguments.table == "coverage"
     if arguments.methods is None:

@@ -243,7 +243,7 @@ def draw_case(
         ValueError: If the kind is unknown.
     """
     if kind not in KINDS:
-        raise ValueError(f"expected a kind among {KINDS}; got {kind!r}; do choose one")
+        raise ValueError(f"expected a kind among {KINDS}; got {kind!r}; choose one")
     drawn = "removed" if kind == "inexpressible" else kind
     seed = derive_seed(number, "case", world.name, drawn)
     truth = _draw_truth(world, drawn, number, seed, 64 + num_held_out)

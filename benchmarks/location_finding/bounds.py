@@ -174,7 +174,7 @@ def _bounds(
     if log_w.ndim != 2 or log_p_true.shape != log_w.shape[:1]:
         raise ValueError(
             "expected log_p_true (n,) and log_p (n, L), one row a history; got "
-            f"{tuple(log_p_true.shape)} and {tuple(log_w.shape)}; do stack histories "
+            f"{tuple(log_p_true.shape)} and {tuple(log_w.shape)}; stack histories "
             "along axis 0"
         )
     num = log_w.shape[1]

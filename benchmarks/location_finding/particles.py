@@ -56,7 +56,7 @@ class ParticleBelief(Belief):
     def __init__(self, task: Task, *, num_particles: int = 2_000, seed: int) -> None:
         if num_particles < 100 or num_particles % 2:
             raise ValueError(
-                f"expected an even num_particles >= 100; got {num_particles}; do use "
+                f"expected an even num_particles >= 100; got {num_particles}; use "
                 "about 2000"
             )
         super().__init__(task.prior)

@@ -79,7 +79,7 @@ class Fixed(Policy):
         if index >= len(self.places):
             raise ValueError(
                 f"expected at most {len(self.places)} trials, the static design's; got "
-                f"trial {index + 1}; do optimize one for more trials"
+                f"trial {index + 1}; optimize one for more trials"
             )
         return self.places[index]
 

@@ -19,7 +19,7 @@ from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.limits import Limits
-from sbi_active.campaign.learning.methods import METHODS, find_method
+from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.planner import Planner
 from sbi_active.campaign.learning.revision import criticize, recompute, revise
 from sbi_active.campaign.options import CampaignOptions
@@ -34,8 +34,6 @@ from sbi_active.campaign.trials import CampaignTrials
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
     from sbi_active.inference.models.posterior import ActionPosterior
-
-__all__ = ["METHODS", "Campaign"]
 
 
 class Campaign(CampaignTrials):

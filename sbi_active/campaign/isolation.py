@@ -10,8 +10,6 @@ import torch
 
 from sbi_active.seeding import kept_generators
 
-__all__ = ["isolated"]
-
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 

@@ -16,8 +16,6 @@ from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["CampaignOptions"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignOptions:
@@ -150,13 +148,13 @@ class CampaignOptions:
             )
         if self.num_simulations < 100:
             raise ValueError(
-                f"expected num_simulations >= 100; got {self.num_simulations}; do use "
+                f"expected num_simulations >= 100; got {self.num_simulations}; use "
                 "about 5000 a round"
             )
         if self.design_on not in ("fresh", "training"):
             raise ValueError(
                 "expected design_on 'fresh' or 'training'; got "
-                f"{self.design_on!r}; do choose one of these"
+                f"{self.design_on!r}; choose one of these"
             )
         if self.network not in ("each round", "on demand"):
             raise ValueError(
@@ -165,11 +163,11 @@ class CampaignOptions:
             )
         if self.num_scored < 100:
             raise ValueError(
-                f"expected num_scored >= 100; got {self.num_scored}; do use about "
+                f"expected num_scored >= 100; got {self.num_scored}; use about "
                 "2000, since no tail probability is below 1 / (num_scored + 1)"
             )
         if self.check_every is not None and self.check_every < 1:
             raise ValueError(
-                f"expected check_every >= 1 or None; got {self.check_every}; do use 2 "
+                f"expected check_every >= 1 or None; got {self.check_every}; use 2 "
                 "or 3 where the simulator may lack something"
             )

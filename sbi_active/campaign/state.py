@@ -14,15 +14,6 @@ from sbi_active.campaign.display.html import trial_html
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.design.designer import Design
 
-__all__ = [
-    "FAR",
-    "UNSCORED",
-    "CampaignState",
-    "ModelVersion",
-    "Status",
-    "Trial",
-]
-
 Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
 
 #: Ranges of the simulations from the prior beyond all of them at which an outcome is no

@@ -11,8 +11,6 @@ from torch.distributions import Distribution
 from sbi_active.design.design import Design
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["StopRules"]
-
 NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
 
 
@@ -43,7 +41,7 @@ class StopRules:
         limits = [self.min_information_gain, *self._limits()]
         if any(limit is not None and not limit > 0 for limit in limits):
             raise ValueError(
-                f"expected positive limits to stop at; got {self}; do leave a rule "
+                f"expected positive limits to stop at; got {self}; leave a rule "
                 "at None that is not wanted"
             )
 
@@ -75,7 +73,7 @@ class StopRules:
         if len(limits) not in (1, len(sd)):
             raise ValueError(
                 f"expected one max_sd or one for each of {len(sd)} parameters; got "
-                f"{len(limits)}; do give max_sd in the order of the parameters, those "
+                f"{len(limits)}; give max_sd in the order of the parameters, those "
                 "of adopted effects last"
             )
         if not bool((sd < limits).all()):

@@ -17,8 +17,6 @@ from sbi_active.arrays import measured
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 
-__all__ = ["find_trial", "new_trial", "recorded", "told_trial"]
-
 LARGEST = torch.finfo(torch.float32).max
 
 

@@ -14,8 +14,6 @@ from sbi_active.campaign.state import UNSCORED, Status, Trial
 from sbi_active.campaign.telling import find_trial, new_trial, told_trial
 from sbi_active.campaign.view import CampaignView
 
-__all__ = ["CampaignTrials"]
-
 
 class CampaignTrials(CampaignView):
     """The half of a :class:`.Campaign` that takes what happened, and computes nothing.

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from sbi_active.criticism import Effect
 
-__all__ = ["CampaignView"]
-
 
 class CampaignView:
     """The readable half of a :class:`.Campaign`.

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["SIMPLE", "Combination", "Term", "linked"]
-
 Array = NDArray[Any]
 
 SHOWN = 4  # terms of a formula that are written out

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from sbi_active.combinations.formula import SIMPLE, Combination, Term
 
-__all__ = ["AS_GOOD", "rounded", "roundings", "width"]
-
 Array = NDArray[Any]
 
 #: A formula may be wider than the best one by this factor and be preferred as simpler.

@@ -13,8 +13,6 @@ from scipy.optimize import minimize_scalar
 from sbi_active.combinations.formula import Combination, Term
 from sbi_active.combinations.rounding import AS_GOOD, rounded, roundings, width
 
-__all__ = ["KNOWN", "Moments", "search"]
-
 Array = NDArray[Any]
 
 #: A combination is known where it is at least so much narrower, in prior deviations,

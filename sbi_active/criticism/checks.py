@@ -21,8 +21,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.estimation import estimate_noise
 
-__all__ = ["digest", "require_fitting", "with_noise"]
-
 FEWEST_REPEATS = 3
 
 
@@ -43,7 +41,7 @@ def with_noise(
             "expected measurement noise, declared or estimated from at least "
             f"{FEWEST_REPEATS} repeats of one action; got a deterministic simulator "
             f"without noise and at most {most} trials of one action, so that nothing "
-            "tells noise from effect; do declare SimulatorModel(fn, noise=...)"
+            "tells noise from effect; declare SimulatorModel(fn, noise=...)"
         )
     repeated = [group for group in groups if len(group) > 1]
     noisy = copy.copy(model)
@@ -86,19 +84,19 @@ def require_fitting(
     taken = [e.name for e in effects if e.name in reserved]
     if taken:
         raise ValueError(
-            f"expected effects not named {', '.join(reserved)}; got {taken[0]!r}; do "
+            f"expected effects not named {', '.join(reserved)}; got {taken[0]!r}; "
             "choose another name: noise inflation is tried in any case"
         )
     num = int(trials.fit.valid.sum())
     if num < 2:
         raise ValueError(
-            f"expected at least two valid trials to fit; got {num}; do measure more, "
+            f"expected at least two valid trials to fit; got {num}; measure more, "
             "since one trial fits any model"
         )
     if actions is not None and actions.action_dim != trials.action.shape[1]:
         raise ValueError(
             f"expected actions of dimension {trials.action.shape[1]}, that of the "
-            f"trials; got {actions.action_dim}; do give the space they were drawn from"
+            f"trials; got {actions.action_dim}; give the space they were drawn from"
         )
     if actions is not None:
         _warn_outside(trials, actions)
@@ -108,7 +106,7 @@ def require_fitting(
         if not bool(x.isfinite().any()):
             raise ValueError(
                 "expected a simulator that gives numbers at the trials' actions; got "
-                "NaN or inf throughout; do check its units and those of the actions"
+                "NaN or inf throughout; check its units and those of the actions"
             )
     # Compares every effect with the simulator at its null.
     AugmentedSimulator(model, effects, check=(theta, action))

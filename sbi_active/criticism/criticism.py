@@ -40,8 +40,6 @@ from sbi_active.simulation import SimulatorModel
 if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
 
-__all__ = ["Criticism", "close_loop"]
-
 FEWEST_TRIALS = 4  # to leave one out
 
 
@@ -182,7 +180,7 @@ class Criticism:
         if unknown:
             raise ValueError(
                 f"expected effects among {', '.join(self.rivals.effects) or 'none'}; "
-                f"got {', '.join(unknown)}; do declare them in Criticism(effects=...)"
+                f"got {', '.join(unknown)}; declare them in Criticism(effects=...)"
             )
         declared = {e.name: e for e in self.effects}  # acting on x, not its summaries
         every = [*names, *[e.name for e in self.rivals.nuisances]]
@@ -206,7 +204,7 @@ class Criticism:
         space = self.actions if actions is None else actions
         if space is None:
             raise ValueError(
-                "expected the permitted actions; got None; do give "
+                "expected the permitted actions; got None; give "
                 "next_action(actions) or Criticism(actions=...)"
             )
         return choose_action(self.rivals, self.trace(), space, beyond=beyond)

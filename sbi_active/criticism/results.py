@@ -9,18 +9,6 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-__all__ = [
-    "Detection",
-    "Estimate",
-    "Evaluation",
-    "Evidence",
-    "ModelKey",
-    "NextAction",
-    "Residuals",
-    "SevereTest",
-    "Tracing",
-]
-
 Array = NDArray[Any]
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross

@@ -17,8 +17,6 @@ from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.race import Race, paired_errors, standard_error
 from sbi_active.seeding import derive_seed
 
-__all__ = ["as_batch", "choose", "pricing"]
-
 
 def choose(
     estimates: Estimates,
@@ -111,7 +109,7 @@ def pricing(
         if given.shape != (len(action),) or not bool((given > 0).all()):
             raise ValueError(
                 f"expected positive costs of shape ({len(action)},); got shape "
-                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; do return "
+                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; return "
                 "one positive number an action"
             )
         return given
@@ -124,7 +122,7 @@ def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tens
     if values is None or table.shape != (len(values),):
         raise ValueError(
             "expected a cost of shape (a,), one number an action of a list; got "
-            f"shape {tuple(table.shape)} for {actions!r}; do pass a function of "
+            f"shape {tuple(table.shape)} for {actions!r}; pass a function of "
             "actions (n, action_dim)"
         )
     return lambda action: table[torch.cdist(action, values).argmin(1)]

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 MOST_SHOWN = 5  # candidates in a notebook, the best ones
 
-__all__ = ["Design", "action_labels", "action_name", "are_categories"]
-
 
 @dataclass(frozen=True)
 class Design:

@@ -16,7 +16,6 @@ from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.choice import as_batch, pricing
 from sbi_active.design.design import Design
 from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
-from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.selection import Selection
 from sbi_active.design.target import Target
 from sbi_active.information_gain import InformationGainEstimator
@@ -30,8 +29,6 @@ from sbi_active.search import (
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
-
-__all__ = ["Design", "InformationGainDesigner", "RandomDesigner"]
 
 #: Name of a search: its class.
 SEARCHES: dict[str, type[Search]] = {
@@ -107,11 +104,11 @@ class InformationGainDesigner:
         if num_samples < 8:
             raise ValueError(
                 f"expected num_samples >= 8, half to choose and half to report; got "
-                f"{num_samples}; do use about 1000"
+                f"{num_samples}; use about 1000"
             )
         if not exponent >= 0:
             raise ValueError(
-                f"expected exponent >= 0; got {exponent}; do use inf for the best "
+                f"expected exponent >= 0; got {exponent}; use inf for the best "
                 "action, or about 8 for one at random among good ones"
             )
         self.actions = actions = action_space(actions)
@@ -187,7 +184,7 @@ class InformationGainDesigner:
         """
         if num_actions < 1:
             raise ValueError(
-                f"expected num_actions >= 1; got {num_actions}; do ask for one or more"
+                f"expected num_actions >= 1; got {num_actions}; ask for one or more"
             )
         others = rows_of(self.actions, pending, "pending")
         limits = DesignLimits(
@@ -220,7 +217,7 @@ class InformationGainDesigner:
             if num_actions > 1 or len(others):
                 raise ValueError(
                     "expected one action and none pending with simulations=, rows of "
-                    f"single outcomes; got {num_actions} and {len(others)} pending; do "
+                    f"single outcomes; got {num_actions} and {len(others)} pending; "
                     "leave out simulations="
                 )
             return selection.by_given(simulations)
@@ -243,6 +240,6 @@ def _find_search(search: str | Search, actions: ActionSpace) -> Search:
     if search not in SEARCHES:
         raise ValueError(
             f"expected search among 'auto', {', '.join(map(repr, SEARCHES))}; got "
-            f"{search!r}; do choose one of these or pass a search"
+            f"{search!r}; choose one of these or pass a search"
         )
     return SEARCHES[search]()

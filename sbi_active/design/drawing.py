@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw", "labels_of"]
-
 Array = NDArray[Any]
 
 MOST_PANELS = 12  # of categories, those with the most information first

@@ -12,12 +12,6 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace, BoxActions
 from sbi_active.simulation import MissingRowsWarning
 
-__all__ = [
-    "DesignLimits",
-    "rows_of",
-    "warn_missing",
-]
-
 MANY = 1_024  # draws of a space without end, of which the permitted are candidates
 SAME = 0.01  # of the width of a box, within which two actions are the same
 
@@ -50,7 +44,7 @@ class DesignLimits:
             if answer.shape != inside.shape:
                 raise ValueError(
                     f"expected a constraint that maps actions {tuple(action.shape)} to "
-                    f"({len(action)},), bool; got shape {tuple(answer.shape)}; do "
+                    f"({len(action)},), bool; got shape {tuple(answer.shape)}; "
                     "return one answer a row"
                 )
             inside = answer.bool()
@@ -71,7 +65,7 @@ class DesignLimits:
         inside = self(values)
         if not bool(inside.any()):
             raise ValueError(
-                f"expected a permitted action; got none of {len(values)}; do loosen "
+                f"expected a permitted action; got none of {len(values)}; loosen "
                 "constraint= or exclude="
             )
         out = int((~inside).sum())
@@ -88,7 +82,7 @@ class DesignLimits:
         if len(drawn) == 0:
             raise ValueError(
                 f"expected a constraint that permits a part of {self.actions!r}; got "
-                f"none of {MANY} actions; do narrow the space to about what is "
+                f"none of {MANY} actions; narrow the space to about what is "
                 "permitted"
             )
         return drawn
@@ -113,12 +107,12 @@ class DesignLimits:
         if bool(valid.isnan().all()):
             raise ValueError(
                 "expected simulations; got none, all rows of all candidates were lost "
-                "to faults; do look at the simulator's tracebacks"
+                "to faults; look at the simulator's tracebacks"
             )
         raise ValueError(
             f"expected a candidate that gives a measurement with a probability of at "
             f"least {self.least:g}; got {float(valid.nan_to_num(0.0).max()):.3g} at "
-            "most; do lower min_probability_valid or add gentler candidates"
+            "most; lower min_probability_valid or add gentler candidates"
         )
 
     def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
@@ -150,7 +144,7 @@ def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
     rows = rows[None] if rows.shape == (dim,) else rows
     if rows.ndim != 2 or rows.shape[1] != dim:
         raise ValueError(
-            f"expected {name} of shape (t, {dim}); got {tuple(rows.shape)}; do give "
+            f"expected {name} of shape (t, {dim}); got {tuple(rows.shape)}; give "
             "one row an action"
         )
     return rows

@@ -12,8 +12,6 @@ from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.information_gain import CandidateSimulations
 from sbi_active.information_gain.race import Race
 
-__all__ = ["Estimates", "eliminate"]
-
 MOST = 4  # times num_samples that a candidate may get
 
 

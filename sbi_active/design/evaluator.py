@@ -23,8 +23,6 @@ from sbi_active.information_gain.estimators.automatic import (
 from sbi_active.information_gain.joint import JointLikelihood, conditional_gain
 from sbi_active.threads import single_thread
 
-__all__ = ["GainEvaluator"]
-
 
 class GainEvaluator:
     """Estimates of the information gain of candidates, on simulations of its sampler.

@@ -24,8 +24,6 @@ from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Outcome, Simulations
 from sbi_active.threads import single_thread
 
-__all__ = ["GivenGains"]
-
 FEWEST = 16  # rows of a candidate
 IN_SAMPLE = (
     "estimated on the given simulations: too high where the model was trained on them, "
@@ -82,7 +80,7 @@ class GivenGains:
         if bool(share.isnan().all()):
             raise ValueError(
                 f"expected simulations with at least {FEWEST} rows of a candidate; got "
-                "fewer of every one; do pass rows at the actions of the list"
+                "fewer of every one; pass rows at the actions of the list"
             )
         return self._estimates(action, halves, share)
 
@@ -95,7 +93,7 @@ class GivenGains:
         if not self.estimator.rowwise:
             raise ValueError(
                 "expected an estimator that scores rows one by one with simulations= "
-                f"and continuous actions; got {type(self.estimator).__name__}; do use "
+                f"and continuous actions; got {type(self.estimator).__name__}; use "
                 "estimator='posterior', or leave out simulations="
             )
         coordinates = Coordinates(self.limits.actions)
@@ -225,6 +223,7 @@ class RowSimulations(CandidateSimulations):
     each: Tensor = field(default_factory=lambda: torch.empty(0))
 
     def rows(self) -> tuple[Tensor, Tensor]:
+        """Return the parameters, and what was drawn at each."""
         return self.theta, self.each
 
 

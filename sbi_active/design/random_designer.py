@@ -17,8 +17,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["RandomDesigner"]
-
 FEW = 32  # draws that are simulated for their share of measurements
 
 
@@ -98,7 +96,7 @@ class RandomDesigner:
             if simulator is None or belief is None:
                 raise ValueError(
                     "expected a simulator and a belief with min_probability_valid; got "
-                    f"{'no simulator' if simulator is None else 'no belief'}; do pass "
+                    f"{'no simulator' if simulator is None else 'no belief'}; pass "
                     "both, or leave min_probability_valid at 0"
                 )
             seed = int(torch.randint(2**62, ())) if seed is None else seed

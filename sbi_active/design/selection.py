@@ -23,8 +23,6 @@ from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.workers.settings import Workers
 
-__all__ = ["Selection"]
-
 SHARE = 12  # of num_samples, that an action evaluated by a search gets one of
 FEW = 256  # given rows by which to choose the estimator
 
@@ -67,7 +65,7 @@ class Selection:
         if listed is not None and budget < 8 * len(listed):
             raise ValueError(
                 f"expected a budget >= {8 * len(listed)}, 8 a candidate; got {budget}; "
-                "do allow more simulations or fewer candidates"
+                "allow more simulations or fewer candidates"
             )
         probed = listed
         if probed is None:
@@ -117,12 +115,12 @@ class Selection:
         if not isinstance(simulations, Simulations):
             raise TypeError(
                 "expected Simulations(theta, action, x) for simulations=; got "
-                f"{type(simulations).__name__}; do wrap the rows in it"
+                f"{type(simulations).__name__}; wrap the rows in it"
             )
         if simulations.action.shape[1] != actions.action_dim:
             raise ValueError(
                 f"expected simulations of actions (n, {actions.action_dim}); got "
-                f"{tuple(simulations.action.shape)}; do pass those of this space"
+                f"{tuple(simulations.action.shape)}; pass those of this space"
             )
         listed, notes = self.limits.listed()
         estimator = target.gain() or _by_model(target.model, simulations)
@@ -162,7 +160,7 @@ def _by_model(model: Any, simulations: Simulations) -> InformationGainEstimator:
     """Return the estimator by what the model can say."""
     if model is None:
         raise ValueError(
-            "expected a model with simulations=; got None; do pass the trained model, "
+            "expected a model with simulations=; got None; pass the trained model, "
             "or leave out simulations="
         )
     some = CandidateSimulations(

@@ -20,8 +20,6 @@ from sbi_active.information_gain.estimators.automatic import find_estimator
 from sbi_active.information_gain.estimators.model_index import RivalPredictive
 from sbi_active.simulation.workers.settings import Workers
 
-__all__ = ["Target"]
-
 
 @dataclass(frozen=True)
 class Target:
@@ -59,27 +57,27 @@ class Target:
         if name != "theta" and estimator != "auto":
             raise ValueError(
                 f"expected estimator='auto' for target={name!r}, whose estimator is "
-                f"its own; got {estimator!r}; do leave out estimator="
+                f"its own; got {estimator!r}; leave out estimator="
             )
         if name == "model":
             if not isinstance(model, Sequence) or not simulates:
                 got = type(model).__name__ if simulates else "given simulations"
                 raise ValueError(
                     "expected a sequence of rivals for target='model'; got "
-                    f"{got}; do pass objects with probability and "
+                    f"{got}; pass objects with probability and "
                     "predict(action, num_samples, seed)"
                 )
             return Target(name, estimator, model, simulator, None)
         if simulator is None and simulates:
             raise ValueError(
-                "expected a simulator; got None; do pass the one that the belief's "
+                "expected a simulator; got None; pass the one that the belief's "
                 "parameters belong to"
             )
         belief = getattr(model, "belief", None) if belief is None else belief
         if belief is None:
             raise ValueError(
                 "expected belief=, the distribution of the parameters; got none, and "
-                "the model has none; do pass the belief of this round"
+                "the model has none; pass the belief of this round"
             )
         return Target(name, estimator, model, simulator, belief)
 
@@ -96,7 +94,7 @@ class Target:
         estimator = find_estimator(self.estimator)
         if estimator is not None and estimator.needs_model and self.model is None:
             raise ValueError(
-                f"expected a model for {type(estimator).__name__}; got None; do pass "
+                f"expected a model for {type(estimator).__name__}; got None; pass "
                 "the trained posterior, or estimator='auto'"
             )
         return estimator
@@ -113,7 +111,7 @@ class Target:
             if len(others):
                 raise ValueError(
                     "expected one action at a time and none pending for "
-                    f"target='model'; got {len(others)} others; do ask for them in turn"
+                    f"target='model'; got {len(others)} others; ask for them in turn"
                 )
             rivals: Sequence[RivalPredictive] = self.model
             sampler = RivalSampler(rivals, action, seed)
@@ -127,7 +125,7 @@ class Target:
                 "expected an estimator of the joint information of several actions, "
                 "by the noise or by a model with log_likelihood; got "
                 f"{type(estimator).__name__} on {type(self.model).__name__}, which "
-                "knows single outcomes; do use estimator='auto', or one action at a "
+                "knows single outcomes; use estimator='auto', or one action at a "
                 "time without pending ones"
             )
         sampler = CandidateSampler(
@@ -142,13 +140,13 @@ def _parameters(target: str | Sequence[str], simulator: Any) -> list[int]:
     if not names:
         raise ValueError(
             f"expected a simulator with parameter_names for target={target!r}; got "
-            "none; do build SimulatorModel(fn, parameter_names=[...])"
+            "none; build SimulatorModel(fn, parameter_names=[...])"
         )
     wanted = [target] if isinstance(target, str) else list(target)
     unknown = [name for name in wanted if name not in names]
     if unknown or not wanted:
         raise ValueError(
             f"expected target 'theta', 'model' or names among {list(names)}; got "
-            f"{target!r}; do choose one or more of these"
+            f"{target!r}; choose one or more of these"
         )
     return [list(names).index(name) for name in wanted]

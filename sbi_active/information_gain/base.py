@@ -12,8 +12,6 @@ from torch.distributions import Distribution
 
 from sbi_active.simulation import NoiseModel
 
-__all__ = ["Bound", "CandidateSimulations", "InformationGainEstimator"]
-
 Bound = Literal["lower", "upper", "none"]
 
 
@@ -154,14 +152,14 @@ class InformationGainEstimator(ABC):
         if x.ndim < 3 or x.shape[:2] != (len(action), len(theta)):
             raise ValueError(
                 f"expected x of shape ({len(action)}, {len(theta)}, *x_shape), one "
-                f"outcome a candidate and parameter set; got {tuple(x.shape)}; do "
+                f"outcome a candidate and parameter set; got {tuple(x.shape)}; "
                 "simulate every candidate at the same parameters"
             )
         unknown = simulations.mean is None or simulations.noise is None
         if self.needs_noise and unknown and simulations.replicate is None:
             raise ValueError(
                 f"expected declared noise or replicates for {type(self).__name__}; got "
-                "neither; do build SimulatorModel(fn, noise=...) around a noise-free "
+                "neither; build SimulatorModel(fn, noise=...) around a noise-free "
                 "fn, or simulate every theta twice"
             )
         with torch.no_grad():

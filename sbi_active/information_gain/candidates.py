@@ -24,8 +24,6 @@ from sbi_active.simulation import (
 from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["CandidateSampler"]
-
 FEW = 16  # rows to look at a simulator
 RETRIED = 64  # rows without a measurement to simulate again: was it luck
 

@@ -8,8 +8,6 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["Critic", "LikelihoodModel", "RatioModel"]
-
 
 class LikelihoodModel(Protocol):
     """Anything with a conditional density of outcomes.
@@ -61,7 +59,7 @@ class Critic:
         if not hasattr(self.model, self.method):
             raise ValueError(
                 f"expected a model with {self.method} for {self.user}; got "
-                f"{type(self.model).__name__}; do pass one that has it, or choose "
+                f"{type(self.model).__name__}; pass one that has it, or choose "
                 "estimator='auto'"
             )
 
@@ -111,7 +109,7 @@ class Critic:
             raise ValueError(
                 f"expected numbers from {type(self.model).__name__}.{self.method} for "
                 f"{self.user}; got NaN in {int(values.isnan().sum())} of "
-                f"{values.numel()} rows; do give a model that says how probable an "
+                f"{values.numel()} rows; give a model that says how probable an "
                 "outcome without a measurement is, x = NaN"
             )
         return values

@@ -25,8 +25,6 @@ from sbi_active.information_gain.base import (
 )
 from sbi_active.simulation import GaussianNoise, NoiseModel
 
-__all__ = ["JointLikelihood", "conditional_gain", "join_outcomes"]
-
 
 def join_outcomes(
     candidates: CandidateSimulations, others: CandidateSimulations
@@ -110,7 +108,7 @@ class JointLikelihood:
             return self._log_likelihood
         raise AttributeError(
             f"expected an estimator by the noise or by log_likelihood, which joint "
-            f"outcomes of several actions have; got one that asks for {name}; do use "
+            f"outcomes of several actions have; got one that asks for {name}; use "
             "estimator='auto', or choose one action at a time without pending ones"
         )
 
@@ -140,7 +138,7 @@ class _JointNoise(NoiseModel):
     ) -> Tensor:
         if seeds is not None:
             raise ValueError(
-                "expected seeds=None for joint outcomes; got some; do draw the noise "
+                "expected seeds=None for joint outcomes; got some; draw the noise "
                 "of each outcome by itself"
             )
         flat = self.each.sample(mean.flatten(0, 1), times=times, parameters=parameters)

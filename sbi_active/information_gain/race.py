@@ -9,8 +9,6 @@ from torch import Tensor
 
 from sbi_active.seeding import derive_seed
 
-__all__ = ["Race", "paired_errors", "standard_error"]
-
 #: Draws behind ``probability_best``; its standard error is at most .016.
 DRAWS = 1_000
 SURE = 0.95  # probability that the leader is the best, at which to stop

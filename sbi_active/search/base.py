@@ -11,8 +11,6 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 
-__all__ = ["Evaluations", "Objective", "Search"]
-
 
 @dataclass(frozen=True)
 class Evaluations:

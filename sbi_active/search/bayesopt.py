@@ -18,8 +18,6 @@ from sbi_active.search.sequential import (
 )
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["BayesianOptimization"]
-
 NUM_RESTARTS, RAW_SAMPLES, DRAWS, MAX_STEPS = 4, 64, 64, 50
 MOST_COMBINATIONS = 24  # of categories, each of which is optimized by itself
 APART_AT_LAST = 0.02
@@ -51,7 +49,7 @@ class BayesianOptimization(SequentialSearch):
             import botorch  # noqa: F401
         except ImportError as error:
             raise ImportError(
-                "expected BoTorch for search='bayesopt'; got none; do run "
+                "expected BoTorch for search='bayesopt'; got none; run "
                 "pip install sbi-active[botorch], or use search='gradient'"
             ) from error
 

@@ -10,8 +10,6 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace, BoxActions
 from sbi_active.seeding import derive_seed
 
-__all__ = ["Coordinates"]
-
 
 class Coordinates:
     r"""Map actions to points :math:`z = (u, k)` and back.
@@ -53,7 +51,7 @@ class Coordinates:
             else:
                 raise TypeError(
                     f"expected boxes and lists of actions; got {type(part).__name__}; "
-                    "do use BoxActions, DiscreteActions or MixedActions of them"
+                    "use BoxActions, DiscreteActions or MixedActions of them"
                 )
         self.num_continuous = sum(box.action_dim for _, box in self._boxes)
         self.sizes = [len(values) for _, values in self._lists]

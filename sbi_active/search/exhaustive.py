@@ -8,8 +8,6 @@ from typing_extensions import override
 from sbi_active.actions import ActionSpace
 from sbi_active.search.base import Objective, Search
 
-__all__ = ["ExhaustiveSearch"]
-
 
 class ExhaustiveSearch(Search):
     """Compare all actions of a list.
@@ -37,7 +35,7 @@ def _listed(actions: ActionSpace) -> Tensor:
     if values is None:
         raise TypeError(
             f"expected DiscreteActions; got {type(actions).__name__}, of which there "
-            "is no end; do list the candidates, DiscreteActions(values), or use "
+            "is no end; list the candidates, DiscreteActions(values), or use "
             "search='gradient'"
         )
     return values

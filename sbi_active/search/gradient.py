@@ -15,8 +15,6 @@ from sbi_active.search.sequential import (
 )
 from sbi_active.search.surrogate import Surrogate
 
-__all__ = ["GradientSearch"]
-
 NUM_STEPS = 50  # of the ascent
 STEP = 0.03  # in the unit cube
 RANGE = 0.1  # of the penalty on being close, in the unit cube
@@ -68,7 +66,7 @@ class GradientSearch(SequentialSearch):
         super().__init__(num_rounds=num_rounds, num_finalists=num_finalists)
         if num_starts < 1:
             raise ValueError(
-                f"expected num_starts >= 1; got {num_starts}; do use about 64"
+                f"expected num_starts >= 1; got {num_starts}; use about 64"
             )
         self.num_starts = num_starts
 

@@ -14,8 +14,6 @@ from sbi_active.search.base import Evaluations, Objective, Search
 from sbi_active.search.cube import Coordinates
 from sbi_active.seeding import derive_seed
 
-__all__ = ["Progress", "SequentialSearch"]
-
 FEWEST = 8  # evaluations
 #: Candidates' worth of simulations for each degree of freedom (an entry of a box, a
 #: category after the first), and for none.
@@ -55,7 +53,7 @@ class SequentialSearch(Search):
         if min(num_rounds, num_finalists) < 1:
             raise ValueError(
                 "expected num_rounds and num_finalists >= 1; got "
-                f"{num_rounds} and {num_finalists}; do use about 6 and 5"
+                f"{num_rounds} and {num_finalists}; use about 6 and 5"
             )
         self.num_rounds, self.num_finalists = num_rounds, num_finalists
 
@@ -64,7 +62,7 @@ class SequentialSearch(Search):
         if actions.listed() is not None:
             raise TypeError(
                 f"expected BoxActions or MixedActions with a box; got {actions!r}, a "
-                "list; do use search='exhaustive'"
+                "list; use search='exhaustive'"
             )
         coordinates = Coordinates(actions)
         categories = sum(size - 1 for size in coordinates.sizes)
@@ -76,7 +74,7 @@ class SequentialSearch(Search):
         if num < FEWEST:
             raise ValueError(
                 f"expected a budget >= {2 * FEWEST * num_samples}, half of it for "
-                f"{FEWEST} actions of {num_samples} simulations; got {budget}; do "
+                f"{FEWEST} actions of {num_samples} simulations; got {budget}; "
                 "allow more simulations"
             )
         return num
@@ -125,7 +123,7 @@ def permitted_points(
     if len(point) < min(num, FEWEST):
         raise ValueError(
             f"expected a constraint that permits a part of {objective.actions!r}; got "
-            f"{len(point)} of {MANY * num} actions; do narrow the space to about what "
+            f"{len(point)} of {MANY * num} actions; narrow the space to about what "
             "is permitted"
         )
     return point[:num]

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["Surrogate"]
-
 NUM_STEPS = 40  # of the optimizer of the hyperparameters
 #: Means and standard deviations of the logarithms' priors, in a unit cube and for
 #: values of unit variance.

@@ -62,7 +62,7 @@ def read_drops(directory: str | Path) -> list[Drop]:
         path = directory / name
         if not path.is_file():
             raise FileNotFoundError(
-                f"expected the measured drops in {directory}; got no {name} there; do "
+                f"expected the measured drops in {directory}; got no {name} there; "
                 "give the folder that holds drops.csv and balls.csv"
             )
         tables.append(pd.read_csv(path))
@@ -71,7 +71,7 @@ def read_drops(directory: str | Path) -> list[Drop]:
     if missing:
         raise ValueError(
             f"expected columns {', '.join(COLUMNS)} in {directory / 'drops.csv'}; got "
-            f"none named {', '.join(missing)}; do name them so"
+            f"none named {', '.join(missing)}; name them so"
         )
     sizes = balls.set_index("ball")
     area = sizes["circumference_m"] ** 2 / (4 * np.pi * sizes["mass_kg"])

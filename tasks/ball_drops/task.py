@@ -44,7 +44,7 @@ class BallDropsTask(Task):
         self.theta_true = torch.as_tensor(theta_true, dtype=torch.float32)
         if self.theta_true.shape != (2,) or not bool(self.theta_true.isfinite().all()):
             raise ValueError(
-                f"expected theta_true of two finite numbers; got {theta_true}; do "
+                f"expected theta_true of two finite numbers; got {theta_true}; "
                 "give, say, (0.0, 0.0)"
             )
         self.prior = make_prior()

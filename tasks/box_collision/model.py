@@ -116,7 +116,7 @@ def _check(theta: Tensor, action: Tensor) -> None:
     if theta.shape[1:] != (3,) or action.shape[1:] != (1,):
         raise ValueError(
             "expected theta (n, 3) and action (n, 1); got "
-            f"{tuple(theta.shape)} and {tuple(action.shape)}; do give one row a trial"
+            f"{tuple(theta.shape)} and {tuple(action.shape)}; give one row a trial"
         )
     outside = (theta < -ROUNDING) | (theta > 1 + ROUNDING)
     bad = torch.nonzero(outside.any(1))[:, 0]
@@ -124,5 +124,5 @@ def _check(theta: Tensor, action: Tensor) -> None:
         row = int(bad[0])
         raise ValueError(
             f"expected theta within [0, 1], {', '.join(PARAMETER_NAMES)}; got "
-            f"{theta[row].tolist()} in row {row}; do draw from the task's prior"
+            f"{theta[row].tolist()} in row {row}; draw from the task's prior"
         )

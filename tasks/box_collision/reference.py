@@ -143,7 +143,7 @@ class BoxCollisionReference:
         if noise is None or not bool((noise.parameters > 0).all()):
             raise ValueError(
                 "expected noise > 0, without which there is no posterior density; got "
-                "0; do choose get_task('box_collision', noise=0.005)"
+                "0; choose get_task('box_collision', noise=0.005)"
             )
         self.action = torch.as_tensor(action, dtype=torch.float32).reshape(-1, 1)
         self.x = torch.as_tensor(x, dtype=torch.float32)
@@ -152,13 +152,13 @@ class BoxCollisionReference:
         ):
             raise ValueError(
                 "expected action (t, 1) and x (t, 3); got "
-                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; do give one "
+                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; give one "
                 "row a trial"
             )
         if past is not None and past._simulator is not simulator:
             raise ValueError(
                 "expected a past posterior with this simulator; got one with another; "
-                "do leave past out"
+                "leave past out"
             )
         self._simulator, self._noise = simulator, noise
         self._num_workers = num_workers
@@ -242,7 +242,7 @@ class BoxCollisionReference:
             if not bool(log_likelihood.isfinite().any()):
                 raise ValueError(
                     "expected a draw of the prior that explains every trial's outcome; "
-                    f"got none of {len(log_ratio)}; do check which trials are invalid"
+                    f"got none of {len(log_ratio)}; check which trials are invalid"
                 )
             log_weight = (log_ratio + log_likelihood).where(is_exact, -torch.inf)
             self.effective_sample_size = float(effective_size(log_weight))
@@ -268,7 +268,7 @@ class BoxCollisionReference:
                 f"the posterior rests on {self.effective_sample_size:.0f} effective "
                 f"draws of {len(log_weight)}, so that its log densities are off by "
                 f"{self.log_evidence_se:.1f} nats or more: the outcome of a rocking "
-                "cube jumps with theta by more than the noise; do raise "
+                "cube jumps with theta by more than the noise; raise "
                 f"num_simulations from {self.num_simulations}",
                 stacklevel=3,
             )

@@ -54,8 +54,7 @@ def render(
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(
-            f"expected a path ending in {' or '.join(SUFFIXES)}; got {path}; do rename "
-            "it"
+            f"expected a path ending in {' or '.join(SUFFIXES)}; got {path}; rename it"
         )
     parameters = torch.as_tensor(theta).double().reshape(3).tolist()
     speed = float(torch.as_tensor(action).reshape(()))

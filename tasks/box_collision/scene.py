@@ -301,7 +301,7 @@ def load_mujoco() -> ModuleType:
         import mujoco
     except ImportError as error:
         raise ImportError(
-            "expected MuJoCo for the box collision; got no package 'mujoco'; do run "
+            "expected MuJoCo for the box collision; got no package 'mujoco'; run "
             "pip install 'sbi-active[mujoco]'"
         ) from error
     except Exception as error:  # what fails depends on the OpenGL that is missing

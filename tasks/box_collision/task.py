@@ -105,7 +105,7 @@ class BoxCollisionTask(Task):
         if self.theta_true.shape != (3,) or not bool(inside.all()):
             raise ValueError(
                 f"expected theta_true of three numbers within [0, 1]; got {theta_true};"
-                " do choose another truth"
+                " choose another truth"
             )
         self.target, self.variant, self.left_table = target, variant, left_table
         self.noise, self.reference_budget = noise, reference_budget
@@ -199,6 +199,6 @@ class BoxCollisionTask(Task):
 def _require(name: str, value: Any, valid: dict[Any, Any]) -> None:
     if value not in valid:
         raise ValueError(
-            f"expected {name} among {', '.join(map(repr, valid))}; got {value!r}; do "
+            f"expected {name} among {', '.join(map(repr, valid))}; got {value!r}; "
             "choose one of these"
         )

@@ -63,7 +63,7 @@ def mean(theta: Tensor, action: Tensor) -> Tensor:
     if not rows or theta.shape[-1] % 2 or action.shape[-1] != 2:
         raise ValueError(
             "expected theta (n, 2 K), two numbers a source, and action (n, 2); got "
-            f"{tuple(theta.shape)} and {tuple(action.shape)}; do give one row a trial"
+            f"{tuple(theta.shape)} and {tuple(action.shape)}; give one row a trial"
         )
     place, xi = theta.double(), action.double()
     signal = torch.tensor(BACKGROUND, dtype=torch.float64)

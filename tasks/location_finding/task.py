@@ -56,7 +56,7 @@ class LocationFindingTask(Task):
     ) -> None:
         if num_sources < 1:
             raise ValueError(
-                f"expected num_sources >= 1; got {num_sources}; do place one at least"
+                f"expected num_sources >= 1; got {num_sources}; place one at least"
             )
         if theta_true is None:
             pattern = torch.tensor([1.0, -0.5, -0.75, 0.5])
@@ -67,7 +67,7 @@ class LocationFindingTask(Task):
         ):
             raise ValueError(
                 f"expected theta_true of {2 * num_sources} finite numbers, two a "
-                f"source; got {theta_true}; do choose another truth"
+                f"source; got {theta_true}; choose another truth"
             )
         self.num_sources = num_sources
         dim = 2 * num_sources

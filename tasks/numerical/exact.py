@@ -72,7 +72,7 @@ class ExactPosterior:
         if self.action.size != self.x.size:
             raise ValueError(
                 f"expected one x an action; got {self.action.size} actions and "
-                f"{self.x.size} x; do pass both of shape (t,) or (t, 1)"
+                f"{self.x.size} x; pass both of shape (t,) or (t, 1)"
             )
         evidence, low, high = log_evidence(self._response, self.action, self.x[None])
         self.log_evidence = float(evidence[0])
@@ -255,7 +255,7 @@ def find_response(variant: str) -> Response:
     """The curve g of a variant; the error for an unknown one lists the valid names."""
     if variant not in RESPONSES:
         raise ValueError(
-            f"expected a variant among {', '.join(RESPONSES)}; got {variant!r}; do "
+            f"expected a variant among {', '.join(RESPONSES)}; got {variant!r}; "
             "choose one of these"
         )
     return RESPONSES[variant]
@@ -266,7 +266,7 @@ def as_actions(action: Tensor | ArrayLike) -> Array:
     vector = _as_vector(action, "action")
     if (abs(vector) > BOUND).any():
         raise ValueError(
-            f"expected actions in [-5, 5]; got {vector[abs(vector).argmax()]:g}; do "
+            f"expected actions in [-5, 5]; got {vector[abs(vector).argmax()]:g}; "
             "keep to the range of the task"
         )
     return vector
@@ -277,7 +277,7 @@ def as_parameters(theta: Tensor | ArrayLike) -> Array:
     rows = as_array(theta)
     if rows.ndim != 2 or rows.shape[1] != 2:
         raise ValueError(
-            f"expected theta of shape (n, 2); got {rows.shape}; do pass one row a draw"
+            f"expected theta of shape (n, 2); got {rows.shape}; pass one row a draw"
         )
     return rows
 
@@ -293,9 +293,9 @@ def _as_vector(values: Tensor | ArrayLike, name: str) -> Array:
     vector = as_array(values)
     if vector.ndim != 1 and (vector.ndim != 2 or vector.shape[1] != 1):
         raise ValueError(
-            f"expected {name} of shape (n,) or (n, 1); got {vector.shape}; do pass one "
+            f"expected {name} of shape (n,) or (n, 1); got {vector.shape}; pass one "
             "number a trial"
         )
     if not np.isfinite(vector).all():
-        raise ValueError(f"expected finite {name}; got nan or inf; do drop such trials")
+        raise ValueError(f"expected finite {name}; got nan or inf; drop such trials")
     return vector.ravel()

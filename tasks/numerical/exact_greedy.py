@@ -147,6 +147,6 @@ def _as_truth(theta_true: Tensor | ArrayLike) -> np.ndarray:
     truth = as_parameters(np.atleast_2d(as_array(theta_true)))
     if len(truth) != 1:
         raise ValueError(
-            f"expected one theta_true, shape (2,); got {truth.shape}; do pass one"
+            f"expected one theta_true, shape (2,); got {truth.shape}; pass one"
         )
     return truth

@@ -61,13 +61,13 @@ class NumericalTask(Task):
         if variant not in TRANSFORMS:
             raise ValueError(
                 f"expected variant among {', '.join(map(repr, TRANSFORMS))}; got "
-                f"{variant!r}; do choose one of these"
+                f"{variant!r}; choose one of these"
             )
         self.theta_true = torch.as_tensor(theta_true, dtype=torch.float32)
         if self.theta_true.shape != (2,) or bool((self.theta_true.abs() > BOUND).any()):
             raise ValueError(
                 f"expected theta_true of two numbers within [-5, 5]; got {theta_true}; "
-                "do choose another truth"
+                "choose another truth"
             )
         self.variant: Variant = variant
         self.prior = BoxUniform(-BOUND * torch.ones(2), BOUND * torch.ones(2))

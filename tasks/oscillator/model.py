@@ -97,7 +97,7 @@ def mean(theta: Tensor, action: Tensor) -> Tensor:
     if not rows or (theta.shape[-1], action.shape[-1]) != (4, 2):
         raise ValueError(
             "expected theta (n, 4) and action (n, 2); got "
-            f"{tuple(theta.shape)} and {tuple(action.shape)}; do give one row a trial"
+            f"{tuple(theta.shape)} and {tuple(action.shape)}; give one row a trial"
         )
     omega_0, zeta, gain, tau = theta.double()[..., None].unbind(-2)
     amplitude, omega = action.double()[..., None].unbind(-2)

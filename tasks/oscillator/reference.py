@@ -89,7 +89,7 @@ class OscillatorReference:
         if len(self.action) != len(self.x):
             raise ValueError(
                 f"expected one x per action; got {len(self.action)} actions and "
-                f"{len(self.x)} x; do pass as many rows"
+                f"{len(self.x)} x; pass as many rows"
             )
         self.noise_sd = noise_sd
         self.log_evidence, self.log_evidence_se = 0.0, 0.0
@@ -217,7 +217,7 @@ class OscillatorReference:
         else:
             raise RuntimeError(
                 f"expected the full likelihood within {MAX_STAGES} stages; got to its "
-                f"power {power:.3g}; do raise num_particles from {num_particles}"
+                f"power {power:.3g}; raise num_particles from {num_particles}"
             )
 
         n, log_weight = len(z), log_ratio + log_likelihood
@@ -256,9 +256,9 @@ def _rows(values: object, name: str, dim: int) -> Tensor:
         rows = rows.reshape(0, dim)
     if rows.ndim != 2 or rows.shape[1] != dim:
         raise ValueError(
-            f"expected {name} of shape (n, {dim}); got {tuple(rows.shape)}; do give "
+            f"expected {name} of shape (n, {dim}); got {tuple(rows.shape)}; give "
             "one row each"
         )
     if not bool(rows.isfinite().all()):
-        raise ValueError(f"expected finite {name}; got nan or inf; do drop these rows")
+        raise ValueError(f"expected finite {name}; got nan or inf; drop these rows")
     return rows

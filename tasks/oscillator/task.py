@@ -58,7 +58,7 @@ class OscillatorTask(Task):
         if not inside:
             raise ValueError(
                 "expected theta_true of four numbers between "
-                f"{PRIOR_LOW.tolist()} and {PRIOR_HIGH.tolist()}; got {theta_true}; do "
+                f"{PRIOR_LOW.tolist()} and {PRIOR_HIGH.tolist()}; got {theta_true}; "
                 "choose another truth"
             )
         self.actions = DiscreteActions(ACTIONS, names=ACTION_NAMES, units=ACTION_UNITS)

@@ -133,7 +133,7 @@ def read_recordings(directory: str | Path, *, rate: float = RATE) -> Recordings:
     if repeated:
         raise ValueError(
             f"expected one row a trial in trials.csv; got trial {repeated[0]} more "
-            "than once; do remove all rows but one"
+            "than once; remove all rows but one"
         )
     groups = dict(iter(samples.groupby("trial")))
     parts = []
@@ -141,7 +141,7 @@ def read_recordings(directory: str | Path, *, rate: float = RATE) -> Recordings:
         if name not in groups:
             raise ValueError(
                 f"expected samples of each of {len(trials)} trials; got none of trial "
-                f"{name} in samples.csv; do add them, or leave the trial out"
+                f"{name} in samples.csv; add them, or leave the trial out"
             )
         parts.append(_checked(name, groups[name]))
     return Recordings.from_samples(
@@ -152,7 +152,7 @@ def read_recordings(directory: str | Path, *, rate: float = RATE) -> Recordings:
 def _table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     if not path.is_file():
         raise FileNotFoundError(
-            f"expected recorded trials in {path}; got no such file; do give the folder "
+            f"expected recorded trials in {path}; got no such file; give the folder "
             "of trials.csv and samples.csv of the servo pendulum"
         )
     table = pd.read_csv(path)
@@ -160,7 +160,7 @@ def _table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
     if missing:
         raise ValueError(
             f"expected columns {', '.join(columns)} in {path.name}; got no "
-            f"{', '.join(missing)} among {', '.join(map(str, table.columns))}; do "
+            f"{', '.join(missing)} among {', '.join(map(str, table.columns))}; "
             "rename or add them"
         )
     return table
@@ -173,19 +173,19 @@ def _checked(name: Any, rows: pd.DataFrame) -> tuple[Array, Array, Array, Array]
             row = int(np.flatnonzero(~np.isfinite(values))[0])
             raise ValueError(
                 f"expected finite {column}; got {values[row]} in sample {row} of trial "
-                f"{name}; do remove that sample"
+                f"{name}; remove that sample"
             )
     time, goal, enabled, angle = columns
     if (np.diff(time) <= 0).any():
         row = int(np.flatnonzero(np.diff(time) <= 0)[0])
         raise ValueError(
             f"expected time_s that increases; got {time[row]:g} s, then "
-            f"{time[row + 1]:g} s in trial {name}; do sort its samples and drop repeats"
+            f"{time[row + 1]:g} s in trial {name}; sort its samples and drop repeats"
         )
     if time[-1] < DURATION - 0.1:
         raise ValueError(
             f"expected {DURATION:g} s of samples; got {time[-1]:g} s in trial {name}; "
-            "do leave the trial out"
+            "leave the trial out"
         )
     return time, goal, enabled, angle
 

@@ -80,7 +80,7 @@ class ServoPendulumTask(Task):
         if self.theta_true.shape != (len(PARAMETER_NAMES),):
             raise ValueError(
                 f"expected theta_true of {len(PARAMETER_NAMES)} numbers, "
-                f"{', '.join(PARAMETER_NAMES)}; got {theta_true}; do give one each"
+                f"{', '.join(PARAMETER_NAMES)}; got {theta_true}; give one each"
             )
         self.noise = servo_noise() if noise is None else noise
         self.prior = BoxUniform(torch.tensor(PRIOR_LOW), torch.tensor(PRIOR_HIGH))
@@ -146,7 +146,7 @@ class ServoPendulumTask(Task):
         if len(lost):
             raise ValueError(
                 "expected the action of a recorded trial, (kp, trajectory); got "
-                f"{action[lost[0]].tolist()}; do choose one of task.actions"
+                f"{action[lost[0]].tolist()}; choose one of task.actions"
             )
         return same.int().argmax(1).numpy()
 

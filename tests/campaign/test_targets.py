@@ -76,11 +76,11 @@ def test_random_actions_stay_random():
 
 
 def test_a_target_that_cannot_be_had():
-    with pytest.raises(ValueError, match="target 'model'; got no effects; do give"):
+    with pytest.raises(ValueError, match="target 'model'; got no effects; give"):
         campaign(effects=()).ask(target="model")
     c = campaign()
     tell(c, actions=(2.0,))
-    with pytest.raises(ValueError, match="at least 2 trials .* got 1 trials; do give"):
+    with pytest.raises(ValueError, match="at least 2 trials .* got 1 trials; give"):
         c.ask(target="model")
     assert c.pending is None
     with pytest.raises(ValueError, match="nonsense"):

@@ -114,7 +114,7 @@ def test_which_search():
         InformationGainDesigner(BOX, search="grid")
     with pytest.raises(TypeError, match="expected DiscreteActions; got BoxActions"):
         InformationGainDesigner(BOX, search="exhaustive")
-    with pytest.raises(TypeError, match="a list; do use search='exhaustive'"):
+    with pytest.raises(TypeError, match="a list; use search='exhaustive'"):
         InformationGainDesigner(lists, search="gradient")
     with pytest.raises(ValueError, match="expected a budget >= "):
         InformationGainDesigner(BOX).select(ExactModel(), simulator, budget=500, seed=0)

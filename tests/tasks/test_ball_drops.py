@@ -130,7 +130,7 @@ def test_a_cut_drop_is_masked_from_there_on():
 
 
 def test_data_that_are_not_there(capsys):
-    with pytest.raises(FileNotFoundError, match="got no drops.csv there; do give"):
+    with pytest.raises(FileNotFoundError, match="got no drops.csv there; give"):
         read_drops("nowhere")
     assert benchmark.main(["--data", "nowhere"]) == 2
     printed = capsys.readouterr().err
@@ -141,7 +141,7 @@ def test_data_that_are_not_there(capsys):
 def test_data_without_a_column():
     Path("drops.csv").write_text("ball,drop,time_s\na,1,0\n")
     Path("balls.csv").write_text("ball,mass_kg,circumference_m\na,1,1\n")
-    with pytest.raises(ValueError, match="got none named height_m; do name them so"):
+    with pytest.raises(ValueError, match="got none named height_m; name them so"):
         read_drops(".")
 
 

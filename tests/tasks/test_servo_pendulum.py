@@ -281,7 +281,7 @@ def test_recordings_that_do_not_fit(folder, name, change, message):
 
 def test_the_benchmark_says_where_it_looked(tmp_path, capsys):
     assert main(["--data", str(tmp_path), "--out", str(tmp_path / "out.json")]) == 2
-    assert "got no such file; do give the folder" in capsys.readouterr().err
+    assert "got no such file; give the folder" in capsys.readouterr().err
     assert not (tmp_path / "out.json").exists()
 
 

@@ -24,5 +24,5 @@ def get_world(name: str, **options: Any) -> World:
         options: Of the world, see its ``make_world``.
     """
     if name not in WORLDS:
-        raise ValueError(f"expected a world among {[*WORLDS]}; got {name!r}; do choose")
+        raise ValueError(f"expected a world among {[*WORLDS]}; got {name!r}; choose")
     return WORLDS[name](**options)

@@ -9,8 +9,6 @@ from typing import Literal
 from sbi_active.campaign.state import CampaignState
 from sbi_active.inference.refinement.regression_error import LARGE
 
-__all__ = ["Health", "assess", "log_e_value"]
-
 Health = Literal["ok", "watch", "alarm"]
 
 #: Probability of an alarm at any time while the simulator is right, half of it by each

@@ -7,8 +7,6 @@ import math
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.refinement.regression_error import LARGE
 
-__all__ = ["error_nats", "misfit"]
-
 
 def misfit(diagnostics: Diagnostics) -> float | None:
     """Return a belief's tail probability, of all trials or the worst, both counted.

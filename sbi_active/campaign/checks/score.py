@@ -17,8 +17,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["Score", "score_outcome"]
-
 #: Numbers of x up to which a kernel estimate says more than a Gaussian.
 MAX_DIM = 8
 TIE = 1e-9  # of a distance, by which rounding may part equal ones

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Spread"]
-
 #: Shares of the diagonal among which the leave-one-out likelihood chooses.
 SHARES = torch.logspace(-10, 0, 21, dtype=torch.float64)
 FLOOR = 1e-10  # of the largest variance, for numbers that never vary

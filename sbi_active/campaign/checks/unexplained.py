@@ -17,8 +17,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 from sbi_active.simulation.workers.settings import Workers
 
-__all__ = ["doubts", "in_doubt", "is_suspect", "outlyingness", "simulate_prior"]
-
 SUSPECT = 0.01  # surprise below which a trial is compared with the prior
 NOTABLE = 0.1  # ranges beyond all simulations that are worth a word
 CONSTANT = 1e-6  # range over size below which a number counts as one that never varies

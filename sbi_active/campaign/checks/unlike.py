@@ -7,8 +7,6 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 
-__all__ = ["most_unlike"]
-
 MANY = 1_024  # draws of a space without end
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_campaign"]
-
 Array = NDArray[Any]
 
 MOST_PARAMETERS = 24  # that have a panel
@@ -279,7 +277,7 @@ def _information(ax: Axes, state: CampaignState) -> None:
     else:
         total = "information by trial"
     worst = [h for h in ("alarm", "watch") if BARS[h] in colors]
-    ax.set_title(total + (f"; colored: {', '.join(worst)}" if worst else ""))
+    ax.set_title(total + (f"; {', '.join(worst)}" if worst else ""))
     ax.title.set_fontsize(10)
     ax.set(xlabel="trial", ylabel="information [nats]")
 

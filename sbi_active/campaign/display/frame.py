@@ -17,8 +17,6 @@ from sbi_active.design.design import Design, action_labels
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["expected_gain", "health_after", "outcome_labels", "to_dataframe"]
-
 MOST_NUMBERS = 16  # of an outcome that have a column each
 #: Columns with numbers, NaN where they are not known.
 NUMBERS = (

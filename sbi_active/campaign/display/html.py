@@ -8,8 +8,6 @@ from torch import Tensor
 
 from sbi_active.notebook import badge, card, facts, number, table
 
-__all__ = ["campaign_html", "trial_html"]
-
 MOST_TRIALS = 12  # of a table, the last ones
 MOST_NUMBERS = 6  # of an outcome
 KINDS = {"ok": "good", "watch": "fair", "alarm": "bad"}

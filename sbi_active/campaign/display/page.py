@@ -11,8 +11,6 @@ from typing import Any
 from sbi_active.notebook import badge, escaped, items, parameters, table
 from sbi_active.seeding import forked_generators
 
-__all__ = ["page", "write_page"]
-
 STYLE = """
 :root { color-scheme: light dark; }
 body { font-family: system-ui, sans-serif; margin: 2em auto; max-width: 62em;

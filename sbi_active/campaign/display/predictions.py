@@ -14,8 +14,6 @@ from sbi_active.campaign.state import CampaignState
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
-__all__ = ["predict"]
-
 Array = NDArray[Any]
 
 

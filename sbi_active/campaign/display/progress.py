@@ -11,8 +11,6 @@ from typing import Any
 
 from sbi_active.campaign.state import CampaignState
 
-__all__ = ["LOGGER", "StageWatch", "rounds"]
-
 #: Says what takes long; the program that uses the library decides where to.
 LOGGER = logging.getLogger("sbi_active")
 LOGGER.addHandler(logging.NullHandler())

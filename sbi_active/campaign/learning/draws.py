@@ -8,8 +8,6 @@ from torch.distributions import Distribution
 from sbi_active.campaign.state import CampaignState
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["NUM_KEPT", "keep_draws"]
-
 NUM_KEPT = 256  # 4 % error of a standard deviation, and 3 kB a trial of 3 parameters
 
 

@@ -14,8 +14,6 @@ from sbi_active.actions import ActionSpace
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
-__all__ = ["IndexedSimulator", "at_index", "depends_on_index"]
-
 
 def at_index(simulator: Any, index: int) -> Any:
     """Return the simulator of one trial.

@@ -46,8 +46,6 @@ from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 
-__all__ = ["Learner"]
-
 
 class Learner:
     """Trains, scores and updates for a campaign, and writes it to the campaign's state.

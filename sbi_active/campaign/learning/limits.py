@@ -13,8 +13,6 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.design.choice import pricing
 from sbi_active.design.eligibility import DesignLimits
 
-__all__ = ["Limits"]
-
 
 @dataclass(frozen=True)
 class Limits:

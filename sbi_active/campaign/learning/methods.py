@@ -20,8 +20,6 @@ from sbi_active.inference import (
     SeqBED_C,
 )
 
-__all__ = ["METHODS", "Method", "faithful_options", "find_method"]
-
 
 @dataclass(frozen=True)
 class Method:
@@ -45,7 +43,7 @@ def _asbi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
     if options.posterior != "importance":
         raise ValueError(
             "expected posterior 'importance' for ASBI, whose network is a density and "
-            f"needs no sampler; got {options.posterior!r}; do leave it out"
+            f"needs no sampler; got {options.posterior!r}; leave it out"
         )
     return ASBI(prior, options.density_estimator, show_progress_bars=False)
 
@@ -100,7 +98,7 @@ def find_method(name: str) -> Method:
     if name not in METHODS:
         raise ValueError(
             f"expected method to be one of {', '.join(map(repr, METHODS))}; got "
-            f"{name!r}; do choose one of these"
+            f"{name!r}; choose one of these"
         )
     return METHODS[name]
 

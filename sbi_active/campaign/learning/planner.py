@@ -15,14 +15,13 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, action_labels, action_name, are_categories
-from sbi_active.design.designer import InformationGainDesigner, RandomDesigner
+from sbi_active.design.designer import InformationGainDesigner
+from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.information_gain.estimators.automatic import ESTIMATORS
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Criticism, Effect
-
-__all__ = ["Planner"]
 
 FEWEST_TRIALS = 2  # that rivals can be compared on
 
@@ -72,7 +71,7 @@ class Planner:
         if not self._designs:
             raise ValueError(
                 f"expected target 'auto' or 'theta', since the method "
-                f"{self._state.method!r} draws actions at random; got {target!r}; do "
+                f"{self._state.method!r} draws actions at random; got {target!r}; "
                 "use a method that designs them, such as 'asbi'"
             )
         told = sum(t.is_measured for t in self._state.trials)
@@ -80,7 +79,7 @@ class Planner:
             lacking = f"{told} trials" if self.effects else "no effects"
             raise ValueError(
                 f"expected effects and at least {FEWEST_TRIALS} trials for the target "
-                f"'model'; got {lacking}; do give Campaign(effects=...), and ask for "
+                f"'model'; got {lacking}; give Campaign(effects=...), and ask for "
                 "'theta' first"
             )
 

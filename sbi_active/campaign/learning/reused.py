@@ -21,8 +21,6 @@ from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import Workers
 from sbi_active.simulation.workers.store import find_store
 
-__all__ = ["first_round"]
-
 LOGGER = logging.getLogger("sbi_active")
 
 

@@ -20,8 +20,6 @@ from sbi_active.simulation import SimulatorModel
 if TYPE_CHECKING:
     from sbi_active.criticism import Criticism, Effect, Report
 
-__all__ = ["compare", "criticize", "rebuilt", "recompute", "revise"]
-
 
 def compare(
     state: CampaignState,
@@ -108,7 +106,7 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     if not chosen:
         raise ValueError(
             "expected a report whose verdict names effects; got the verdict "
-            f"{report.verdict!r}, which adds none; do criticize(effects) with further "
+            f"{report.verdict!r}, which adds none; criticize(effects) with further "
             "effects, or after further trials"
         )
     before = state.version
@@ -117,7 +115,7 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     if report.digest not in before.examined or names != [*before.effects, *chosen]:
         raise ValueError(
             f"expected a report of the current model, version {before.number}; got one "
-            "of another; do criticize() again"
+            "of another; criticize() again"
         )
     version = ModelVersion(
         number=before.number + 1,

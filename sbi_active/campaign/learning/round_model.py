@@ -7,8 +7,6 @@ from typing import Any
 
 from sbi_active.campaign.isolation import isolated
 
-__all__ = ["RoundModel"]
-
 DENSITIES = ("log_posterior", "log_likelihood", "log_ratio")
 
 

@@ -22,8 +22,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Absent", "NotStorableError", "decode", "encode"]
-
 #: Packages whose classes are stored by their attributes.
 TRUSTED = (
     "sbi_active.",

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["DamagedCampaignError"]
-
 
 class DamagedCampaignError(OSError):
     """A file of a campaign that does not hold what was written to it.

@@ -21,15 +21,6 @@ from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.simulation.workers.settings import Workers
 
-__all__ = [
-    "actions_from",
-    "describe_actions",
-    "describe_options",
-    "describe_prior",
-    "options_from",
-    "prior_from",
-]
-
 #: Arguments by which each is made anew.
 _PRIORS: dict[type, tuple[str, ...]] = {
     td.Uniform: ("low", "high"),

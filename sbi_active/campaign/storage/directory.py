@@ -21,8 +21,6 @@ from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.simulation.bank.lock import WriterLock
 from sbi_active.simulation.bank.segments import write_file
 
-__all__ = ["CampaignDirectory"]
-
 LOG, STATE, BELIEF, SIMULATIONS = "trials.jsonl", "state.bin", "belief", "simulations"
 
 

@@ -32,8 +32,6 @@ from sbi_active.simulation.bank.fingerprint import fingerprint
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect
 
-__all__ = ["Loaded", "StoredLearner", "load"]
-
 
 @dataclass(frozen=True)
 class Loaded:

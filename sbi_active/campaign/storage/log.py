@@ -13,8 +13,6 @@ from typing import Any
 from sbi_active.campaign.storage.damage import DamagedCampaignError
 from sbi_active.simulation.bank.segments import synchronize, write_file
 
-__all__ = ["TrialLog"]
-
 
 class TrialLog:
     """A file of JSON lines that is only ever added to.

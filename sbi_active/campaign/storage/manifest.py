@@ -24,14 +24,6 @@ from sbi_active.campaign.storage.described import (
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
 from sbi_active.simulation.bank.segments import write_file
 
-__all__ = [
-    "has_manifest",
-    "new_manifest",
-    "read_manifest",
-    "require_same_simulator",
-    "write_manifest",
-]
-
 MANIFEST, COPY = "campaign.json", "campaign.json.copy"
 FORMAT, SCHEMA = "sbi-active campaign", 1
 PACKAGES = ("sbi-active", "sbi", "torch", "numpy")

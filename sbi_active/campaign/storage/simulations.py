@@ -13,8 +13,6 @@ from sbi_active.simulation.bank.header import has_header
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.store import RowStore
 
-__all__ = ["CampaignBanks", "num_rows"]
-
 
 def num_rows(folder: str | None) -> int:
     """Return how many rows of the simulator itself a folder of banks has.

@@ -15,8 +15,6 @@ from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.simulations import CampaignBanks
 from sbi_active.simulation.workers.store import storing
 
-__all__ = ["Storage", "known", "stored"]
-
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 

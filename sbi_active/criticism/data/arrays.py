@@ -11,8 +11,6 @@ from torch import Tensor
 
 from sbi_active.arrays import measured
 
-__all__ = ["padded", "repeated", "require_labels", "root"]
-
 
 def padded(value: Any) -> Tensor:
     """Return copies of arrays stacked, shorter ones padded with NaN at their end."""
@@ -24,7 +22,7 @@ def padded(value: Any) -> Tensor:
     if len({row.shape[1:] for row in rows}) > 1 or any(r.ndim == 0 for r in rows):
         raise ValueError(
             "expected observations that differ in their first axis alone; got shapes "
-            f"{[tuple(row.shape) for row in rows]}; do give the same channels in each"
+            f"{[tuple(row.shape) for row in rows]}; give the same channels in each"
         )
     longest = max(len(row) for row in rows)
     x = torch.full((len(rows), longest, *rows[0].shape[1:]), torch.nan).double()

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 
-__all__ = ["Measurements"]
-
 Array = NDArray[Any]
 
 

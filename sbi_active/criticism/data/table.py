@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.table_columns import Columns, find_columns
 
-__all__ = ["TrialTable", "read_table"]
-
 Array = NDArray[Any]
 
 EMPTY = ("", "nan", "none", "na", "<na>")
@@ -72,7 +70,7 @@ def read_table(
     if frame.empty:
         raise ValueError(
             f"expected a header and one row a trial or sample; got 0 rows in {source}; "
-            "do write, say, action_speed,x_distance"
+            "write, say, action_speed,x_distance"
         )
     return TrialTable(arguments=_Rows(frame, found, source).trials(), columns=found)
 
@@ -87,7 +85,7 @@ class _Rows:
             for i in np.flatnonzero(part == ""):
                 raise ValueError(
                     f"expected the name of a trial in column {column}, row {i + 1}; "
-                    f"got an empty cell in {source}; do fill it in"
+                    f"got an empty cell in {source}; fill it in"
                 )
         labels = [" ".join(words) for words in zip(*parts, strict=True)]
         if not columns.trial:
@@ -117,7 +115,7 @@ class _Rows:
             one = first[np.flatnonzero(index == index[t])[0]]
             raise ValueError(
                 f"expected each trial once; got index {index[t]:g} in rows {one + 1} "
-                f"and {first[t] + 1} of {self.source}; do remove one, or give each its "
+                f"and {first[t] + 1} of {self.source}; remove one, or give each its "
                 "own index where both were executed"
             )
         found: dict[str, Any] = {"action": action, "x": x, "index": index}
@@ -170,13 +168,13 @@ class _Rows:
         for i in np.flatnonzero(np.isnan(values) & ~blank):
             raise ValueError(
                 f"expected a number in column {column}, {self.place(i)}; got "
-                f"{text.iloc[i]!r} in {self.source}; do "
+                f"{text.iloc[i]!r} in {self.source}; "
                 + (_remedy(column, text.iloc[i]) or leave)
             )
         for i in np.flatnonzero(np.isinf(values) if empty else ~np.isfinite(values)):
             raise ValueError(
                 f"expected a finite number in column {column}, {self.place(i)}; got "
-                f"{text.iloc[i] or 'an empty cell'} in {self.source}; do "
+                f"{text.iloc[i] or 'an empty cell'} in {self.source}; "
                 + (leave if empty else "fill it in")
             )
         return values
@@ -190,7 +188,7 @@ class _Rows:
             raise ValueError(
                 f"expected one value of {column} in each trial; got {values[one]} in "
                 f"row {one + 1} and {values[i]} in {self.place(i)} of {self.source}; "
-                "do give each trial its own name, or x_* to what varies"
+                "give each trial its own name, or x_* to what varies"
             )
         return own
 
@@ -203,13 +201,13 @@ class _Rows:
                 raise ValueError(
                     f"expected each sample once; got {column} = {time[order[k]]:g} s "
                     f"in rows {one} and {two} of {self.source}, both of trial {name}; "
-                    "do remove one, or give each trial its own name"
+                    "remove one, or give each trial its own name"
                 )
             for k in np.flatnonzero(np.diff(time[at]) < 0):
                 raise ValueError(
                     "expected times that increase within a trial; got "
                     f"{time[at[k + 1]]:g} s in {self.place(at[k + 1])} after "
-                    f"{time[at[k]]:g} s in row {at[k] + 1} of {self.source}; do sort "
+                    f"{time[at[k]]:g} s in row {at[k] + 1} of {self.source}; sort "
                     "its rows, or give each trial its own name"
                 )
 
@@ -226,7 +224,7 @@ class _Rows:
             if one != t:
                 raise ValueError(
                     f"expected each trial once; got the same numbers in {what} "
-                    f"{self.names[one]} and {self.names[t]} of {self.source}; do "
+                    f"{self.names[one]} and {self.names[t]} of {self.source}; "
                     "remove one, or give each its own index where both were executed"
                 )
 
@@ -235,7 +233,7 @@ class _Rows:
             raise ValueError(
                 "expected a role 'fit' or 'held out' in column "
                 f"{self.columns.optional['role']}, {self.place(self.first[t])}; got "
-                f"{role!r} in {self.source}; do write one of them, or leave it empty "
+                f"{role!r} in {self.source}; write one of them, or leave it empty "
                 "for fit"
             )
         return role or "fit"
@@ -246,7 +244,7 @@ class _Rows:
         for t in np.flatnonzero((repeated >= 0) & ~np.isin(repeated, index)):
             raise ValueError(
                 f"expected in repeat_of an index of the table; got {repeated[t]:g} in "
-                f"{self.place(self.first[t])} of {self.source}; do give that of the "
+                f"{self.place(self.first[t])} of {self.source}; give that of the "
                 "first trial of this action"
             )
         return [place[value] if value >= 0 else -1 for value in repeated]
@@ -284,7 +282,7 @@ class _Rows:
         warnings.warn(
             f"{column} of {'trials' if self.columns.trial else 'rows'} {which} in "
             f"{self.source} is about {factor:.0f} times {word} than that of the "
-            "others: do check that all are in one unit",
+            "others: check that all are in one unit",
             stacklevel=5,
         )
 
@@ -301,7 +299,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
     """Return a CSV file as text, its first row as the names of the columns."""
     if not path.is_file():
         raise FileNotFoundError(
-            f"expected a CSV file; got none at {path}; do check the path"
+            f"expected a CSV file; got none at {path}; check the path"
         )
     try:
         table = pd.read_csv(
@@ -317,12 +315,12 @@ def _read_csv(path: Path) -> pd.DataFrame:
     except pd.errors.ParserError as error:
         raise ValueError(
             f"expected a CSV file with as many cells in each row as in the first; got "
-            f"{error} in {path}; do check the commas"
+            f"{error} in {path}; check the commas"
         ) from error
     header = [str(c).strip() for c in table.iloc[0]]
     if len(header) == 1 and re.search(r"[;\t]", header[0]):
         raise ValueError(
-            f"expected cells separated by commas; got {header[0]!r} in {path}; do save "
+            f"expected cells separated by commas; got {header[0]!r} in {path}; save "
             "the table with commas"
         )
     return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)

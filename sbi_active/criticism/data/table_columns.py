@@ -7,8 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-__all__ = ["Columns", "find_columns"]
-
 ACTION, OBSERVATION, TRIAL, TIME = "action_", "x_", "trial", "time"
 OPTIONAL = ("role", "index", "repeat_of")
 KEYS = (TRIAL, TIME, "action", "x", *OPTIONAL)
@@ -74,7 +72,7 @@ def find_columns(
     if twice:
         raise ValueError(
             f"expected each column once; got {', '.join(twice)} more than once in "
-            f"{source}; do remove or rename one"
+            f"{source}; remove or rename one"
         )
     found = (
         _by_name(names, source) if columns is None else _as_told(names, columns, source)
@@ -83,14 +81,14 @@ def find_columns(
         there, missing = (TRIAL, TIME) if found[TRIAL] else (TIME, TRIAL)
         raise ValueError(
             f"expected columns {TRIAL} and {TIME} in a table with one row a sample; "
-            f"got {there} without {missing} in {source}; do add a column {missing}, or "
+            f"got {there} without {missing} in {source}; add a column {missing}, or "
             f"remove {there} where a row is a trial"
         )
     for key, beginning in (("action", ACTION), ("x", OBSERVATION)):
         if not found[key]:
             raise ValueError(
                 f"expected columns {beginning}*; got {', '.join(names)} in {source}; "
-                "do name them, as in action_speed, x_distance[m]"
+                "name them, as in action_speed, x_distance[m]"
             )
     used = [name for group in found.values() for name in group]
     stated = _units(used, names, units or {}, source)
@@ -100,7 +98,7 @@ def find_columns(
         if unit not in ("", *SECONDS):
             raise ValueError(
                 f"expected times in {', '.join(SECONDS)}; got {unit} in column {time} "
-                f"of {source}; do convert them"
+                f"of {source}; convert them"
             )
         stated[time] = unit
     return Columns(
@@ -127,13 +125,13 @@ def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
         if len(found[key]) > 1:
             raise ValueError(
                 f"expected one column {key}; got {', '.join(found[key])} in {source}; "
-                "do keep one"
+                "keep one"
             )
     unknown = found.pop("")
     if unknown and found["action"] and found["x"]:
         raise ValueError(
             f"expected columns {ACTION}*, {OBSERVATION}*, {TRIAL}, {TIME}, "
-            f"{', '.join(OPTIONAL)}; got {', '.join(unknown)} in {source}; do rename "
+            f"{', '.join(OPTIONAL)}; got {', '.join(unknown)} in {source}; rename "
             "or remove what is none of these, or say which columns are what"
         )
     return {key: (*group,) for key, group in found.items()}
@@ -145,7 +143,7 @@ def _as_told(
     wrong = [key for key in columns if key not in KEYS]
     if wrong:
         raise ValueError(
-            f"expected columns of {', '.join(KEYS)}; got {', '.join(wrong)}; do say "
+            f"expected columns of {', '.join(KEYS)}; got {', '.join(wrong)}; say "
             "which columns are these"
         )
     of = {_bare(name): name for name in names} | {name: name for name in names}
@@ -157,11 +155,11 @@ def _as_told(
             hint = f"; {near[0]} is close" if near else ""
             raise ValueError(
                 f"expected a column {name} for {key}; got {', '.join(names)} in "
-                f"{source}{hint}; do correct the name"
+                f"{source}{hint}; correct the name"
             )
         if key in (TIME, *OPTIONAL) and len(told) > 1:
             raise ValueError(
-                f"expected one column for {key}; got {', '.join(told)}; do keep one"
+                f"expected one column for {key}; got {', '.join(told)}; keep one"
             )
         found[key] = tuple(of[name] for name in told)
     return found
@@ -174,7 +172,7 @@ def _units(
     if unknown:
         raise ValueError(
             f"expected units of columns {', '.join(names)}; got one of "
-            f"{', '.join(sorted(unknown))}; do correct the name"
+            f"{', '.join(sorted(unknown))}; correct the name"
         )
     found: dict[str, str] = {}
     seen: dict[str, str] = {}
@@ -185,14 +183,14 @@ def _units(
         if header and given and header != given:
             raise ValueError(
                 f"expected one unit of column {name}; got [{header}] in the header of "
-                f"{source} and {given} in units; do convert the numbers, or correct one"
+                f"{source} and {given} in units; convert the numbers, or correct one"
             )
         found[name] = header or given
         other = seen.setdefault(_bare(name), name)
         if other != name:
             raise ValueError(
                 f"expected each quantity in one unit; got {other} and {name} in "
-                f"{source}; do convert one and merge them"
+                f"{source}; convert one and merge them"
             )
     return found
 

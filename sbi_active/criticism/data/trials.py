@@ -20,8 +20,6 @@ from sbi_active.criticism.data.arrays import (
 )
 from sbi_active.criticism.data.table import read_table
 
-__all__ = ["Role", "Trials"]
-
 Role = Literal["fit", "held out"]
 
 
@@ -79,12 +77,12 @@ class Trials:
         if self.action.ndim != 2 or len(self.action) != n or 0 in self.action.shape:
             raise ValueError(
                 "expected actions (n, action_dim) and x with as many rows; got "
-                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; do give one "
+                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; give one "
                 "action a trial"
             )
         if not bool(self.action.isfinite().all()):
             raise ValueError(
-                "expected finite actions; got NaN or inf; do give each trial the "
+                "expected finite actions; got NaN or inf; give each trial the "
                 "action that was commanded"
             )
         if self.x.ndim == 1:
@@ -121,13 +119,13 @@ class Trials:
         if not bool(self.valid.any()):
             raise ValueError(
                 f"expected at least one valid trial; got {n} trials without a "
-                "measurement; do check x and mask for NaN"
+                "measurement; check x and mask for NaN"
             )
         lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
         if lost:
             raise ValueError(
                 f"expected measurements in the held-out trials; got NaN in trials "
-                f"{lost}; do hold out other trials"
+                f"{lost}; hold out other trials"
             )
 
     @classmethod
@@ -270,7 +268,7 @@ class Trials:
         if not positions:
             raise ValueError(
                 f"expected at least one trial of role {role!r}; got none of "
-                f"{len(self)}; do change role"
+                f"{len(self)}; change role"
             )
         return self.select(positions)
 
@@ -279,7 +277,7 @@ class Trials:
         if tensor.shape != (len(self),):
             raise ValueError(
                 f"expected {name} of shape ({len(self)},), one a trial; got "
-                f"{tuple(tensor.shape)}; do give one each"
+                f"{tuple(tensor.shape)}; give one each"
             )
         return tensor
 
@@ -291,7 +289,7 @@ class Trials:
         if keep.shape != self.x.shape:
             raise ValueError(
                 f"expected a mask of shape {tuple(self.x.shape)}, that of x; got "
-                f"{tuple(keep.shape)}; do give one an entry of x"
+                f"{tuple(keep.shape)}; give one an entry of x"
             )
         if not bool(((keep == 0) | (keep == 1) | keep.isnan()).all()):
             wrong = float(keep[(keep != 0) & (keep != 1) & ~keep.isnan()][0])
@@ -309,7 +307,7 @@ class Trials:
         if tensor.shape not in ((k,), (len(self), k)):
             raise ValueError(
                 f"expected sample_times of shape ({k},) or ({len(self)}, {k}) for x of "
-                f"shape {tuple(self.x.shape)}; got {tuple(tensor.shape)}; do give one "
+                f"shape {tuple(self.x.shape)}; got {tuple(tensor.shape)}; give one "
                 "an entry of x's first axis"
             )
         stamps = tensor.expand(len(self), k)
@@ -319,14 +317,14 @@ class Trials:
                 raise ValueError(
                     f"expected as many sample_times as samples in each trial; got "
                     f"{int(stamps[i].isfinite().sum())} for "
-                    f"{int(measured[i].nonzero().max()) + 1} samples in trial {i}; do "
+                    f"{int(measured[i].nonzero().max()) + 1} samples in trial {i}; "
                     "give one an entry of x's first axis"
                 )
             own = stamps[i][stamps[i].isfinite()]
             if bool((own.diff() <= 0).any()):
                 raise ValueError(
                     f"expected sample_times that increase; got {own.tolist()[:6]}... "
-                    f"in trial {i}; do sort its samples by time"
+                    f"in trial {i}; sort its samples by time"
                 )
         return tensor
 
@@ -337,7 +335,7 @@ def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
     if len(roles) != n or not {*roles} <= {"fit", "held out"}:
         raise ValueError(
             f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "
-            "do give one each"
+            "give one each"
         )
     return roles
 

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from sbi_active.criticism.effects.effect import Context, Effect
 
-__all__ = ["applied"]
-
 
 def applied(
     effect: Effect, value: Any, phi: Tensor, action: Tensor, context: Context

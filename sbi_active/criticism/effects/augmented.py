@@ -17,8 +17,6 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.model import NOISE_STREAM
 
-__all__ = ["AugmentedSimulator", "takes_times"]
-
 #: Rows on which an effect is compared with the simulator without it.
 NUM_CHECKED = 16
 #: Largest difference at the null, in deviations of x over the checked rows: single
@@ -161,7 +159,7 @@ class AugmentedSimulator(SimulatorModel):
         if theta_dim < 1:
             raise ValueError(
                 f"expected (theta, phi) with {sum(sizes)} numbers for the effects; got "
-                f"{parameters.shape[1]} columns; do draw from joint_prior"
+                f"{parameters.shape[1]} columns; draw from joint_prior"
             )
         theta, *phi = parameters.split([theta_dim, *sizes], -1)
         return theta, {e.name: p for e, p in zip(campaign, phi, strict=True)}
@@ -312,7 +310,7 @@ class AugmentedSimulator(SimulatorModel):
                 raise ValueError(
                     f"expected effect {effect.name!r} to vanish at its null "
                     f"{effect.null}; got {changed} changed by up to "
-                    f"{difference:.3g}; do correct apply or null"
+                    f"{difference:.3g}; correct apply or null"
                 )
             if effect.hook == "noise":
                 _require_positive(effect, torch.ones_like(x), action, context)

@@ -8,11 +8,6 @@ import torch
 
 from sbi_active.criticism.effects.effect import NUM_DRAWS, Effect
 
-__all__ = [
-    "require_distinct",
-    "require_nested",
-]
-
 #: Step from the null towards a draw: a null on the edge of a support belongs to it.
 STEP = 1e-6
 
@@ -53,7 +48,7 @@ def _require_once(names: Sequence[str], expected: str) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(
-            f"expected {expected}; got {', '.join(twice)} more than once; do rename "
+            f"expected {expected}; got {', '.join(twice)} more than once; rename "
             "one of them"
         )
 

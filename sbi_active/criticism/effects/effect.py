@@ -13,8 +13,6 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 
-__all__ = ["Context", "Effect", "Hook"]
-
 Hook = Literal["action", "parameter", "dynamics", "observation", "noise"]
 
 #: Stands for an infinite null where the formula has no limit in floating point.
@@ -88,12 +86,11 @@ class Effect:
         if self.hook not in get_args(Hook):
             raise ValueError(
                 f"expected a hook of {', '.join(get_args(Hook))}; got {self.hook!r}; "
-                f"do say what effect {self.name!r} changes"
+                f"say what effect {self.name!r} changes"
             )
         if self.scope not in ("campaign", "trial"):
             raise ValueError(
-                f"expected scope 'campaign' or 'trial'; got {self.scope!r}; do choose "
-                "one"
+                f"expected scope 'campaign' or 'trial'; got {self.scope!r}; choose one"
             )
         object.__setattr__(self, "null", _sound_null(self))
         _require_finite_draws(self)
@@ -130,7 +127,7 @@ class Effect:
         if len(names) != effect.phi_dim:
             raise ValueError(
                 f"expected {effect.phi_dim} keywords for effect {name!r}, one an entry "
-                f"of phi; got {', '.join(names)}; do name each"
+                f"of phi; got {', '.join(names)}; name each"
             )
         return effect
 
@@ -226,7 +223,7 @@ def _sound_null(effect: Effect) -> Any:
     if null.numel() not in (1, effect.phi_dim):
         raise ValueError(
             f"expected a null of shape ({effect.phi_dim},), the shape of a draw of "
-            f"effect {effect.name!r}; got {tuple(null.shape)}; do give one each"
+            f"effect {effect.name!r}; got {tuple(null.shape)}; give one each"
         )
     if bool(null.isnan().any()):
         raise ValueError(

@@ -20,8 +20,6 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
 
-__all__ = ["generic_effects"]
-
 #: Relative error of an actuator or sensor, one prior deviation.
 GAIN = 0.1
 #: Offset and dead zone of an actuator, in ranges of the action space.
@@ -60,7 +58,7 @@ def generic_effects(
     if model.noise is None and prior is None:
         raise ValueError(
             "expected a simulator with declared noise, or its prior; got neither, so "
-            "nothing says how large a bias may be; do give prior="
+            "nothing says how large a bias may be; give prior="
         )
     spread = None
     sd = None if model.noise is None else declared_sds(model.noise)
@@ -208,7 +206,7 @@ def _shift_in_time(
     """Return x at times + phi, linear between samples and beyond the ends."""
     if context.times is None:
         raise ValueError(
-            "expected sample times for an offset of the clock; got none; do give "
+            "expected sample times for an offset of the clock; got none; give "
             "SimulatorModel(sample_times=...)"
         )
     times = context.times.expand(len(value), -1).contiguous()

@@ -14,8 +14,6 @@ from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.seeding import kept_generators
 
-__all__ = ["JointPrior", "joint_prior"]
-
 
 class JointPrior(Distribution):
     r"""Prior of the parameters and the effects,
@@ -115,7 +113,7 @@ def _elementwise(support: Any) -> constraints.Constraint:
     if support.event_dim > 0:
         raise ValueError(
             "expected priors whose numbers are bounded one by one; got a support "
-            f"{support}; do give parameters in coordinates without such a constraint"
+            f"{support}; give parameters in coordinates without such a constraint"
         )
     return support
 

@@ -27,8 +27,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
 
-__all__ = ["MANY", "MOST", "Summarized", "obstacle", "summarize"]
-
 Array = NDArray[Any]
 
 #: Numbers a trial beyond which summaries are taken unless they are refused.
@@ -91,7 +89,7 @@ def summarize(
     if reason:
         raise ValueError(
             "expected whole observations with independent Gaussian noise for "
-            f"summaries; got {reason}; do set summaries=0, which compares all numbers"
+            f"summaries; got {reason}; set summaries=0, which compares all numbers"
         )
     x = trials.x.flatten(1)
     base = model.base if isinstance(model, AugmentedSimulator) else model
@@ -192,7 +190,7 @@ def _trained(
         if x.shape[1] != len(sd):
             raise ValueError(
                 f"expected trials of the simulator's {x.shape[1]} numbers; got "
-                f"{len(sd)}; do measure what the simulator returns"
+                f"{len(sd)}; measure what the simulator returns"
             )
         return x / sd
 

@@ -10,8 +10,6 @@ from sbi_active.criticism.evidence.importance import Array, ImportanceSample
 from sbi_active.criticism.results import Evidence
 from sbi_active.criticism.rivals.rival import Rival
 
-__all__ = ["Fit"]
-
 
 @dataclass(frozen=True)
 class Fit:

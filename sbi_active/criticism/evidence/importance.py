@@ -13,8 +13,6 @@ from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["ImportanceSample", "importance_sample", "lower_factors"]
-
 Array = NDArray[Any]
 
 #: Particles a round, rounds at most, and the effective number that ends them.

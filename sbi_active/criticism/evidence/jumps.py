@@ -12,8 +12,6 @@ from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.seeding import derive_seed
 
-__all__ = ["look_for_jumps", "quadratic"]
-
 Array = NDArray[Any]
 
 #: Finite-difference steps in prior deviations, and where two of them count as one; a

@@ -14,16 +14,6 @@ from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.seeding import derive_seed
 
-__all__ = [
-    "ROUGH",
-    "THOROUGH",
-    "Modes",
-    "Search",
-    "along_ridges",
-    "find_modes",
-    "local_proposal",
-]
-
 Array = NDArray[Any]
 
 #: Draws of the prior, the best of which are among the starts of a search.

@@ -35,8 +35,6 @@ from sbi_active.criticism.rivals.error_models import (
 from sbi_active.criticism.rivals.residual_process import smooth_features
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["OneOutlier"]
-
 Array = NDArray[Any]
 
 #: Ratio of neighboring sizes of a gross error, the smallest among them, and the number

@@ -23,8 +23,6 @@ from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size, log_sum_exp
 
-__all__ = ["ridges", "regressions"]
-
 Array = NDArray[Any]
 Local = Callable[[ImportanceSample, int], StudentMixture]
 

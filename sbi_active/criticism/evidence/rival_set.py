@@ -37,8 +37,6 @@ from sbi_active.criticism.rivals.validity import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 
-__all__ = ["RivalSet"]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 400

@@ -12,8 +12,6 @@ from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 
-__all__ = ["starts_near_parents"]
-
 Array = NDArray[Any]
 
 #: Searches that start at posteriors of smaller rivals.

@@ -16,8 +16,6 @@ from sbi_active.inference.sampling.weights import (
     systematic,
 )
 
-__all__ = ["temper"]
-
 Array = NDArray[Any]
 
 NUM_PARTICLES, NUM_MOVES = 400, 4

@@ -26,8 +26,6 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["SCALES", "log_evidence"]
-
 Array = NDArray[Any]
 
 #: Scales of an effect's prior in units of the declared one, equally likely.

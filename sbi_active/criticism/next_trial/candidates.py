@@ -12,8 +12,6 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.seeding import derive_seed
 
-__all__ = ["following", "permitted_candidates", "simulated"]
-
 MAX_CANDIDATES = 64
 
 

@@ -25,8 +25,6 @@ from sbi_active.design.design import Design
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.seeding import derive_seed
 
-__all__ = ["PredictedRival", "choose_action"]
-
 Array = NDArray[Any]
 
 #: Rivals below this probability are left out.

@@ -7,8 +7,6 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 
-__all__ = ["extrapolated", "outside_candidates"]
-
 #: By which the range of the actions is widened about its center.
 WIDER = (1.5, 2.0)
 

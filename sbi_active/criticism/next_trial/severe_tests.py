@@ -37,8 +37,6 @@ from sbi_active.criticism.next_trial.outside import extrapolated
 from sbi_active.criticism.results import UNEXPLAINED, ModelKey, SevereTest, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
 
-__all__ = ["severe_tests"]
-
 Array = NDArray[Any]
 
 #: Permitted candidates, and as many beyond; one costs some hundred simulated trials.

@@ -27,8 +27,6 @@ from sbi_active.criticism.rivals.validity import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED
 from sbi_active.seeding import forked_generators
 
-__all__ = ["find_warnings"]
-
 Array = NDArray[Any]
 
 ALIASED = 0.9  # |rank correlation| of an action with the order of the trials
@@ -136,9 +134,9 @@ def _of_errors(
         correlation, num = _neighbors(own.refitted)
         if correlation > max(CORRELATED, SIGNIFICANT / np.sqrt(num)):
             advice = (
-                "do give sample_times"
+                "declare sample_times"
                 if own.times is None
-                else "do declare GaussianNoise or AutocorrelatedNoise"
+                else "declare GaussianNoise or AutocorrelatedNoise"
             )
             yield (
                 "independent errors forced on a trajectory: neighboring residuals have "

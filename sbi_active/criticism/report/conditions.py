@@ -10,8 +10,6 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import number, summary_sentence
 from sbi_active.criticism.report.section import named_entries, setting
 
-__all__ = ["conditions", "first_paragraph"]
-
 #: Parameters and entries of the action that a sentence names at most.
 MOST_NAMED = 3
 

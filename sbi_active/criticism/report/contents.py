@@ -27,8 +27,6 @@ from sbi_active.inference.beliefs.identifiability import (
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
 
-__all__ = ["Contents"]
-
 NUM_PRIOR = 2_000  # draws that a width is compared with
 
 

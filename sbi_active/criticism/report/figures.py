@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_before_after", "plot_probabilities", "plot_residuals"]
-
 BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
 MAX_ACTION_PANELS = 3
 LOGARITHMIC_FROM = 12.0  # standard deviations; larger residuals get a symlog axis

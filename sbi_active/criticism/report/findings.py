@@ -10,8 +10,6 @@ from sbi_active.criticism.report.section import Section, joined
 from sbi_active.criticism.report.suspects import label
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
 
-__all__ = ["effects", "equivalences", "leave_one_out", "residuals"]
-
 SHOWN = 0.01  # probability from which a set of several effects stands in the table
 SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
 

@@ -8,16 +8,6 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 
-__all__ = [
-    "added",
-    "number",
-    "probability",
-    "stated",
-    "summary_sentence",
-    "verdict_line",
-    "with_error",
-]
-
 
 def verdict_line(report: Contents) -> str:
     """Return the verdict with what limits it, in one line."""

@@ -16,8 +16,6 @@ from sbi_active.criticism.results import (
     NextAction,
 )
 
-__all__ = ["errors", "next_action", "parameters"]
-
 SEVERE = (
     "The first paragraph names the actions that put the verdict to the test most. The "
     "free residual is the bare model and a smooth function of the action, both as "

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-__all__ = ["figures", "to_html", "to_markdown", "to_notebook", "to_text"]
-
 WIDTH = 88  # of lines of text; tables are as wide as they are
 CAPTIONS = {
     "residuals": "Residuals of the models refitted to all trials, in standard "

@@ -16,8 +16,6 @@ from sbi_active.criticism.report.cautions import find_warnings
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import verdict_line
 
-__all__ = ["Report", "build_report"]
-
 
 class Report(Contents):
     """What the closed loop found, see :class:`.Contents`.

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Section", "joined", "named_entries", "setting"]
-
 
 @dataclass(frozen=True)
 class Section:

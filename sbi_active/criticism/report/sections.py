@@ -8,8 +8,6 @@ from sbi_active.criticism.report import findings, outlook
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.section import Section
 
-__all__ = ["sections"]
-
 
 def sections(report: Contents) -> Iterator[Section]:
     """Yield the parts of a report in order."""

@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 
 from sbi_active.criticism.results import OUTLIER, Detection, Tracing
 
-__all__ = ["in_words", "label", "of_noise", "of_trials", "suspects", "verdict_clause"]
-
 #: Share of the probability that the suspects hold together.
 MASS = 0.9
 #: Tail probability of a chi-square that is too small for the declared noise.

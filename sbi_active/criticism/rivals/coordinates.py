@@ -16,8 +16,6 @@ from sbi_active.criticism.effects.joint_prior import JointPrior
 from sbi_active.inference.sampling.coordinates import support_bounds
 from sbi_active.seeding import forked_generators
 
-__all__ = ["SearchCoordinates"]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 1_000

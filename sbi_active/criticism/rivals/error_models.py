@@ -20,8 +20,6 @@ from typing_extensions import override
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["ErrorModel", "NoiseCell", "NoiseGrid", "drawn", "student"]
-
 Array = NDArray[Any]
 Whitener = Callable[[Array], Array]
 

@@ -15,8 +15,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel, declared_sds
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 
-__all__ = ["declared_noise", "scattered"]
-
 Array = NDArray[Any]
 
 #: Cells of the correlation time, from half a sample step to twice the recording, and
@@ -69,7 +67,7 @@ def declared_noise(
         if (sds <= 0).any():
             raise ValueError(
                 "expected measurement noise with a standard deviation > 0; got "
-                f"{noise}; do declare the error of the measurement, since without one "
+                f"{noise}; declare the error of the measurement, since without one "
                 "any residual is an effect"
             )
         sd = sds[_channel_of(measurements, len(sds))]
@@ -153,7 +151,7 @@ def _channel_of(measurements: Measurements, num: int) -> NDArray[np.int64]:
     last = measurements.shape[-1]
     if last != num:
         raise ValueError(
-            f"expected a standard deviation for each of {last} channels; got {num}; do "
+            f"expected a standard deviation for each of {last} channels; got {num}; "
             "give one an entry of x's last axis"
         )
     return measurements.position % last

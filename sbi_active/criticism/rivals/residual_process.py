@@ -37,8 +37,6 @@ from sbi_active.criticism.rivals.error_models import (
 )
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["LENGTHS", "ResidualProcess", "smooth_features"]
-
 Array = NDArray[Any]
 
 #: Length scales, in ranges of the action space: a local and a global misfit.

@@ -16,8 +16,6 @@ from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid, Whit
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import DISAGREEMENT, log_outcomes
 
-__all__ = ["Rival"]
-
 Array = NDArray[Any]
 
 #: Bound on a residual, so that its square is finite.

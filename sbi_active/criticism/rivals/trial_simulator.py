@@ -15,8 +15,6 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
-__all__ = ["TrialSimulator"]
-
 Array = NDArray[Any]
 Prediction = tuple[Array, "Array | None", Array]
 
@@ -223,7 +221,7 @@ class TrialSimulator:
         if simulated.shape[3:] != shape:
             raise ValueError(
                 f"expected trials of the simulator's shape {simulated.shape[3:]}; got "
-                f"x of shape {shape} a trial; do measure what the simulator returns, "
+                f"x of shape {shape} a trial; measure what the simulator returns, "
                 "or give sample_times to both"
             )
         return simulated.reshape(n, repeats, -1)
@@ -258,7 +256,7 @@ def _interpolate(x: Array, own: Array, stamps: Array) -> Array:
     if low < own[0] - step or high > own[-1] + step:
         raise ValueError(
             f"expected sample_times within those of the simulator, {own[0]:g} to "
-            f"{own[-1]:g}; got {low:g} to {high:g}; do simulate for longer, or leave "
+            f"{own[-1]:g}; got {low:g} to {high:g}; simulate for longer, or leave "
             "the samples beyond out"
         )
     safe = np.where(np.isfinite(stamps), stamps, own[0])

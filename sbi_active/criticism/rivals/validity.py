@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from sbi_active.criticism.results import Residuals
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["DISAGREEMENT", "UNKNOWN_RATES", "log_outcomes", "surprising_outcomes"]
-
 Array = NDArray[Any]
 
 #: Probability that a trial has no outcome where the simulator has one, or vice versa.

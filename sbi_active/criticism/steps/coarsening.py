@@ -30,8 +30,6 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 
-__all__ = ["coarsening", "power"]
-
 
 def coarsening(rivals: RivalSet, log_p: Mapping[ModelKey, float]) -> float:
     r"""Return :math:`\alpha`, 1 where the error of measurement is not known.

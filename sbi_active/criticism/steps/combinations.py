@@ -15,8 +15,6 @@ from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
-__all__ = ["grow", "log_prior"]
-
 Array = NDArray[Any]
 
 BEAM = 3

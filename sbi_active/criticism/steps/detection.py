@@ -12,8 +12,6 @@ from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection, ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["REFUTED", "THRESHOLD", "alternatives", "detect"]
-
 #: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
 #: at any stopping time, with a probability of at most 1/20.
 THRESHOLD = float(np.log(20.0))

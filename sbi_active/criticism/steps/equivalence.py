@@ -19,8 +19,6 @@ from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["equivalent_effects", "every_action", "noise_unit"]
-
 Array = NDArray[Any]
 
 MAX_ACTIONS = 48

@@ -14,8 +14,6 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
 
-__all__ = ["Fold", "evaluate_held_out", "evaluate_left_out"]
-
 Array = NDArray[Any]
 #: The models fitted to some trials, and what was traced in them.
 Fold = Callable[[Trials], tuple[RivalSet, Tracing]]

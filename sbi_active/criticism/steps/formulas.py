@@ -20,8 +20,6 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import UNEXPLAINED, ModelKey
 
-__all__ = ["formula_effects", "guess"]
-
 Array = NDArray[Any]
 
 #: Nats by which a formula must beat the residual process to be printed.

@@ -7,8 +7,6 @@ import numpy as np
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import OUTLIER, ModelKey
 
-__all__ = ["gross_errors"]
-
 
 def gross_errors(rivals: RivalSet) -> dict[float, float]:
     """Return the probability that each trial is the one, if one has a gross error.

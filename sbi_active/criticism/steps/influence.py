@@ -30,8 +30,6 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["is_left_to_chance", "needed_trials", "unless_refuted", "withdrawn"]
-
 Array = NDArray[Any]
 
 #: Effective draws below which an evidence without a trial is computed anew.

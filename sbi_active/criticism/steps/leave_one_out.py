@@ -24,8 +24,6 @@ from sbi_active.criticism.results import NONE, OUTLIER, UNEXPLAINED, ModelKey, T
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["LeaveOneOut", "leave_one_out"]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 400

@@ -18,8 +18,6 @@ from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import every_action, noise_unit
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["near_aliases"]
-
 Array = NDArray[Any]
 
 #: Root mean square difference of two effects' predictions over the permitted actions,

@@ -19,8 +19,6 @@ from sbi_active.criticism.rivals.validity import log_outcomes
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["Prediction", "predict"]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 200

@@ -13,8 +13,6 @@ from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.steps.predictive import Prediction, predict
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["find_residuals"]
-
 Array = NDArray[Any]
 
 #: Draws of the prior, and of the posterior; a simulator that jumps is seldom cheap.

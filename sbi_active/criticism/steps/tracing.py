@@ -37,8 +37,6 @@ from sbi_active.criticism.steps.influence import (
 from sbi_active.criticism.steps.near_aliases import near_aliases
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-__all__ = ["log_priors", "trace"]
-
 Array = NDArray[Any]
 
 PROBABILITY_OF_NONE = 0.5

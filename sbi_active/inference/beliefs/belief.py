@@ -19,18 +19,6 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.notebook import card, parameters
 from sbi_active.seeding import forked_generators
 
-__all__ = [
-    "Belief",
-    "ChainedBelief",
-    "UnchangedBelief",
-    "information_gained",
-    "named",
-    "names_of",
-    "parameter_dim",
-    "require_support",
-    "require_width",
-]
-
 #: Draws behind moments and a chained belief's normalizer: a hundredth of a deviation.
 NUM_DRAWS = 20_000
 #: Below this share of q inside the support, rejection is too wasteful.
@@ -317,7 +305,7 @@ def require_support(prior: Distribution | None) -> Distribution:
     """
     if prior is None:
         raise ValueError(
-            "expected a prior, since a belief starts from it; got None; do pass one "
+            "expected a prior, since a belief starts from it; got None; pass one "
             "at construction, ASBI(prior)"
         )
     try:
@@ -327,7 +315,7 @@ def require_support(prior: Distribution | None) -> Distribution:
     if support is None:
         raise ValueError(
             "expected a prior with a support, which every belief keeps; got "
-            f"{type(prior).__name__} without one; do use sbi.utils.BoxUniform, a torch "
+            f"{type(prior).__name__} without one; use sbi.utils.BoxUniform, a torch "
             "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
         )
     if prior.batch_shape:

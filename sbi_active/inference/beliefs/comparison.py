@@ -5,8 +5,6 @@ from __future__ import annotations
 from sbi_active.inference.beliefs.belief import Belief, ChainedBelief
 from sbi_active.seeding import forked_generators
 
-__all__ = ["ORDER_TOLERANCE", "TOLERANCE", "compare", "compare_orders"]
-
 #: Nats by which the network may lie beside the refined belief before it is said.
 TOLERANCE = 0.5
 #: Nats between two refinements of the same trials beyond which it is said.
@@ -77,5 +75,5 @@ def compare_orders(belief: Belief, other: Belief) -> None:
     if divergence > ORDER_TOLERANCE:
         belief.diagnostics = belief.diagnostics.warned(
             f"a second refinement of the same trials, in reverse order, differs by "
-            f"{divergence:.2g} nats; do raise num_histories"
+            f"{divergence:.2g} nats; raise num_histories"
         )

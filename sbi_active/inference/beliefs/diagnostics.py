@@ -11,8 +11,6 @@ from typing import Any
 from sbi_active.inference.beliefs.identifiability import Combinations
 from sbi_active.notebook import badge, card, facts, items, number
 
-__all__ = ["Assumption", "Diagnostics"]
-
 VERDICTS = {
     True: ("good", "trustworthy"),
     False: ("bad", "not trustworthy"),

@@ -16,15 +16,6 @@ from sbi_active.combinations.rounding import width
 from sbi_active.combinations.search import KNOWN, search
 from sbi_active.seeding import forked_generators
 
-__all__ = [
-    "Combinations",
-    "KnownCombination",
-    "UnknownCombination",
-    "combinations_of",
-    "combinations_of_draws",
-    "note_combinations",
-]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 2_000  # an interval's ends to a twentieth of its length

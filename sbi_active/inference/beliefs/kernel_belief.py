@@ -15,8 +15,6 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.sampling.bandwidth import scott, silverman
 from sbi_active.seeding import forked_generators
 
-__all__ = ["Bandwidth", "KernelBelief"]
-
 Bandwidth = float | Literal["scott", "silverman"]
 
 BLOCK = 4_000_000  # pairs of a kernel and a row held in memory at once
@@ -121,6 +119,6 @@ def _width(bandwidth: Bandwidth, num: float, dim: int) -> float:
     if isinstance(bandwidth, str) or not bandwidth > 0:
         raise ValueError(
             f"expected bandwidth 'scott', 'silverman' or a number > 0; got "
-            f"{bandwidth!r}; do use 'scott'"
+            f"{bandwidth!r}; use 'scott'"
         )
     return float(bandwidth)

@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-__all__ = ["ParticleDraws"]
-
 
 class ParticleDraws(Distribution):
     """Parameters out of a finite set (p, theta_dim), each as likely.

@@ -12,8 +12,6 @@ from typing_extensions import override
 
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 
-__all__ = ["ActionFactor", "ActionLikelihood", "ActionRatio"]
-
 
 class ActionFactor(ABC):
     """A learned factor of the likelihood of a trial.

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegressionCV
 from torch import Tensor
 
-__all__ = ["LFIRE", "LogRatio"]
-
 FEWEST = 2  # rows of each kind a fold
 
 
@@ -69,7 +67,7 @@ class LFIRE:
         for name, low in (("num_marginal", 10), ("num_penalties", 1), ("num_folds", 2)):
             if getattr(self, name) < low:
                 raise ValueError(
-                    f"expected {name} >= {low}; got {getattr(self, name)}; do raise it"
+                    f"expected {name} >= {low}; got {getattr(self, name)}; raise it"
                 )
 
     def summaries(self, x: Tensor, center: Tensor, scale: Tensor) -> Tensor:
@@ -103,7 +101,7 @@ class LFIRE:
         if min(len(own), len(marginal)) < fewest:
             raise ValueError(
                 f"expected at least {fewest} outcomes of a parameter set and of the "
-                f"marginal; got {len(own)} and {len(marginal)}; do simulate each "
+                f"marginal; got {len(own)} and {len(marginal)}; simulate each "
                 "parameter set several times, as SeqBED.arrange() does"
             )
         features = np.concatenate([own, marginal])

@@ -14,8 +14,6 @@ from sbi_active.inference.beliefs.particles import ParticleDraws
 from sbi_active.inference.models.lfire import LFIRE, LogRatio
 from sbi_active.inference.rounds.rows import RoundRows
 
-__all__ = ["LFIREModel", "fit_log_ratios"]
-
 
 @dataclass(frozen=True)
 class LFIREModel:
@@ -126,6 +124,6 @@ def _places(rows: Tensor, known: Tensor, name: str, what: str) -> Tensor:
         other = rows[~found][0].tolist()
         raise ValueError(
             f"expected {name} among the {len(known)} {what} of this round; got "
-            f"{other}; do draw from model.belief and keep to the actions simulated"
+            f"{other}; draw from model.belief and keep to the actions simulated"
         )
     return same.int().argmax(1)[inverse]

@@ -17,8 +17,6 @@ from torch import Tensor, nn
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 
-__all__ = ["ActionPosterior"]
-
 
 class ActionPosterior:
     r"""Amortized posterior :math:`q(\theta | x, \xi)`.
@@ -183,7 +181,7 @@ class ActionPosterior:
         if not isinstance(self._packed, DirectPosterior):
             raise ValueError(
                 "expected a posterior with a density; got one that only samples, "
-                f"{type(self._packed).__name__}; do build_posterior() with "
+                f"{type(self._packed).__name__}; build_posterior() with "
                 "sample_with='direct'"
             )
         return self._packed
@@ -223,7 +221,7 @@ class ActionPosterior:
             given = "x without action" if action is None else "action without x"
             given = "neither" if x is None and action is None else given
             raise ValueError(
-                f"expected x= and action= together; got {given}; do pass both, or "
+                f"expected x= and action= together; got {given}; pass both, or "
                 "posterior.at(action) to something that only knows x"
             )
         rows = outcome_rows(x, self.x_shape)

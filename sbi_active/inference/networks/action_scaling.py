@@ -10,16 +10,6 @@ from itertools import combinations_with_replacement
 import torch
 from torch import Tensor, nn
 
-__all__ = [
-    "SMALLEST_SCALE",
-    "ActionScaling",
-    "Polynomials",
-    "best_prefix",
-    "exponents_of",
-    "fit_location_and_scale",
-    "held_out",
-]
-
 LOG_NORMAL_MEAN = 0.6351814227  # -E log|e| of a standard normal e
 SMALLEST_SCALE = 1e-6  # of the scale over all actions: float32 ends there
 WILD = 10.0  # residuals beyond so many medians count as that many

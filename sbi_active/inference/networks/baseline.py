@@ -10,8 +10,6 @@ from torch import Tensor
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.response import Response
 
-__all__ = ["Baseline", "Frames", "precision_factor"]
-
 BLOCK = 4_096  # rows held in memory at once
 NUM_CENTERS = 32
 NUM_STEPS = 7
@@ -178,7 +176,7 @@ def precision_factor(precision: Tensor) -> Tensor:
         if share > 1.0:  # which suffices for any finite one
             raise ValueError(
                 "expected a regression of the outcomes with finite weights; got "
-                "infinite or undefined ones; do check the outcomes for numbers beyond "
+                "infinite or undefined ones; check the outcomes for numbers beyond "
                 "any use"
             )
         largest = precision.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)

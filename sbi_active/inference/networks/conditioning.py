@@ -12,17 +12,6 @@ from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
 from sbi_active.inference.networks.response import STRAIGHT
 
-__all__ = [
-    "MAX_OUTCOMES",
-    "MIN_ROWS",
-    "BaselineKind",
-    "Conditioning",
-    "covariance_factor",
-    "log_normal",
-    "scale_of",
-    "whitened",
-]
-
 BaselineKind = Literal["none", "linear", "curved"]
 
 #: Numbers in x beyond which no regression is tried: each has coefficients of its own.

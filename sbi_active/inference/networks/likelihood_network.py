@@ -23,8 +23,6 @@ from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.response import Response, exceeds_chance
 from sbi_active.inference.networks.validity_network import ValidityNetwork
 
-__all__ = ["LikelihoodNetwork"]
-
 
 class LikelihoodNetwork(ConditionalDensityEstimator):
     r"""Density of the outcome given parameters and action.
@@ -70,7 +68,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         if len(known) < 2:
             raise ValueError(
                 f"expected at least two simulations with a measurement; got "
-                f"{len(known)} of {len(x)}; do check the simulator, or the belief"
+                f"{len(known)} of {len(x)}; check the simulator, or the belief"
             )
         self.register_buffer("y_mean", known.mean(0))
         self.register_buffer("y_scale", scale_of(known))

@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 
-__all__ = ["MixtureDensity", "MixtureDensityNetwork"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class MixtureDensity:
@@ -67,10 +65,10 @@ class MixtureDensity:
         }
         for name, value in counts.items():
             if value < 1:
-                raise ValueError(f"expected {name} >= 1; got {value}; do raise it")
+                raise ValueError(f"expected {name} >= 1; got {value}; raise it")
         if not self.learning_rate > 0:
             raise ValueError(
-                f"expected learning_rate > 0; got {self.learning_rate}; do use 1e-3"
+                f"expected learning_rate > 0; got {self.learning_rate}; use 1e-3"
             )
         choices = {
             "scaling": ("action", "global"),
@@ -80,7 +78,7 @@ class MixtureDensity:
             if getattr(self, name) not in valid:
                 raise ValueError(
                     f"expected {name} among {', '.join(map(repr, valid))}; got "
-                    f"{getattr(self, name)!r}; do choose one of these"
+                    f"{getattr(self, name)!r}; choose one of these"
                 )
 
     @classmethod

@@ -14,8 +14,6 @@ from typing_extensions import override
 from sbi_active.inference.networks.baseline import Frames, local
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
 
-__all__ = ["MixtureDensityNetwork", "PreparedLoss"]
-
 #: Bounds of the log-precision of a component in units of the standardized parameter:
 #: wide enough for seven decimal digits, where float32 ends.
 LOG_PRECISION_RANGE = (-10.0, 16.0)

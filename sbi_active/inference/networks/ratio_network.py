@@ -18,8 +18,6 @@ from sbi_active.inference.networks.conditioning import (
 )
 from sbi_active.inference.networks.response import Response
 
-__all__ = ["RatioClassifier", "RatioNetwork"]
-
 FAR = 4.0  # noise deviations, beyond which a residual is squashed
 
 
@@ -50,10 +48,10 @@ class RatioClassifier:
             values[name] = getattr(self, name)
         for name, value in values.items():
             if value < 1:
-                raise ValueError(f"expected {name} >= 1; got {value}; do raise it")
+                raise ValueError(f"expected {name} >= 1; got {value}; raise it")
         if not self.learning_rate > 0:
             raise ValueError(
-                f"expected learning_rate > 0; got {self.learning_rate}; do use 1e-3"
+                f"expected learning_rate > 0; got {self.learning_rate}; use 1e-3"
             )
 
 

@@ -17,8 +17,6 @@ from sbi_active.inference.networks.action_scaling import (
     held_out,
 )
 
-__all__ = ["STRAIGHT", "Response", "exceeds_chance"]
-
 MAX_FEATURES = 260  # of (action, parameters)
 MAX_ACTION_DEGREE = 14
 MAX_DEGREE = 9  # of the parameters

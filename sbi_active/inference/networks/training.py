@@ -17,12 +17,6 @@ from sbi_active.inference.networks.mixture_network import (
     PreparedLoss,
 )
 
-__all__ = [
-    "TrainingBudget",
-    "TrainingRecord",
-    "train_mixture_density",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingBudget:
@@ -138,7 +132,7 @@ def train_mixture_density(
         if not abs(validation_loss) < torch.inf:
             raise RuntimeError(
                 f"expected a finite loss; got {validation_loss} after {done} "
-                "iterations; do lower learning_rate, or look for numbers in x far "
+                "iterations; lower learning_rate, or look for numbers in x far "
                 "from all others"
             )
         if validation_loss < best:

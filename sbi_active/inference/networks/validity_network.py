@@ -6,8 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
-__all__ = ["ValidityNetwork"]
-
 WIDTH = 32
 NUM_ITERATIONS = 300
 LEARNING_RATE = 0.01

@@ -18,8 +18,6 @@ from sbi_active.inference.sampling.population import (
 )
 from sbi_active.inference.sampling.student_mixture import Proposal
 
-__all__ = ["sample_product"]
-
 #: Effective draws below which the normalizer is off by more than a tenth of a nat.
 ENOUGH = 100.0
 

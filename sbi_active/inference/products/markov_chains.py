@@ -12,8 +12,6 @@ from torch.distributions import Distribution
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.products.product import Product
 
-__all__ = ["MARKOV_CHAINS", "MarkovChainBelief"]
-
 #: sbi's names of its samplers; those that end on "_pymc" need sbi's extra "pymc".
 MARKOV_CHAINS = (
     *("slice_np", "slice_np_vectorized", "hmc_pyro", "nuts_pyro"),
@@ -41,7 +39,7 @@ class MarkovChainBelief(Belief):
         if method not in MARKOV_CHAINS:
             raise ValueError(
                 f"expected a sampler among {', '.join(map(repr, MARKOV_CHAINS))}; got "
-                f"{method!r}; do choose one of these"
+                f"{method!r}; choose one of these"
             )
         self.label = f"product over trials, by {method}"
         self._product, self._factors, self._method = product, factors, method

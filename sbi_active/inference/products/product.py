@@ -17,8 +17,6 @@ from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture
 from sbi_active.threads import single_thread
 
-__all__ = ["Product", "TrainedRegion", "TrialModel", "widened"]
-
 Array = NDArray[Any]
 
 NUM_COMPONENTS = 6

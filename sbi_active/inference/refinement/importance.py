@@ -38,8 +38,6 @@ from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
-__all__ = ["WeightedPool", "importance_sample"]
-
 Array = NDArray[Any]
 
 NEGLIGIBLE = 25.0  # nats below the best draw, beyond which a draw is given up

@@ -15,8 +15,6 @@ from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import Particles
 
-__all__ = ["LearnedLikelihood", "LearnedBelief"]
-
 Array = NDArray[Any]
 
 #: Least share of draws that sampling keeps.

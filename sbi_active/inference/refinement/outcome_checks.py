@@ -11,8 +11,6 @@ from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.surrogate import Surrogate
 
-__all__ = ["check_outcomes"]
-
 Array = NDArray[Any]
 
 LIVE = 0.01  # mass below which a region is left out

@@ -28,8 +28,6 @@ from scipy.stats import chi2
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
 
-__all__ = ["LARGE", "SMALL", "expected_error", "widened"]
-
 Array = NDArray[Any]
 
 SMALL = 0.05  # nats that need no mending

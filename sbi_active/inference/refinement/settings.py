@@ -8,8 +8,6 @@ import numpy as np
 
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["RefinementOptions"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RefinementOptions:
@@ -77,6 +75,6 @@ class RefinementOptions:
                 continue
             if not low <= value <= high:
                 raise ValueError(
-                    f"expected {name} in [{low:g}, {high:g}]; got {value}; do choose "
+                    f"expected {name} in [{low:g}, {high:g}]; got {value}; choose "
                     "a value in this range"
                 )

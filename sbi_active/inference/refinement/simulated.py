@@ -29,8 +29,6 @@ from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
-__all__ = ["ExactRecord", "refine_exactly"]
-
 Array = NDArray[Any]
 
 USABLE = 5.0  # effective draws, below which the learned likelihood is kept
@@ -150,7 +148,7 @@ def _diagnose(
     if effective < COARSE:
         warnings.append(
             f"the belief rests on {effective:.0f} effective draws, so that its log "
-            f"density is off by about {effective**-0.5:.2g} nats; do raise "
+            f"density is off by about {effective**-0.5:.2g} nats; raise "
             "num_histories"
         )
     warnings += misplaced(tail[:-1], tail[-1], edge_mass)

@@ -15,8 +15,6 @@ from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import KernelProposal
 
-__all__ = ["SimulatedBelief"]
-
 BEYOND = 20.0  # nats below the defensive share at which a density is given up
 
 

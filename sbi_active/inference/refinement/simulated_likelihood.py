@@ -16,8 +16,6 @@ from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
 from sbi_active.simulation.workers.settings import Workers
 
-__all__ = ["MeanTable", "SimulatedLikelihood", "declares_noise"]
-
 Array = NDArray[Any]
 
 BATCH = 64  # rows a call: the same ones whatever the number of workers

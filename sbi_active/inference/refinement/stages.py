@@ -54,8 +54,6 @@ from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.outcomes import MissingRowsWarning
 from sbi_active.threads import single_thread
 
-__all__ = ["RefinementOptions", "refine"]
-
 Array = NDArray[Any]
 
 HALF = 0.5  # of the budget, after which misfit is taken to stay
@@ -389,7 +387,7 @@ def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     if action.ndim != 2 or x.ndim < 1 or len(action) != len(x) or len(action) == 0:
         raise ValueError(
             "expected action (t, action_dim) and x (t, *x_shape) with as many trials, "
-            f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; do stack "
+            f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; stack "
             "the trials along axis 0"
         )
     return action.float().cpu(), x.double().cpu().reshape(len(x), *x.shape[1:] or (1,))

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from sbi_active.inference.regression.surrogate import LocalRegression, Surrogate
 
-__all__ = ["tail_probability"]
-
 Array = NDArray[Any]
 
 RESOLUTION = 2e-5  # least tail probability

@@ -19,8 +19,6 @@ from sbi_active.inference.refinement.tails import tail_probability
 from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
 from sbi_active.inference.sampling.population import Particles
 
-__all__ = ["Course", "Stage", "diagnose", "misplaced"]
-
 Array = NDArray[Any]
 
 SETTLED = 0.03  # nats a dimension that the last stage may have changed
@@ -166,39 +164,39 @@ def diagnose(
             is_gaussian,
             negentropy,
             "the noise is not Gaussian (it differs by {:.2g} nats a number), and the "
-            "belief, which takes it for Gaussian, may be too wide or too narrow; do "
+            "belief, which takes it for Gaussian, may be too wide or too narrow; "
             "check against a belief of a trained network",
         ),
         "few_modes": (
             effective >= MIN_EFFECTIVE,
             effective,
             "at some stage only {:.1%} of the particles counted, as with many narrow "
-            "modes, and a mode may be lost; do raise num_histories and first_share",
+            "modes, and a mode may be lost; raise num_histories and first_share",
         ),
         "smooth_response": (
             roughness <= ROUGH,
             roughness,
             "over the prior the outcomes have more turns than a cubic, which misses "
             "{:.0%} of their variance, so that four or more narrow modes are possible "
-            "and one may be lost; do check against another seed or a narrower prior",
+            "and one may be lost; check against another seed or a narrower prior",
         ),
         "no_misfit": (
             last.excess <= SERIOUS_MISFIT,
             ratio,
             "the residuals of the surrogate have {:.2g} times the variance of the "
-            "noise, so that the belief is too wide; do raise num_histories",
+            "noise, so that the belief is too wide; raise num_histories",
         ),
         "settled": (
             len(course.stages) > 1 and course.divergence <= UNSETTLED * dim,
             course.divergence if len(course.stages) > 1 else -1.0,
-            "the last stage still changed the belief, by {:.2g} nats; do raise "
+            "the last stage still changed the belief, by {:.2g} nats; raise "
             "num_histories",
         ),
         "independent_trials": (
             is_independent,
             correlation,
             "simulated trials correlate at the same parameters ({:.2f}), yet the "
-            "likelihood is a product over trials; do check how the simulator seeds "
+            "likelihood is a product over trials; check how the simulator seeds "
             "its noise",
         ),
         "small_error": (

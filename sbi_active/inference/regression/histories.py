@@ -30,8 +30,6 @@ from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-__all__ = ["Histories", "HistoryRecord"]
-
 Array = NDArray[Any]
 
 MIN_PAIRS = 20  # replicates a noise estimate rests on
@@ -255,7 +253,7 @@ class Histories:
         if x.shape[1] != self._seen.shape[1]:
             raise ValueError(
                 f"expected simulated x of shape {tuple(rows.x.shape[1:])} a row, as "
-                f"observed; got {self._seen.shape[1]} observed numbers a trial; do "
+                f"observed; got {self._seen.shape[1]} observed numbers a trial; "
                 "pass x (t, *x_shape) of the simulator's shape"
             )
         x = np.where(np.isfinite(x), x, np.nan)

@@ -40,8 +40,6 @@ from scipy.special import expit, log_expit
 from sbi_active.inference.regression.basis import Basis
 from sbi_active.inference.regression.regions import Region
 
-__all__ = ["TrialOutcome", "outcomes_of"]
-
 Array = NDArray[Any]
 
 DEVIATIONS = (1.0, 4.0, 16.0, 64.0)  # of coefficients a priori

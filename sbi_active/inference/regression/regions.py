@@ -15,15 +15,6 @@ from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture, Particles
 from sbi_active.inference.sampling.student_mixture import Proposal
 
-__all__ = [
-    "PriorProposal",
-    "Region",
-    "RegionsProposal",
-    "cover",
-    "nearest_region",
-    "whole_space",
-]
-
 Array = NDArray[Any]
 
 #: Mass of a Gaussian posterior that its ellipsoid covers.

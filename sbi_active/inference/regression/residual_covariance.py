@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 
-__all__ = ["ResidualCovariance", "alike"]
-
 Array = NDArray[Any]
 
 

@@ -37,14 +37,6 @@ from sbi_active.inference.regression.residual_covariance import (
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
-__all__ = [
-    "LocalRegression",
-    "NoiseEstimate",
-    "Surrogate",
-    "estimate_noise",
-    "fewest_rows",
-]
-
 Array = NDArray[Any]
 
 CAUTION = 2.0  # at least, under misfit

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 
 from sbi_active.arrays import own_tensor
 
-__all__ = ["ActionEmbedding", "action_rows", "outcome_rows", "pack", "unpack"]
-
 
 def pack(x: Tensor, action: Tensor) -> Tensor:
     """Return the condition (x, action), (n, *x_shape) and (n, a) -> (n, x_dim + a)."""
@@ -51,7 +49,7 @@ def action_rows(
         expected = ("n" if num_rows is None else num_rows, action_dim or "action_dim")
         raise ValueError(
             f"expected action of shape ({expected[0]}, {expected[1]}) or "
-            f"({expected[1]},); got {tuple(torch.as_tensor(action).shape)}; do give "
+            f"({expected[1]},); got {tuple(torch.as_tensor(action).shape)}; give "
             "the executed action, one row an outcome"
         )
     return rows if num_rows is None else rows.expand(num_rows, -1)
@@ -78,7 +76,7 @@ def outcome_rows(x: Tensor, x_shape: Sequence[int]) -> Tensor:
         return rows
     raise ValueError(
         f"expected x of shape {tuple(shape)} or (n, {', '.join(map(str, shape))}), as "
-        f"simulated; got {tuple(rows.shape)}; do give one outcome, or one a row"
+        f"simulated; got {tuple(rows.shape)}; give one outcome, or one a row"
     )
 
 
@@ -115,7 +113,7 @@ class ActionEmbedding(nn.Module):
             raise ValueError(
                 f"expected a packed condition of {expected} numbers, x "
                 f"{tuple(self.x_shape)} and {self.action_dim} of the action; got "
-                f"{condition.shape[-1]}; do check x_shape and action_dim"
+                f"{condition.shape[-1]}; check x_shape and action_dim"
             )
         x, action = unpack(condition, self.x_shape)
         return torch.cat([self.net(x), action], dim=-1)

@@ -15,15 +15,6 @@ from torch.distributions import Distribution
 from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 
-__all__ = [
-    "Observation",
-    "RoundRows",
-    "UnexplainedOutcomeError",
-    "check_proposal",
-    "require_whole",
-    "round_rows",
-]
-
 
 class UnexplainedOutcomeError(ValueError):
     """A trial gave a measurement where simulations give none."""
@@ -80,7 +71,7 @@ def round_rows(
     if theta.ndim != 2 or theta.shape[1] != dim or len(x) != len(theta):
         raise ValueError(
             f"expected theta (n, {dim}) and x (n, ...) with as many rows; got "
-            f"{tuple(theta.shape)} and {tuple(x.shape)}; do give one row a simulation"
+            f"{tuple(theta.shape)} and {tuple(x.shape)}; give one row a simulation"
         )
     outside = ~within_support(prior, theta)
     if bool(outside.any()):
@@ -88,7 +79,7 @@ def round_rows(
         raise ValueError(
             f"expected theta within the prior's support; got {int(outside.sum())} of "
             f"{len(theta)} rows outside, the first {theta[row].tolist()} in row {row}; "
-            "do sample theta from the belief"
+            "sample theta from the belief"
         )
     x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape)
     action = action_rows(action, action_dim, num_rows=len(theta))
@@ -98,7 +89,7 @@ def round_rows(
     if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
         raise UnexplainedOutcomeError(
             f"expected at least one simulation with a measurement; got {len(x)} of "
-            f"{len(x)} invalid (NaN or inf); do check the simulator at theta = "
+            f"{len(x)} invalid (NaN or inf); check the simulator at theta = "
             f"{theta[0].tolist()}, action = {action[0].tolist()}"
         )
     if not (exclude_invalid and bool(invalid.any())):
@@ -121,7 +112,7 @@ def require_whole(x: Tensor) -> None:
         raise ValueError(
             "expected outcomes that are measured or NaN throughout, since a likelihood "
             f"of some of the numbers is not learned; got {int(partly.sum())} of "
-            f"{len(x)} measured in part, the first in row {row}; do leave out the "
+            f"{len(x)} measured in part, the first in row {row}; leave out the "
             "numbers that go missing, or use ASBI"
         )
 
@@ -134,6 +125,6 @@ def check_proposal(proposal: Any, belief: Distribution | None) -> None:
     raise ValueError(
         "expected proposal to be the belief or sbi's RestrictedPrior of it, since a "
         "round with actions is trained by plain maximum likelihood and any other "
-        f"proposal would take the belief's place; got {type(proposal).__name__}; do "
+        f"proposal would take the belief's place; got {type(proposal).__name__}; "
         "pass belief= the distribution theta was drawn from"
     )

@@ -6,8 +6,6 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
-__all__ = ["NEVER", "extends", "given_arguments", "require_likelihood_loss", "takes"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 Ours = TypeVar("Ours", bound=Callable[..., Any])
@@ -70,6 +68,6 @@ def require_likelihood_loss(
         if given.get(name, default) != default:
             raise ValueError(
                 f"expected {name} to be left out in a round with actions, which is "
-                f"trained by maximum likelihood; got {given[name]}; do drop it"
+                f"trained by maximum likelihood; got {given[name]}; drop it"
             )
     return {n: v for n, v in given.items() if n not in _NO_MEANING_WITH_ACTION}

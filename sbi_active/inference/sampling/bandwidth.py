@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["scott", "silverman"]
-
 
 def scott(num: float, dim: int) -> float:
     """Return Scott's width, :math:`n^{-1 / (d + 4)}`, of n draws that count.

@@ -13,8 +13,6 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 
-__all__ = ["PriorCoordinates", "support_bounds"]
-
 Array = NDArray[Any]
 
 #: Where the half-width 1 of an unbounded coordinate lies, in prior deviations.

@@ -18,8 +18,6 @@ from sbi_active.inference.sampling.student_mixture import (
     student_steps,
 )
 
-__all__ = ["EitherProposal", "KernelProposal"]
-
 Array = NDArray[Any]
 
 NUM_KERNELS = 120
@@ -33,11 +31,13 @@ class KernelMixture(StudentMixture):
     """Many Student kernels of equal weight."""
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
         which = rng.integers(len(self.means), size=num_samples)
         steps = student_steps(num_samples, self.means.shape[1], rng)
         return self.moved(which, steps)
 
     def log_prob(self, z: Array) -> Array:
+        """Return the log density, (n, d) -> (n,)."""
         blocks = [self._log_kernels(z[i : i + BLOCK]) for i in range(0, len(z), BLOCK)]
         return np.concatenate([np.zeros(0), *blocks])
 

@@ -24,13 +24,6 @@ from sbi_active.inference.sampling.weights import (
     systematic,
 )
 
-__all__ = [
-    "GaussianMixture",
-    "Particles",
-    "StudentProposal",
-    "population_monte_carlo",
-]
-
 Array = NDArray[Any]
 
 INFLATION = 1.4  # of the covariance of Student components
@@ -177,6 +170,7 @@ class WidenedMixture:
         return INFLATION**0.5 * self.mixture.factor
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
         mean = self.mixture.mean
         count = rng.multinomial(num_samples, self.weight)
         steps = student_steps(num_samples, mean.shape[1], rng)
@@ -186,6 +180,7 @@ class WidenedMixture:
         return drawn if self.unbounding is None else self.unbounding.from_line(drawn)
 
     def log_prob(self, z: Array) -> Array:
+        """Return the log density, (n, d) -> (n,)."""
         y = z if self.unbounding is None else self.unbounding.to_line(z)
         square, log_volume = _mahalanobis(y, self.mixture.mean, self.factor)
         each = log_student(square, log_volume, z.shape[1]) + np.log(self.weight)

@@ -12,8 +12,6 @@ from typing_extensions import override
 
 from sbi_active.inference.sampling.weights import log_sum_exp, systematic
 
-__all__ = ["Defended", "Proposal", "StudentMixture", "log_student", "student_steps"]
-
 Array = NDArray[Any]
 
 #: Degrees of freedom: tails above any Gaussian's, and a covariance that exists.

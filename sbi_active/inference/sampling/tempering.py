@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["largest_power"]
-
 
 def largest_power(
     suffices: Callable[[float], bool],

@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-__all__ = ["effective_sample_size", "log_sum_exp", "normalized", "systematic"]
-
 Array = NDArray[Any]
 
 

@@ -23,8 +23,6 @@ from sbi_active.inference.rounds.tracking import SilentTracker
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.threads import single_thread
 
-__all__ = ["ActionRounds"]
-
 
 class ActionRounds(ActiveInference):
     r"""Rows by round of the belief they were drawn from, and the trials in between.
@@ -128,7 +126,7 @@ class ActionRounds(ActiveInference):
         if resume and self._trained_round != max(self._data_round_index):
             raise ValueError(
                 "expected resume_training after train() on the same rows; got rows "
-                "appended since; do train() without resume_training"
+                "appended since; train() without resume_training"
             )
         defaults = self._training_defaults(given) if self._has_settings else {}
         arguments = {**defaults, **given, "retrain_from_scratch": not resume}
@@ -194,7 +192,7 @@ class ActionRounds(ActiveInference):
                 name = type(self).__name__
                 raise ValueError(
                     "expected rounds without action, since earlier rounds of this "
-                    f"trainer have none; got action=; do start a new {name}(prior) for "
+                    f"trainer have none; got action=; start a new {name}(prior) for "
                     "rounds with actions"
                 )
             return True
@@ -259,14 +257,14 @@ class ActionRounds(ActiveInference):
         if self._trained_round is None:
             raise RuntimeError(
                 "expected a network trained on this round's simulations; got new rows "
-                "since the last train(); do call train() first"
+                "since the last train(); call train() first"
             )
 
     def _require_belief_network(self) -> None:
         if self._trained_round is None:
             raise RuntimeError(
                 "expected a network trained under the current belief; got none since "
-                "the last update() or append_simulations(); do append simulations of "
+                "the last update() or append_simulations(); append simulations of "
                 "the belief with action= and train() first"
             )
 

@@ -23,8 +23,6 @@ from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 
-__all__ = ["ALHI"]
-
 
 class ALHI(ProductRounds, MixtureRounds, NLE_A):
     r"""Active likelihood-based inference, the paper's ALHI; at random actions NLHI.

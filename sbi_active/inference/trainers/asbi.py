@@ -40,8 +40,6 @@ from sbi_active.inference.trainers.base import Told
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.seeding import forked_generators, kept_generators
 
-__all__ = ["ASBI"]
-
 NUM_PROBES = 64  # draws of the prior, at one of which a network has a finite density
 
 

@@ -16,8 +16,6 @@ from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.inference.rounds.rows import Observation
 
-__all__ = ["ActiveInference", "Told"]
-
 
 @dataclass(frozen=True)
 class Told:
@@ -199,7 +197,7 @@ class ActiveInference(ABC):
         rows = outcome_rows(x, shape)
         if len(rows) != 1:
             raise ValueError(
-                f"expected one outcome; got {len(rows)} rows; do update with one trial "
+                f"expected one outcome; got {len(rows)} rows; update with one trial "
                 "at a time"
             )
         return Observation(

@@ -17,8 +17,6 @@ from sbi_active.inference.networks.training import TrainingBudget, TrainingRecor
 from sbi_active.inference.rounds.sbi_arguments import NEVER
 from sbi_active.inference.trainers.action_rounds import ActionRounds
 
-__all__ = ["MixtureRounds", "training_budget"]
-
 
 class MixtureRounds(ActionRounds):
     """Rounds whose default estimator is a :class:`.MixtureDensity`.

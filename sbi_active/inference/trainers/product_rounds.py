@@ -32,8 +32,6 @@ from sbi_active.inference.trainers.base import Told
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 
-__all__ = ["SAMPLERS", "ProductRounds"]
-
 SAMPLERS = ("importance", "kde", *MARKOV_CHAINS)
 #: Shares of the budget by stage, by what they begin at: this round's network, the
 #: belief before, or the prior.
@@ -84,7 +82,7 @@ class ProductRounds(ActionRounds):
         if posterior not in SAMPLERS:
             raise ValueError(
                 f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
-                f"{posterior!r}; do choose one of these"
+                f"{posterior!r}; choose one of these"
             )
         super().__init__(*args, **kwargs)
         self._sampler = posterior

@@ -17,8 +17,6 @@ from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNe
 from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 
-__all__ = ["SeqBED_B", "SeqBED_C"]
-
 HELD_OUT = 0.1  # share of the rows, sbi's default
 
 

@@ -29,8 +29,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 from sbi_active.threads import single_thread
 
-__all__ = ["SeqBED"]
-
 
 class SeqBED(ActiveInference):
     r"""Sequential Bayesian experimental design for implicit models.
@@ -96,7 +94,7 @@ class SeqBED(ActiveInference):
         self._settings = LFIRE() if settings is None else settings
         if num_particles is not None and num_particles < 2:
             raise ValueError(
-                f"expected num_particles >= 2; got {num_particles}; do use about 50"
+                f"expected num_particles >= 2; got {num_particles}; use about 50"
             )
         self._num_particles = num_particles
         self._bandwidth: Bandwidth = bandwidth
@@ -126,7 +124,7 @@ class SeqBED(ActiveInference):
             raise ValueError(
                 f"expected at least {2 * self._settings.num_folds} simulations of each "
                 f"particle at each action; got {repeats}, of {len(theta)} in all at "
-                f"{len(candidates)} different actions and {num} particles; do allow "
+                f"{len(candidates)} different actions and {num} particles; allow "
                 "more simulations, or fewer actions"
             )
         particles = theta[:num]
@@ -153,7 +151,7 @@ class SeqBED(ActiveInference):
         """
         if action is None:
             raise ValueError(
-                "expected action=, since ratios belong to an action; got none; do pass "
+                "expected action=, since ratios belong to an action; got none; pass "
                 "the action of each row"
             )
         belief = self.belief if belief is None else belief
@@ -188,7 +186,7 @@ class SeqBED(ActiveInference):
         """
         if not self._rows:
             raise RuntimeError(
-                "expected simulations of this round; got none; do append_simulations()"
+                "expected simulations of this round; got none; append_simulations()"
             )
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         with single_thread():
@@ -200,7 +198,7 @@ class SeqBED(ActiveInference):
         if self._model is None:
             raise RuntimeError(
                 "expected log ratios of this round; got new rows since the last "
-                "train(), or none; do call train() first"
+                "train(), or none; call train() first"
             )
         return self._model
 

@@ -24,14 +24,6 @@ from sbi_active.information_gain.estimators.variational_nested import (
 )
 from sbi_active.information_gain.race import standard_error
 
-__all__ = [
-    "ESTIMATORS",
-    "MAX_NEIGHBOR_OUTCOMES",
-    "choose_estimator",
-    "disagreements",
-    "find_estimator",
-]
-
 #: Name of an estimator: its class.
 ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
     "contrastive": ContrastiveGain,
@@ -63,7 +55,7 @@ def find_estimator(
     if estimator not in ESTIMATORS:
         raise ValueError(
             f"expected estimator among 'auto', {', '.join(map(repr, ESTIMATORS))}; got "
-            f"{estimator!r}; do choose one of these or pass an estimator"
+            f"{estimator!r}; choose one of these or pass an estimator"
         )
     return ESTIMATORS[estimator]()
 

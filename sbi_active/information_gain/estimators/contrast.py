@@ -19,8 +19,6 @@ from sbi_active.information_gain.base import (
 from sbi_active.information_gain.critic import Critic
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["BATCH_SIZE", "Contrast", "at_least", "log_mean", "near_limit"]
-
 BATCH_SIZE = 50_000  # rows in one pass of a network; bounds memory
 FEWEST = 64  # outcomes at a time: a table runs its network once for each such block
 NEAR = 1.0  # nats to the log of a number of draws, within which too few are effective
@@ -110,7 +108,7 @@ class Contrast(InformationGainEstimator):
         if belief is None:
             raise ValueError(
                 f"expected a belief for {type(self).__name__} to draw from; got None; "
-                "do pass the distribution of theta in the simulations"
+                "pass the distribution of theta in the simulations"
             )
         key = zlib.crc32(simulations.theta.numpy(force=True).tobytes())
         with forked_generators(derive_seed(self.seed, "contrastive", key)):
@@ -140,6 +138,6 @@ def at_least(value: int, least: int, name: str) -> int:
     """Return a count, or raise where it is too small."""
     if value < least:
         raise ValueError(
-            f"expected {name} >= {least}; got {value}; do use about a hundred or more"
+            f"expected {name} >= {least}; got {value}; use about a hundred or more"
         )
     return value

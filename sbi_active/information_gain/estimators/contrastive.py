@@ -11,8 +11,6 @@ from typing_extensions import override
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.estimators.contrast import Contrast, near_limit
 
-__all__ = ["ContrastiveGain"]
-
 
 class ContrastiveGain(Contrast):
     r"""Prior contrastive estimation (PCE).

@@ -22,8 +22,6 @@ from sbi_active.information_gain.fits.presence import (
 )
 from sbi_active.seeding import forked_generators
 
-__all__ = ["EntropyGain", "conditional_entropy", "with_control"]
-
 LOG_2PI_E = math.log(2 * math.pi) + 1
 NOISE_DRAWS = 16  # of the declared noise, for its entropy
 LOG_SQUARE_VARIANCE = math.pi**2 / 2  # Var log z^2
@@ -76,7 +74,7 @@ class EntropyGain(InformationGainEstimator):
     def __init__(self, *, num_neighbors: int = 4) -> None:
         if num_neighbors < 1:
             raise ValueError(
-                f"expected num_neighbors >= 1; got {num_neighbors}; do use about 4"
+                f"expected num_neighbors >= 1; got {num_neighbors}; use about 4"
             )
         self.num_neighbors = num_neighbors
 

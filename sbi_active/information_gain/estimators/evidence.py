@@ -14,8 +14,6 @@ from sbi_active.information_gain.fits.emulator import MeanEmulator
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
 
-__all__ = ["Evidence", "log_belief"]
-
 DEGREES = 6  # of freedom of the Student-t proposals; even
 WIDER = 1.2  # than the linearized posterior
 ENOUGH = 50  # effective draws of the belief that need no local ones

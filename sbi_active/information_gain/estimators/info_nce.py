@@ -22,8 +22,6 @@ from sbi_active.information_gain.estimators.contrast import (
     near_limit,
 )
 
-__all__ = ["InfoNCEGain"]
-
 
 class InfoNCEGain(InformationGainEstimator):
     r"""InfoNCE bound with a learned ratio or likelihood as its critic.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["learning_error"]
-
 
 def learning_error(
     slope: Tensor, z: Tensor, difference: Tensor, residual: Tensor, share: Tensor

@@ -11,8 +11,6 @@ from typing_extensions import override
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.estimators.contrast import Contrast, near_limit
 
-__all__ = ["LikelihoodGain"]
-
 
 class LikelihoodGain(Contrast):
     r"""Nested Monte Carlo on a likelihood, the utility of ALHI.

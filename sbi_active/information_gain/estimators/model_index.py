@@ -24,14 +24,6 @@ from sbi_active.information_gain.fits.cross_fitting import (
 from sbi_active.information_gain.fits.noise_kernels import MOST_NUMBERS, noise_members
 from sbi_active.seeding import derive_seed
 
-__all__ = [
-    "ModelIndexGain",
-    "NoisyRivalPredictive",
-    "RivalPredictive",
-    "RivalSampler",
-    "RivalSimulations",
-]
-
 FEW = 16  # outcomes of one pattern and model whose numbers are not used
 
 
@@ -123,7 +115,7 @@ class RivalSampler:
         if len(values) < 2 or min(values) < 0 or abs(total - 1) > 1e-3:
             raise ValueError(
                 "expected two or more rivals whose probabilities are not negative and "
-                f"add up to 1; got {values}; do normalize them"
+                f"add up to 1; got {values}; normalize them"
             )
         # a rival of no probability has no part in the information
         self.rivals = [r for r, p in zip(self.rivals, values, strict=True) if p > 0]
@@ -154,7 +146,7 @@ class RivalSampler:
             if len({part.shape for part in drawn}) > 1:
                 raise ValueError(
                     "expected outcomes of one shape from all rivals; got "
-                    f"{[tuple(part.shape[1:]) for part in drawn]}; do predict the "
+                    f"{[tuple(part.shape[1:]) for part in drawn]}; predict the "
                     "same x"
                 )
             rows.append(torch.stack(drawn, 2).flatten(1, 2))
@@ -178,7 +170,7 @@ class RivalSampler:
         if x.ndim == 0 or len(x) != num:
             raise ValueError(
                 f"expected {num} outcomes from rival {k}; got shape {tuple(x.shape)}; "
-                "do return one row a draw"
+                "return one row a draw"
             )
         parts = [x]
         if self._is_noisy:
@@ -187,7 +179,7 @@ class RivalSampler:
             if len({part.shape for part in parts}) > 1:
                 raise ValueError(
                     f"expected means and deviations of shape {tuple(x.shape)} from "
-                    f"rival {k}; got {[tuple(p.shape) for p in parts[1:]]}; do return "
+                    f"rival {k}; got {[tuple(p.shape) for p in parts[1:]]}; return "
                     "one of each a number"
                 )
         # kernels as narrow as the noise need what a float loses of a large number

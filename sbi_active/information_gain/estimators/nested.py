@@ -30,8 +30,6 @@ from sbi_active.information_gain.fits.presence import (
 from sbi_active.information_gain.fits.smoothing import declare, fill
 from sbi_active.simulation import NoiseModel
 
-__all__ = ["NestedGain"]
-
 FEW = 20  # outcomes too few for an emulator
 MAX_MISSED = 0.5  # of the numbers of x, by smoothing, more than by the noise
 FEWEST = 8  # complete outcomes of one candidate that are compared
@@ -88,7 +86,7 @@ class NestedGain(InformationGainEstimator):
 
     def __init__(self, *, num_local: int = 16) -> None:
         if num_local < 2:
-            raise ValueError(f"expected num_local >= 2; got {num_local}; do use 16")
+            raise ValueError(f"expected num_local >= 2; got {num_local}; use 16")
         self.num_local = num_local
 
     def _contributions(

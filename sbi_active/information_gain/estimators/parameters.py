@@ -27,8 +27,6 @@ from sbi_active.information_gain.fits.cross_fitting import (
 from sbi_active.information_gain.fits.nearest_neighbors import nearest_neighbor_entropy
 from sbi_active.seeding import forked_generators
 
-__all__ = ["ParameterGain"]
-
 NUM_MARGINAL = 20_000  # draws of the belief for the marginal of the target
 NUM_NEIGHBORS = 4
 NUM_QUANTILES = 33
@@ -76,7 +74,7 @@ class ParameterGain(InformationGainEstimator):
     def __init__(self, index: Sequence[int]) -> None:
         if not index or len(set(index)) < len(index):
             raise ValueError(
-                f"expected one or more different parameters; got {list(index)}; do "
+                f"expected one or more different parameters; got {list(index)}; "
                 "name each once"
             )
         self.index = list(index)

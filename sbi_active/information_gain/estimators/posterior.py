@@ -14,8 +14,6 @@ from sbi_active.information_gain.base import (
     InformationGainEstimator,
 )
 
-__all__ = ["PosteriorGain", "PosteriorModel"]
-
 
 class PosteriorModel(Protocol):
     """Anything with a conditional density of parameters."""

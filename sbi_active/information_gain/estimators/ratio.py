@@ -12,8 +12,6 @@ from sbi_active.information_gain.base import (
 from sbi_active.information_gain.critic import Critic, RatioModel
 from sbi_active.information_gain.estimators.contrast import BATCH_SIZE
 
-__all__ = ["RatioGain"]
-
 
 class RatioGain(InformationGainEstimator):
     r"""Mean log ratio of likelihood to marginal, the utility of LFIRE.

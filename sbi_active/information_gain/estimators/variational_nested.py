@@ -26,8 +26,6 @@ from sbi_active.information_gain.estimators.contrast import (
 from sbi_active.information_gain.estimators.evidence import log_density
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["Proposal", "VariationalNestedGain"]
-
 
 class Proposal(Protocol):
     """A posterior that is drawn from and evaluated, as ``ActionPosterior`` is."""
@@ -108,7 +106,7 @@ class VariationalNestedGain(InformationGainEstimator):
         if belief is None or not hasattr(proposal, "sample_batched"):
             raise ValueError(
                 f"expected a belief and a proposal with sample_batched for {user}; got "
-                f"{type(belief).__name__} and {type(proposal).__name__}; do pass "
+                f"{type(belief).__name__} and {type(proposal).__name__}; pass "
                 f"{user}(proposal=ASBI's posterior)"
             )
         posterior = Critic(proposal, "log_posterior", user, self.batch_size)

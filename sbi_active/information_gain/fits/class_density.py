@@ -11,8 +11,6 @@ from torch import Tensor
 from sbi_active.inference.sampling.bandwidth import silverman
 from sbi_active.information_gain.fits.reduction import Reduction
 
-__all__ = ["TEMPERATURES", "LogDensities", "class_members"]
-
 TEMPERATURES = (1.0, 0.5)  # powers of a density, against too much confidence
 BANDWIDTHS = (0.5, 1.0)  # of Silverman's rule
 SHRINKAGE = 5.0  # rows' worth of the common covariance in that of a class

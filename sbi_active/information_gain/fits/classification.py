@@ -12,8 +12,6 @@ from torch.nn.functional import logsigmoid
 from sbi_active.information_gain.fits.cross_fitting import NUM_FOLDS
 from sbi_active.information_gain.fits.emulator import kernel, whitening
 
-__all__ = ["ParameterFeatures", "cross_fitted", "fit_logistic", "probability"]
-
 NUM_KNOTS = 12  # of the radial features
 NUM_STEPS = 25  # of Newton's method at most
 MAX_MOVE = 4.0  # of a logit in one step, lest separable labels run away

@@ -13,8 +13,6 @@ from sbi_active.information_gain.fits.classification import probability
 from sbi_active.information_gain.fits.emulator import MeanEmulator
 from sbi_active.information_gain.fits.presence import random_presence
 
-__all__ = ["Completeness", "completeness"]
-
 
 @dataclass(frozen=True)
 class Completeness:

@@ -12,8 +12,6 @@ from torch import Tensor
 from sbi_active.information_gain.fits.emulator import kernel, linear
 from sbi_active.information_gain.fits.reduction import Reduction
 
-__all__ = ["conditional_members", "log_normal"]
-
 LOG_2PI = math.log(2 * math.pi)
 RIDGES = 10.0 ** torch.arange(-6.0, 3.0, dtype=torch.float64)
 LENGTHS = (0.3, 1.0, 3.0, 10.0)  # in standard deviations of x

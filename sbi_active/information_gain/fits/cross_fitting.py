@@ -7,8 +7,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["NUM_FOLDS", "cross_fit", "patterns_of_numbers"]
-
 NUM_FOLDS = 4
 
 

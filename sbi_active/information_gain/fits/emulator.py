@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["MeanEmulator", "kernel", "linear", "whitening"]
-
 LENGTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0)  # in standard deviations of the belief
 REFINED = (0.7, 1.0, 1.4)  # of the best isotropic length, in the metric of slopes
 NUGGET = 1e-6

@@ -9,8 +9,6 @@ from scipy.spatial import KDTree
 from scipy.special import digamma
 from torch import Tensor
 
-__all__ = ["nearest_neighbor_entropy"]
-
 FLOAT32 = 2.0**-23  # outcomes are float32: no two are closer than their rounding
 #: Of the jackknife's estimate of an outcome's effect on its neighbors. All of it is too
 #: much, as distances are not smooth in the outcomes; with .27 the variance of the mean

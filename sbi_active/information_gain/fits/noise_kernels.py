@@ -23,8 +23,6 @@ from torch import Tensor
 from sbi_active.inference.sampling.bandwidth import silverman
 from sbi_active.information_gain.fits.class_density import LogDensities
 
-__all__ = ["MOST_NUMBERS", "noise_members"]
-
 #: Widths h, in those of Silverman's rule.
 FACTORS = (0.25, 1.0)
 #: Numbers of an outcome up to which each kernel has a covariance of its own.

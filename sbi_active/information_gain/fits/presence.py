@@ -8,13 +8,6 @@ from torch import Tensor
 from sbi_active.information_gain.base import CandidateSimulations
 from sbi_active.information_gain.fits.classification import cross_fitted
 
-__all__ = [
-    "presence_information",
-    "presence_notes",
-    "presence_problems",
-    "random_presence",
-]
-
 MAX_PARTLY = 0.1  # share of partly observed outcomes
 MAX_PATTERNS = 6  # of a random presence; rarer ones are one pattern
 

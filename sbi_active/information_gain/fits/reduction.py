@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Reduction"]
-
 MAX_NUMBERS = 6  # of an outcome that need no reduction
 RIDGE = 0.01  # share of the total variance, that a direction is penalized by
 LIMIT = 8.0  # standard deviations beyond which a number is cut off

@@ -12,8 +12,6 @@ from sbi_active.information_gain.fits.emulator import kernel, linear, whitening
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise
 
-__all__ = ["Learned", "declare", "fill"]
-
 LENGTHS = (0.7, 1.0, 1.4, 2.0, 4.0)  # in standard deviations of the belief
 REFINED = (0.7, 1.0, 1.4)  # of the best, in the metric of slopes
 RIDGES = 10.0 ** torch.arange(-5.0, 2.0, dtype=torch.float64)

@@ -60,7 +60,7 @@ def simulator_name(identity: Mapping[str, Any]) -> str:
 def _compare(path: str, expected: Any, got: Any) -> Iterator[str]:
     if isinstance(expected, dict) and isinstance(got, dict):
         # Keys of one side alone come from another release of a class.
-        for key in expected.keys() & got.keys():
+        for key in sorted(expected.keys() & got.keys()):
             yield from _compare(f"{path}.{key}", expected[key], got[key])
     elif expected != got:
         yield f"{path} {expected!r} there, {got!r} here"

@@ -95,7 +95,7 @@ SHORT = "trial,time,action_v,x_y"
         (["1,2,3"], "time,action_v,x_y", "got time without trial in trials.csv; do"),
         (["1,0,3"], "trial,time,x_y", r"columns action_\*; got trial, time, x_y in"),
         (["1,0,3"], "trial,time,action_v", r"columns x_\*; got trial, time, action_v"),
-        (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; do rename or"),
+        (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; rename or"),
         (["1,0,1,2,3"], f"{SHORT},x_y", "got x_y more than once in trials.csv"),
         (
             ["1,0,1,2,3"],
@@ -109,7 +109,7 @@ SHORT = "trial,time,action_v,x_y"
         ),
         (["1,0,1,2,3"], f"{SHORT},time_s", "one column time; got time, time_s"),
         (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),
-        (['1,0,1,"5,2"'], SHORT, "got '5,2' in trials.csv; do write decimals with a"),
+        (['1,0,1,"5,2"'], SHORT, "got '5,2' in trials.csv; write decimals with a"),
         (["1,0,1,5", "1,x,1,4"], SHORT, r"column time, row 2 \(trial 1\); got 'x'"),
         (["1,0,1,5", "1,,1,4"], SHORT, r"number in column time, row 2 .*an empty cell"),
         (
@@ -159,10 +159,10 @@ def test_a_long_table_that_is_not_understood(rows, header, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y; do say"),
+        ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y; say"),
         ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*; x_y is close"),
         ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
-        ({"units": {"x_z": "m"}}, "got one of x_z; do correct the name"),
+        ({"units": {"x_z": "m"}}, "got one of x_z; correct the name"),
     ],
 )
 def test_options_that_do_not_fit_the_table(options, message):

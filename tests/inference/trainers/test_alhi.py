@@ -311,7 +311,7 @@ def test_outcomes_measured_in_part_are_refused():
     theta, x, action = rows(50)
     x[3, 1] = torch.nan
     inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
-    with raises("got 1 of 50 measured in part, the first in row 3; do leave out"):
+    with raises("got 1 of 50 measured in part, the first in row 3; leave out"):
         inference.append_simulations(theta, x, action=action)
     with raises("expected outcomes that are measured or NaN throughout"):
         trained().update(torch.tensor([0.0, torch.nan]), action=torch.ones(1))
