@@ -134,7 +134,9 @@ def _captured(function: types.FunctionType) -> dict[str, Any]:
 def _name(thing: Any) -> str:
     module = thing.__module__
     if module == "__main__":  # the same file, run and imported, is one simulator
-        module = Path(getattr(sys.modules["__main__"], "__file__", module)).stem
+        main = sys.modules["__main__"]
+        spec = getattr(main, "__spec__", None)  # of python -m
+        module = spec.name if spec else Path(getattr(main, "__file__", module)).stem
     return f"{module}.{thing.__qualname__}"
 
 
