@@ -122,6 +122,13 @@ def test_seeing(run, capsys, monkeypatch):
     assert ((belief.mean - page.truth).abs() < 4 * belief.variance.sqrt()).all()
 
 
+def test_campaigns(run, capsys):
+    (page,) = run("docs/campaigns.md")
+    assert "Belief(refined" in capsys.readouterr().out
+    assert [t.status for t in page.campaign.history] == ["ok", "ok"]
+    assert page.campaign.history[1].reason == "read off the wrong tape"
+
+
 def test_no_page_is_forgotten():
     pages = {
         page.name
@@ -130,6 +137,7 @@ def test_no_page_is_forgotten():
     }
     assert pages == {
         "README.md",
+        "campaigns.md",
         "simulations.md",
         "methods.md",
         "seeing.md",

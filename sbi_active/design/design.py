@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -165,3 +165,22 @@ def are_categories(actions: ActionSpace) -> tuple[bool, ...]:
     listed = [(part.listed() is not None, part.action_dim) for part in actions.parts()]
     mixed = len({is_listed for is_listed, _ in listed}) > 1
     return tuple(mixed and is_listed for is_listed, dim in listed for _ in range(dim))
+
+
+def naming(actions: ActionSpace) -> dict[str, Any]:
+    """Return the fields of a :class:`Design` that name its actions."""
+    return {
+        "name": action_name(actions),
+        "labels": action_labels(actions),
+        "categorical": are_categories(actions),
+    }
+
+
+def equal_errors(error: Tensor) -> dict[str, Tensor]:
+    """Return the fields of a :class:`Design` for errors that are all alike.
+
+    Args:
+        error: NaN where not known, shape (a,).
+    """
+    kinds = ("standard_error", "difference_standard_error", "probability_best")
+    return dict.fromkeys(kinds, error)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.design.design import Design, action_labels, action_name, are_categories
+from sbi_active.design.design import Design, equal_errors, naming
 from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
@@ -114,16 +114,12 @@ class RandomDesigner:
             action=candidates[chosen],
             candidates=candidates,
             expected_information_gain=unknown,
-            standard_error=unknown,
-            difference_standard_error=unknown,
-            probability_best=unknown,
+            **equal_errors(unknown),
             probability_valid=valid,
             bound="none",
             index=chosen,
             num_simulations=num_simulations,
-            name=action_name(self.actions),
-            labels=action_labels(self.actions),
-            categorical=are_categories(self.actions),
+            **naming(self.actions),
             num_samples=torch.full((num,), num_simulations // num).long(),
             num_missing=num_missing,
             notes=(*limits.excluded_note(eligible), *notes),

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from sbi_active import __version__
-from sbi_active.campaign import methods
+from sbi_active.campaign.learning import methods
 from sbi_active.cli import main, parser, run
 from sbi_active.tasks import TASKS  # pyright: ignore
 

@@ -213,7 +213,7 @@ def test_a_slow_simulator_is_run_less():
 
 
 def test_the_command_says_it(tmp_path, capsys):
-    file = tmp_path / "my_body.py"
+    file = tmp_path / "my_checked_body.py"
     file.write_text(
         "import torch\n"
         "def simulator(theta, action):\n"

@@ -14,7 +14,7 @@ from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.design.design import Design, action_labels, action_name, are_categories
+from sbi_active.design.design import Design, equal_errors, naming
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.information_gain.estimators.automatic import ESTIMATORS
@@ -216,16 +216,12 @@ def _model_design(
         action=candidates[index],
         candidates=candidates,
         expected_information_gain=gain,
-        standard_error=unknown,
-        difference_standard_error=unknown,
-        probability_best=unknown,
+        **equal_errors(unknown),
         probability_valid=unknown,
         bound="lower",
         index=index,
         num_simulations=criticism.rivals.simulator.num_simulations - spent,
-        name=action_name(limits.actions),
-        labels=action_labels(limits.actions),
-        categorical=are_categories(limits.actions),
+        **naming(limits.actions),
         estimator="ModelIndexGain",
         stopped="budget spent",
         notes=(f"about which is right: {', '.join(found.separates)}",),

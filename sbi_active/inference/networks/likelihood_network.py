@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
+from sbi_active.inference.networks.batches import log_prob_of_batch
 from sbi_active.inference.networks.conditioning import (
     MAX_OUTCOMES,
     MIN_ROWS,
@@ -126,18 +127,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
             condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
             kwargs: Not used.
         """
-        self._check_condition_shape(condition)
-        self._check_input_shape(input)
-        if input.ndim == 2:
-            input = input[None]
-        if condition.ndim == 3:
-            pairs = input.expand(*condition.shape[:2], -1).reshape(
-                1, -1, input.shape[-1]
-            )
-            return self._log_density(pairs, condition.flatten(0, 1)).reshape(
-                condition.shape[:2]
-            )
-        return self._log_density(input, condition)
+        return log_prob_of_batch(self, self._log_density, input, condition)
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: object

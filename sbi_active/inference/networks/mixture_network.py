@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from sbi_active.inference.networks.baseline import Frames, local
+from sbi_active.inference.networks.batches import log_prob_of_batch
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
 
 #: Bounds of the log-precision of a component in units of the standardized parameter:
@@ -180,15 +181,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
             kwargs: Not used.
         """
-        self._check_condition_shape(condition)
-        self._check_input_shape(input)
-        if input.ndim == 2:
-            input = input[None]
-        if condition.ndim == 3:
-            pairs = (input.expand(*condition.shape[:2], -1).flatten(0, 1), condition)
-            flat = self._log_density(pairs[0], condition.flatten(0, 1))
-            return flat.reshape(condition.shape[:2])
-        return self._log_density(input, condition)
+        return log_prob_of_batch(self, self._log_density, input, condition)
 
     def sample(
         self, sample_shape: torch.Size, condition: Tensor, **kwargs: object

@@ -91,8 +91,8 @@ SHORT = "trial,time,action_v,x_y"
 @pytest.mark.parametrize(
     ("rows", "header", "message"),
     [
-        (["1,2,3"], "trial,action_v,x_y", "got trial without time in trials.csv; do"),
-        (["1,2,3"], "time,action_v,x_y", "got time without trial in trials.csv; do"),
+        (["1,2,3"], "trial,action_v,x_y", "got trial without time in trials.csv; add"),
+        (["1,2,3"], "time,action_v,x_y", "got time without trial in trials.csv; add"),
         (["1,0,3"], "trial,time,x_y", r"columns action_\*; got trial, time, x_y in"),
         (["1,0,3"], "trial,time,action_v", r"columns x_\*; got trial, time, action_v"),
         (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; rename or"),
@@ -131,7 +131,7 @@ SHORT = "trial,time,action_v,x_y"
         (
             ["1,0,1,5", "2,0,1,4", "1,0,1,5"],
             SHORT,
-            "= 0 s in rows 1 and 3 .* trial 1; do",
+            "= 0 s in rows 1 and 3 .* trial 1; remove",
         ),
         (
             ["1,1,1,5", "1,0,1,4"],

@@ -246,7 +246,7 @@ CASES: dict[str, tuple[Callable[[], Report], Callable[[], Report]]] = {
         partial(examined, exploratory=True),
         partial(examined, exploratory=False),
     ),
-    "do declare GaussianNoise or AutocorrelatedNoise": (
+    "declare GaussianNoise or AutocorrelatedNoise": (
         partial(trajectories, stamped=True, noise=assumed),
         partial(trajectories, stamped=True, noise=assumed, correlation=0.0),
     ),

@@ -5,7 +5,7 @@ from torch.distributions import Normal
 
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Effect
-from sbi_active.criticism.evidence import log_evidence
+from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.near_aliases import near_aliases

@@ -29,6 +29,7 @@ from sbi_active.inference.sampling import (
 )
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
+from sbi_active.simulation.workers.settings import IN_PROCESS
 
 BOX = BoxUniform(-torch.ones(2), torch.ones(2))
 SD, CELL = 0.02, 0.02
@@ -80,7 +81,7 @@ def grid_evidence(model: SimulatorModel, action: Tensor, x: Tensor) -> float:
 
 def sampled(model: SimulatorModel, x: Tensor, count: int, seed: int = 0, past=None):
     coordinates = PriorCoordinates(BOX, np.random.default_rng(0))
-    table = MeanTable(model, {})
+    table = MeanTable(model, IN_PROCESS)
     likelihood = SimulatedLikelihood(table, ACTION[:count], x[:count])
     base = PriorProposal(coordinates)
     pool = importance_sample(
@@ -120,7 +121,7 @@ def test_kernels_are_normalized_and_match_their_draws(either):
 
 def test_the_likelihood_is_the_noise_around_the_mean(model: SimulatorModel):
     x = observe(model, 0)
-    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    likelihood = SimulatedLikelihood(MeanTable(model, IN_PROCESS), ACTION, x)
     theta = BOX.sample((50,))
     exact = torch.zeros(50).double()
     for k in range(3):
@@ -138,7 +139,7 @@ def test_the_likelihood_is_the_noise_around_the_mean(model: SimulatorModel):
 
 def test_hopeless_rows_are_not_simulated_further(model: SimulatorModel):
     x = observe(model, 0)
-    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    likelihood = SimulatedLikelihood(MeanTable(model, IN_PROCESS), ACTION, x)
     likelihood(BOX.sample((200,)), floor=float(likelihood.peak.sum()) - 25)
     assert likelihood.table.num_simulations < 0.6 * 600
 
@@ -260,12 +261,12 @@ def test_a_smooth_density_costs_no_simulations(model: SimulatorModel):
 def test_trials_without_a_measurement_count():
     model = SimulatorModel(half, noise=GaussianNoise(SD))
     x = torch.full((3, 1), torch.nan).double()
-    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    likelihood = SimulatedLikelihood(MeanTable(model, IN_PROCESS), ACTION, x)
     theta = BOX.sample((100,))
     left = (theta[:, 0] < 0.3).numpy()
     assert (likelihood(theta) == np.where(left, 0.0, -np.inf)).all()
     x = observe(model, 0)  # the truth lies just on the right
-    likelihood = SimulatedLikelihood(MeanTable(model, {}), ACTION, x)
+    likelihood = SimulatedLikelihood(MeanTable(model, IN_PROCESS), ACTION, x)
     assert (np.isfinite(likelihood(theta)) == ~left).all()
 
 

@@ -245,7 +245,7 @@ def test_errors():
         inference.update(torch.zeros(2), action=torch.ones(1))
     theta, x, action = rows(200)
     inference.append_simulations(theta, x, action=action)
-    with raises("do call train() first", RuntimeError):
+    with raises("call train() first", RuntimeError):
         inference.build_posterior()
     with raises("expected action=, since earlier rounds of this trainer have actions"):
         inference.append_simulations(theta, x)
@@ -253,7 +253,7 @@ def test_errors():
         ALHI(PRIOR, posterior="nuts")
     inference = ALHI(PRIOR, "mdn", show_progress_bars=False)
     inference.append_simulations(theta, x)
-    with raises("do start a new ALHI(prior) for rounds with actions"):
+    with raises("start a new ALHI(prior) for rounds with actions"):
         inference.append_simulations(theta, x, action=action)
 
 

@@ -49,7 +49,7 @@ def test_action_missing():
 def test_rounds_with_and_without_action_do_not_mix():
     theta, x, action = rows()
     inference = ASBI(PRIOR, "mdn").append_simulations(theta, x)
-    with raises("do start a new ASBI(prior) for rounds with actions"):
+    with raises("start a new ASBI(prior) for rounds with actions"):
         inference.append_simulations(theta, x, action=action)
 
 
@@ -113,7 +113,7 @@ def test_update_needs_a_network_of_this_round():
         inference.update(torch.zeros(2), action=torch.zeros(1))
     inference.train()
     inference.update(torch.zeros(2), action=torch.zeros(1))
-    with raises("do append simulations of the belief with action=", RuntimeError):
+    with raises("append simulations of the belief with action=", RuntimeError):
         inference.update(torch.zeros(2), action=torch.zeros(1))
 
 

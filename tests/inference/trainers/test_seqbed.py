@@ -188,7 +188,7 @@ def test_errors():
         inference.arrange(NORMAL.sample((50,)), torch.rand(50, 1))
     with raises("expected simulations of this round", RuntimeError):
         inference.train()
-    with raises("do call train() first", RuntimeError):
+    with raises("call train() first", RuntimeError):
         inference.update(torch.zeros(1), action=torch.ones(1))
     theta, x, action = drawn(inference, 800, NORMAL)
     with raises("expected action=, since ratios belong to an action"):
@@ -201,7 +201,7 @@ def test_errors():
     inference = SeqBED(NORMAL)
     theta = NORMAL.sample((100,))
     inference.append_simulations(theta, theta, action=torch.ones(1))
-    with raises("do simulate each parameter set several times"):
+    with raises("simulate each parameter set several times"):
         inference.train()
     with raises("expected num_iterations >= 1; got 0"):
         RatioClassifier(num_iterations=0)
