@@ -133,7 +133,7 @@ class Campaign(CampaignTrials):
             )
             write_manifest(Path(directory), manifest)
             disk = CampaignDirectory(Path(directory))
-        self._storage = Storage(disk, options.bank)
+        self._storage = Storage(disk, options.bank, prior)
 
     def _begin(
         self, state: CampaignState, actions: ActionSpace, learner: Any, planner: Planner
@@ -210,7 +210,7 @@ class Campaign(CampaignTrials):
         found.state.watch = StageWatch(show_progress)
         self._begin(found.state, found.actions, found.learner, planner)
         self.on_trial, self.on_update = on_trial, on_update
-        self._storage = Storage(found.disk, found.state.options.bank)
+        self._storage = Storage(found.disk, found.state.options.bank, found.prior)
         return self
 
     def close(self) -> None:
@@ -225,7 +225,7 @@ class Campaign(CampaignTrials):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy is in memory alone: a directory belongs to one campaign.
-        return {**vars(self), "_storage": Storage()}
+        return {**vars(self), "_storage": Storage(prior=self.first_prior)}
 
     @property
     @stored

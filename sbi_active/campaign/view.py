@@ -94,6 +94,12 @@ class CampaignView:
         return self._planner.effects
 
     @property
+    def first_prior(self) -> Distribution:
+        """The prior that the campaign began with."""
+        prior = self._storage.prior
+        return self.prior if prior is None else prior
+
+    @property
     def directory(self) -> Path | None:
         """Where the campaign is kept; None for in memory alone."""
         return self._storage.path

@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = make_parser().parse_args(argv)
     module, function = arguments.command
     command = getattr(importlib.import_module(f"sbi_active.cli.{module}"), function)
-    folder = getattr(arguments, "folder", "DIR")
+    folder = getattr(arguments, "folder", getattr(arguments, "trials", "DIR"))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: say(f"note: {message}", folder)

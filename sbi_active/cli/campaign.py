@@ -131,7 +131,7 @@ def status(arguments: argparse.Namespace) -> int:
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare the campaign's simulator with its trials, and print the report."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign, arguments))
+        report = campaign.criticize(library_of(campaign))
     print(report)
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
@@ -143,7 +143,7 @@ def criticize(arguments: argparse.Namespace) -> int:
 def adopt(arguments: argparse.Namespace) -> int:
     """Go on with the simulator that the verdict names."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign, arguments), evaluate=False)
+        report = campaign.criticize(library_of(campaign), evaluate=False)
         campaign.adopt(report)
         print(f"adopted: {report.verdict}", file=sys.stderr)
         return print_status(arguments, campaign)

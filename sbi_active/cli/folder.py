@@ -173,13 +173,11 @@ def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign
     return Campaign.load(folder, simulator=simulator, effects=effects, **given)
 
 
-def library_of(campaign: Campaign, arguments: argparse.Namespace) -> list[Effect]:
+def library_of(campaign: Campaign) -> list[Effect]:
     """Return the effects to compare: the campaign's own, and those that are usual."""
     # An adopted effect is declared for the simulator without it.
     base = getattr(campaign.simulator, "base", campaign.simulator)
-    return _with_usual(
-        [*campaign.effects], base, open_campaign(arguments, simulates=False)
-    )
+    return _with_usual([*campaign.effects], base, campaign)
 
 
 def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:
@@ -193,5 +191,5 @@ def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Eff
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)
     taken = {effect.name for effect in own}
-    generic = generic_effects(simulator, reader.actions, prior=reader.prior)
+    generic = generic_effects(simulator, reader.actions, prior=reader.first_prior)
     return [*own, *(effect for effect in generic if effect.name not in taken)]

@@ -140,3 +140,26 @@ def test_exported(made, capsys, tmp_path):
     assert main(["export", "camp", "--netcdf", "out.nc"]) == 0
     data = az.from_netcdf(tmp_path / "out.nc")
     assert data["posterior"]["theta"].shape == (1, 2000, 2)
+
+
+def test_a_missing_effect_is_found_and_adopted(made, capsys):
+    for index, speed in enumerate((0.5, 1.0, 1.5, 2.0, 2.5, 3.0)):
+        distance = speed**2 / (2 * 9.81 * 0.5) / (1 + 0.3 * speed)
+        slip = 0.02 * (-1) ** index
+        x = f"{distance + 0.3 + slip:.4f}"  # the sensor reads 30 cm too much
+        assert main(["tell", "camp", x, "--action", str(speed)]) == 0
+    assert main(["criticize", "camp"]) == 0
+    shown = capsys.readouterr()
+    assert "Verdict: bias" in shown.out
+    assert "to go on with it: sbi-active adopt camp" in shown.out
+    assert "DIR" not in shown.err
+    assert main(["adopt", "camp"]) == 0
+    capsys.readouterr()
+    belief = answer(capsys, "status", "camp")["belief"]["parameters"]
+    assert belief["theta_3"]["mean"] == pytest.approx(0.3, abs=0.06)
+    assert answer(capsys, "ask", "camp")["trial"] == 6
+    assert main(["report", "camp"]) == 0
+    page = (made / "report.html").read_text()
+    assert "bias" in page
+    assert "data:image/png;base64," in page
+    assert "http" not in page.replace("http-equiv", "")

@@ -26,7 +26,6 @@ from sbi_active.campaign.storage.described import (
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.manifest import require_same_simulator
-from sbi_active.campaign.storage.storage import known
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
 if TYPE_CHECKING:
@@ -41,20 +40,21 @@ class Loaded:
     state: CampaignState
     actions: ActionSpace
     learner: Learner | StoredLearner
+    prior: Distribution
 
 
 class StoredLearner:
     """What is known of a campaign without its simulator.
 
     Args:
-        prior: Over the parameters.
+        prior: That the campaign began with.
         x_shape: Of an outcome.
         state: Of the campaign.
         belief: Returns the belief, read when it is first asked for; None for none.
         parameter_names: Of the parameters, if they have names.
 
     Attributes:
-        prior: As given; without those of effects that were adopted.
+        first_prior: As given.
         x_shape: As given.
     """
 
@@ -69,8 +69,13 @@ class StoredLearner:
         parameter_names: Sequence[str] | None,
     ) -> None:
         self.parameter_names = parameter_names
-        self.prior, self.x_shape, self._state = prior, x_shape, state
+        self.first_prior, self.x_shape, self._state = prior, x_shape, state
         self._saved, self._belief = belief, prior
+
+    @property
+    def prior(self) -> Distribution:
+        """The original prior, times those of the effects that were adopted."""
+        return getattr(self.belief, "prior", self.first_prior)
 
     @property
     def belief(self) -> Distribution:
@@ -134,7 +139,7 @@ def load(
         reader = StoredLearner(
             first_prior, shape, state, saved, manifest["parameter_names"]
         )
-        return Loaded(disk, state, space, reader)
+        return Loaded(disk, state, space, reader, first_prior)
     for what, given in (("cost", has_cost), ("constraint", has_constraint)):
         if given != manifest[f"has_{what}"]:
             raise ValueError(
@@ -155,14 +160,17 @@ def load(
     model, joint = rebuilt(state, simulator, first_prior, space, effects)
     learner = Learner(model, joint, space, state, x_shape=shape)
     if name is not None and not state.is_stale:
-        learner.resume(lambda: _belief(disk, name, learner))
-    return Loaded(disk, state, space, learner)
+        known = {"simulator": model, "prior": first_prior}
+        learner.resume(lambda: _belief(disk, name, known, learner))
+    return Loaded(disk, state, space, learner, first_prior)
 
 
-def _belief(disk: CampaignDirectory, name: str, learner: Learner) -> Distribution:
+def _belief(
+    disk: CampaignDirectory, name: str, known: dict[str, Any], learner: Learner
+) -> Distribution:
     """Return the belief, or the prior where all has to be computed again."""
     try:
-        return disk.belief(name, known(learner))
+        return disk.belief(name, known)
     except (OSError, ValueError) as error:
         warnings.warn(f"the belief is computed again: {error}", stacklevel=4)
         learner.forget()

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torch.distributions import Distribution
+
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.state import CampaignState, Trial
@@ -40,12 +42,16 @@ class Storage:
     Args:
         disk: The folder; None keeps the campaign in memory alone.
         bank: Folder of the simulations; None is one in the campaign's.
+        prior: That the campaign began with.
     """
 
     def __init__(
-        self, disk: CampaignDirectory | None = None, bank: str | None = None
+        self,
+        disk: CampaignDirectory | None = None,
+        bank: str | None = None,
+        prior: Distribution | None = None,
     ) -> None:
-        self.disk = disk
+        self.disk, self.prior = disk, prior
         folder = None if disk is None else disk.simulations
         folder = folder if bank is None else Path(bank)
         self._banks = None if folder is None else CampaignBanks(folder)
@@ -83,7 +89,8 @@ class Storage:
         """Save what was computed."""
         if self.disk is not None:
             belief = None if learner.belief is learner.prior else learner.belief
-            self.disk.save(state, belief, known(learner))
+            known = {"simulator": learner.simulator, "prior": self.prior}
+            self.disk.save(state, belief, known)
 
     def close(self) -> None:
         """Let others write."""
@@ -91,8 +98,3 @@ class Storage:
             self._banks.close()
         if self.disk is not None:
             self.disk.close()
-
-
-def known(learner: Any) -> dict[str, Any]:
-    """Return what a reader of a belief has too."""
-    return {"simulator": learner.simulator, "prior": learner.prior}

@@ -237,6 +237,9 @@ def test_adopted_effects_come_back(tmp_path):
     campaign.adopt(report)
     campaign.close()
 
+    reader = Campaign.load(tmp_path / "c")
+    assert torch.equal(draws(reader), draws(campaign))
+    assert reader.parameter_names == ["a", "b", "bias"]
     with pytest.raises(ValueError, match=r"expected the effects \['bias'\]; got"):
         Campaign.load(tmp_path / "c", simulator=MODEL)
     again = Campaign.load(tmp_path / "c", simulator=MODEL, effects=[bias])
