@@ -103,10 +103,11 @@ def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
         state: Of the campaign.
         facts: Fields of :class:`.Trial`, its index among them.
 
-    Raises:
-        ValueError: If trials before it are not there.
     """
     index = facts["index"]
+    while index > len(state.trials):  # what a repair of the log gave up
+        gap = Trial(len(state.trials), torch.full_like(facts["action"], torch.nan))
+        state.record(replace(gap, status="withdrawn", reason="its record was lost"))
     if index == len(state.trials):
         return Trial(**facts)
     before = find_trial(state, index)

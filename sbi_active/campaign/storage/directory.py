@@ -14,10 +14,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
 from sbi_active.campaign.storage.log import TrialLog, mend_log
 from sbi_active.campaign.storage.manifest import read_manifest
+from sbi_active.campaign.telling import recorded
 from sbi_active.simulation.bank.lock import WriterLock
 from sbi_active.simulation.bank.segments import write_file
 
@@ -47,12 +50,13 @@ class CampaignDirectory:
     def __init__(self, path: Path, *, repair: bool = False) -> None:
         self.path, self.notes = path, []
         self.manifest = read_manifest(path, repair=repair)
-        if repair and (path / LOG).exists():
-            lost = mend_log(path / LOG)
+        if repair and (lost := mend_log(path / LOG)):
+            (path / STATE).unlink(missing_ok=True)  # it counts other lines
             self.notes = [f"given up, tell it again: {text}" for text in lost]
         self._log = TrialLog(path / LOG)
         self._lock = WriterLock(path)
         self._belief_written: tuple[int, str | None] = (-1, None)
+        self._kept: Any = None
         for entry in self._log.entries:
             if entry["event"] == "simulator changed":
                 self.manifest["simulator"] = entry["simulator"]
@@ -96,9 +100,11 @@ class CampaignDirectory:
         elif self._belief_written[0] == id(belief):
             name = self._belief_written[1]
         else:
-            name = f"{BELIEF}-{len(self._log):06d}.bin"
             try:
-                self._put(name, encode(belief, known=known))
+                content = encode(belief, known=known)
+                # Another name for another belief: the state says which one is meant.
+                name = f"{BELIEF}-{hashlib.sha256(content).hexdigest()[:16]}.bin"
+                self._put(name, content)
             except NotStorableError:
                 name = ""  # it has to be computed again
             self._kept = belief  # so that no other object gets its identity
@@ -146,9 +152,16 @@ class CampaignDirectory:
         """Return a belief from its file.
 
         Raises:
-            ValueError: If it is damaged, or another release wrote it.
+            ValueError: If it is damaged, another release wrote it, or it is not there
+                any more.
         """
-        return decode(self._get(name), known=known)
+        try:
+            return decode(self._get(name), known=known)
+        except FileNotFoundError:
+            raise ValueError(
+                f"expected {name} in {self.path}; got none, as after another process "
+                "went on with the campaign; load it again"
+            ) from None
 
     def close(self) -> None:
         """Let others write."""
@@ -229,10 +242,6 @@ def _listed(x: Any) -> Any:
 
 
 def _trial(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
-    import torch
-
-    from sbi_active.campaign.telling import recorded
-
     action = torch.tensor(facts["action"], dtype=torch.float32)
     x = facts["x"]
     if x is not None:

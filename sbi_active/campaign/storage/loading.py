@@ -82,7 +82,13 @@ class StoredLearner:
         """The belief when the campaign was last brought up to date."""
         saved, self._saved = self._saved, None
         if saved is not None:
-            self._belief = saved()
+            try:
+                self._belief = saved()
+            except ValueError as error:
+                warnings.warn(
+                    f"the belief has to be computed again: {error}", stacklevel=3
+                )
+                self._state.is_stale = True
         return self._belief
 
     @property
@@ -171,7 +177,7 @@ def _belief(
     """Return the belief, or the prior where all has to be computed again."""
     try:
         return disk.belief(name, known)
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         warnings.warn(f"the belief is computed again: {error}", stacklevel=4)
         learner.forget()
         return learner.prior

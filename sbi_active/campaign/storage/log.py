@@ -103,7 +103,7 @@ def mend_log(path: Path) -> list[str]:
     Args:
         path: The log; its copy ends on ".damaged".
     """
-    content = path.read_bytes()
+    content = path.read_bytes() if path.exists() else b""
     lines = content.splitlines(keepends=True)
     kept = [entry for line in lines if (entry := _opened(line.rstrip(b"\n")))]
     lost = [
@@ -111,6 +111,8 @@ def mend_log(path: Path) -> list[str]:
         for line in lines
         if _opened(line.rstrip(b"\n")) is None
     ]
+    if not lost:
+        return []
     path.with_suffix(".damaged").write_bytes(content)
     renumbered = [{**entry, "line": k} for k, entry in enumerate(kept, 1)]
     write_file(path, b"".join(map(_sealed, renumbered)))

@@ -78,6 +78,28 @@ def test_a_damaged_line_is_given_up_by_name(made, folder):
     assert torch.equal(draws(campaign), draws(made[1]))
 
 
+def test_a_trial_without_any_line_leaves_a_gap(tmp_path):
+    campaign = new(tmp_path / "c")
+    for action, x in (([0.8], 0.3), ([1.0], 0.4), ([1.9], 0.6)):
+        campaign.attach(action, [x] * 4)
+    campaign.close()
+    lines = (tmp_path / "c" / LOG).read_text().splitlines()
+    flip(tmp_path / "c" / LOG, len(lines[0]) // 2)
+    with pytest.warns(UserWarning, match="given up, tell it again: .*attached"):
+        again = Campaign.load(tmp_path / "c", simulator=drawn, repair=True)
+    assert [t.status for t in again.history] == ["withdrawn", "ok", "ok"]
+    assert again.history[0].reason == "its record was lost"
+    again.correct(0, [0.3] * 4, action=[0.8])
+    again.update()
+    apart = new()
+    for trial in campaign.history:
+        apart.attach(trial.action, trial.x)
+    apart.update()
+    assert torch.equal(draws(again), draws(apart))
+    again.close()
+    assert Campaign.load(tmp_path / "c", repair=True).history[0].status == "ok"
+
+
 @pytest.mark.parametrize("name", ["state.bin", "belief"])
 def test_what_can_be_computed_again_is(made, folder, name):
     path = next(folder.glob(f"{name}*"))

@@ -106,6 +106,27 @@ def test_killed_at_each_write_of_a_round(tmp_path, at_call, whole):
     assert torch.equal(draws(campaign), draws(whole))
 
 
+@pytest.mark.parametrize("at_call", range(1, 15))
+def test_killed_while_several_trials_are_learned(tmp_path, at_call):
+    told = [([0.8], [0.3, 0.5, 0.7, 0.8]), ([1.9], [0.6, 0.8, 1.0, 1.2])]
+
+    def learn(campaign):
+        campaign.update()
+        return campaign
+
+    apart = new()
+    folder = tmp_path / "c"
+    with new(folder) as campaign:
+        for action, x in told:
+            apart.attach(action, x)
+            campaign.attach(action, x)
+    killed(lambda: learn(Campaign.load(folder, simulator=drawn)), at_call=at_call)
+    campaign = learn(Campaign.load(folder, simulator=drawn))
+    apart.update()
+    assert torch.equal(draws(campaign), draws(apart))
+    assert facts(campaign) == facts(apart)
+
+
 def run_from(folder):
     complete = (folder / "campaign.json").exists()
     if not complete and folder.exists():  # died before there was a campaign
