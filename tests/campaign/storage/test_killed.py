@@ -74,27 +74,26 @@ def whole():
 
 
 @pytest.mark.parametrize("how", ["by the clock", "at the disk"])
-def test_killed_and_resumed(tmp_path, how, whole):
+def test_killed_ten_times_and_resumed(tmp_path, how, whole):
     rng = random.Random(0)
-    folder, told = tmp_path / "c", []
-    num_killed = 0
+    num_killed = num_campaigns = 0
     while num_killed < 10:
-        if how == "by the clock":
-            moment = {"after": rng.uniform(0.02, 0.4)}
-        else:
-            moment = {"at_call": rng.randint(1, 14)}
-        ended = killed(lambda: run(folder), **moment)
-        now = told_of(folder)
-        assert now[: len(told)] == told  # what was told is never lost
-        told = now
-        if ended:
-            break
-        num_killed += 1
-    campaign = run(folder)
-    assert num_killed >= 5
-    assert torch.equal(draws(campaign), draws(whole))
-    assert facts(campaign) == facts(whole)
-    assert len(told_of(folder)) == NUM_TRIALS
+        folder, told, ended = tmp_path / f"c{num_campaigns}", [], False
+        while num_killed < 10 and not ended:
+            if how == "by the clock":
+                moment = {"after": rng.uniform(0.02, 0.4)}
+            else:
+                moment = {"at_call": rng.randint(1, 14)}
+            ended = killed(lambda folder=folder: run_from(folder), **moment)
+            num_killed += not ended
+            now = told_of(folder)
+            assert now[: len(told)] == told  # what was told is never lost
+            told = now
+        campaign = run_from(folder)
+        assert torch.equal(draws(campaign), draws(whole))
+        assert facts(campaign) == facts(whole)
+        assert len(told_of(folder)) == NUM_TRIALS
+        num_campaigns += 1
 
 
 @pytest.mark.parametrize("at_call", range(1, 13))
