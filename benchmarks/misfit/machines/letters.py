@@ -7,6 +7,7 @@ those that the worlds have outside of their libraries.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
@@ -55,8 +56,10 @@ def make_letter(letter: str, num_trials: int) -> Machine:
                 effects[what] = value.to(theta) + effects.get(what, 0.0)
         return bare(theta, action, **effects)
 
-    # A model knows its effects by the signature of its function.
-    fn.__signature__ = _signature(bare)  # type: ignore[attr-defined]
+    # A model knows its effects by the signature of its function; times are the world's.
+    signature = inspect.signature(bare)
+    keep = [p for name, p in signature.parameters.items() if name != "times"]
+    fn.__signature__ = signature.replace(parameters=keep)  # type: ignore[attr-defined]
     kind = "A" if letter == "A" else "B"
     times = torch.tensor(TIMES) if letter == "B" else None
     times = torch.tensor(world.sample_times) if letter == "C" else times
@@ -81,8 +84,3 @@ def make_letter(letter: str, num_trials: int) -> Machine:
         equivalences=world.equivalences,
     )
 
-
-def _signature(fn: Any) -> Any:
-    import inspect
-
-    return inspect.signature(fn)
