@@ -56,6 +56,13 @@ REMOVALS = (
     ("linear outflow", "outflow exponent"),
     ("overflow", "sensor saturation", "linear outflow", "outflow exponent"),
 )
+#: Effects that least squares is given in any case.
+GIVEN = (
+    ("overflow",),
+    ("linear outflow",),
+    ("overflow", "linear outflow"),
+    ("overflow", "outflow exponent"),
+)
 
 
 def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
@@ -90,6 +97,7 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         nuisances=[start_levels()],
         trials=pieces.trials(LABELS),
         removals=REMOVALS,
+        given=GIVEN,
         score=lambda draws, effects: score(draws, scored, effects),
         least_squares=least_squares,
         replay=replay,

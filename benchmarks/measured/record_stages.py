@@ -42,6 +42,8 @@ class Bench:
         nuisances: Declared besides.
         trials: To fit.
         removals: Sets of effects to remove from the library, one stage each.
+        given: Sets of effects that least squares is given in any case, each in the
+            order of the library.
         score: Draws (n, d) and effects to errors by held-out record.
         least_squares: Names of effects to a fit's row.
         replay: Seed to trials that the bare model makes.
@@ -53,6 +55,7 @@ class Bench:
     nuisances: Sequence[Effect]
     trials: Trials
     removals: Sequence[tuple[str, ...]]
+    given: Sequence[tuple[str, ...]]
     score: Callable[[Tensor, Sequence[Effect]], Errors]
     least_squares: Callable[[tuple[str, ...]], dict[str, Any]]
     replay: Callable[[int], Trials]
@@ -94,7 +97,8 @@ def run_stages(
             folder = None if reports is None else reports / name.replace(" ", "_")
             keep(name, judge(bench, gone=gone, replay=replay, seed=seed, folder=folder))
     fits = rows.get("least squares", {})
-    wanted = {(), *[(*row["helps"],) for n, row in rows.items() if "clean" not in n]}
+    judged = [name for name, (_, replay) in stages.items() if replay is None]
+    wanted = {(), *bench.given, *[(*rows[name]["helps"],) for name in judged]}
     for names in sorted(wanted):
         label = " + ".join(names) or "none"
         if label not in fits:

@@ -23,7 +23,7 @@ TABLE = (
         "overflow",
         "tanks",
         "1/s",
-        0.1,
+        0.2,
         "the upper tank runs over into the lower one, and that into the sink",
     ),
     (
