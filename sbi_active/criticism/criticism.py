@@ -17,9 +17,13 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.evaluation import evaluate_linear
+from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     NONE,
+    SCATTER,
     UNEXPLAINED,
     Detection,
     Evaluation,
@@ -129,9 +133,24 @@ class Criticism:
         self._residuals: Residuals | None = None
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
+        self._misfit: Misfit | None = None
+        self._is_searched = False
+
+    def misfit(self) -> Misfit | None:
+        """Return the models where none explains the trials to the sensor's error.
+
+        None where one does, or where the size of that error is not declared, x has no
+        time axis, or the simulator is random or jumps.
+        """
+        if not self._is_searched:
+            self._misfit = find_misfit(self.rivals, self.equivalent())
+            self._is_searched = True
+        return self._misfit
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
+        if self.misfit() is not None:
+            self.trace()  # by which models have their posteriors
         if self._residuals is None:
             self._residuals = find_residuals(self.rivals)
         return self._residuals
@@ -149,16 +168,33 @@ class Criticism:
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            self._detection = detect(self.rivals, self.equivalent())
+            misfit = self.misfit()
+            self._detection = (
+                detect(self.rivals, self.equivalent())
+                if misfit is None
+                else detected(misfit)
+            )
         return self._detection
 
     def trace(self) -> Tracing:
         """Return which effect the data point to."""
+        misfit = self.misfit()
+        if self._tracing is None and misfit is not None:
+            self._tracing = traced(misfit, self._parts[1].held_out)
         if self._tracing is None:
             tracing = trace(
                 self.rivals, self.detect(), self.equivalent(), actions=self.actions
             )
-            if tracing.verdict == UNEXPLAINED:
+            if tracing.verdict in (UNEXPLAINED, SCATTER):
+                # It is no error of a sensor: a process that follows the action is.
+                self._misfit = find_misfit(
+                    self.rivals, self.equivalent(), is_known=True
+                )
+            if self._misfit is not None:
+                self._residuals = None
+                self.rivals.fits.clear()
+                tracing = traced(self._misfit, self._parts[1].held_out)
+            if tracing.verdict == UNEXPLAINED and not tracing.chosen:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
         return self._tracing
@@ -221,6 +257,8 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
+        if tracing.misfit is not None and self._misfit is not None:
+            return evaluate_linear(self._misfit, trials.fit)
         return evaluate_left_out(trials.fit, self._fold)
 
     def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
@@ -280,7 +318,9 @@ class Criticism:
             digest=self.digest,
             designed=designed,
             exploratory=exploratory,
-            leave_one_out=leave_one_out(self.rivals, tracing),
+            leave_one_out=(
+                () if tracing.misfit else leave_one_out(self.rivals, tracing)
+            ),
             severe_tests=(
                 () if space is None else severe_tests(self.rivals, tracing, space)
             ),

@@ -9,6 +9,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.criticism.under_misfit import Misfit
+
 Array = NDArray[Any]
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
@@ -237,8 +239,6 @@ class Tracing:
         evidences: Of every model tried, by name, effects with priors of unknown scale.
         robust: Whether the verdict is that of effect priors a third and three times as
             wide.
-        coarsening: Power of the evidences in the probabilities; 1 where models are not
-            known to miss by more than the error of measurement.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
@@ -252,6 +252,9 @@ class Tracing:
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials before and after, which is why;
             None where it is not.
+        misfit: Why, where every model misses by more than the sensor's error. Effects
+            that help are then ``chosen``, those that are probably the cause are the
+            verdict, and the rest stand in ``beside``.
     """
 
     verdict: str
@@ -265,19 +268,26 @@ class Tracing:
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
     robust: bool
-    coarsening: float = 1.0
     guesses: tuple[tuple[str, float], ...] = ()
     beside: tuple[str, ...] = ()
     outliers: dict[float, float] = field(default_factory=dict)
     needed: tuple[float, ...] = ()
     instead_of: str = ""
     refuted: tuple[float, float] | None = None
+    misfit: Misfit | None = None
 
     @property
     def key(self) -> ModelKey:
         """The model of the verdict, of "unexplained" with the effects beside it."""
+        if self.misfit is not None:  # the process is beside every model
+            return ModelKey(self.chosen)
         error = self.verdict if self.verdict in CATCH_ALLS else None
         return ModelKey(self.chosen or self.beside, error)
+
+    @property
+    def model(self) -> str:
+        """What reports call the model of the verdict."""
+        return self.verdict if self.misfit is None else str(self.key)
 
     def has_several(self, name: str) -> bool:
         """Return whether a name in ``probabilities`` is that of several effects."""

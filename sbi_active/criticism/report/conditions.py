@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.headline import number, summary_sentence
+from sbi_active.criticism.report.headline import summary_sentence
+from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.report.section import named_entries, setting
 
 #: Parameters and entries of the action that a sentence names at most.

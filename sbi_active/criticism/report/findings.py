@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.headline import added, probability, with_error
+from sbi_active.criticism.report.headline import added
+from sbi_active.criticism.report.numbers import probability, with_error
 from sbi_active.criticism.report.section import Section, joined
 from sbi_active.criticism.report.suspects import label
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
@@ -24,7 +25,7 @@ def effects(report: Contents) -> Section:
     null = tracing.evidences[NONE].log_evidence
     rows, left_out = [], 0
     for name, p in tracing.probabilities.items():
-        if tracing.has_several(name) and p < SHOWN and name != tracing.verdict:
+        if tracing.has_several(name) and p < SHOWN and name != tracing.model:
             left_out += 1
             continue
         inclusion, phi, fit, order = ("",) * any_set, "", ("", ""), -np.inf

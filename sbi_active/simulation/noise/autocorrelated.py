@@ -95,8 +95,8 @@ class AutocorrelatedNoise(ScaleNoise):
             correlation_time: Bounds, s; well below the distance of samples, errors are
                 independent.
             measurement_sd: Of the sensor alone, where it is known. Errors beyond it are
-                the simulator's, and a trial then counts as one measurement of them
-                (:mod:`.coarsening`).
+                the simulator's, and a verdict then says what helps to predict and what
+                is probably the cause (:mod:`.misfit`).
             num_sds: Nodes of the grid over standard deviations.
             num_times: The same over correlation times.
 
