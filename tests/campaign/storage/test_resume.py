@@ -195,6 +195,30 @@ def test_another_simulator_is_refused_or_computes_everything_again(tmp_path):
     assert torch.equal(draws(again).mean(0), shifted)
 
 
+@pytest.mark.parametrize("told_since", [False, True])
+def test_a_changed_simulator_is_not_forgotten_by_a_kill(tmp_path, told_since):
+    go_on(new(tmp_path / "c"), 2).close()
+
+    def mended(theta, action):
+        return drawn(theta, action) + 0.1
+
+    changed = Campaign.load(tmp_path / "c", simulator=mended, simulator_changed=True)
+    if told_since:
+        changed.attach([1.0], outcome(torch.tensor([1.0]), 2))
+    changed.close()  # as a kill before the next update: nothing was saved
+    assert Campaign.load(tmp_path / "c", simulator=mended).state.is_stale
+    anew = new(simulator=mended)
+    with Campaign.load(tmp_path / "c", simulator=mended) as campaign:
+        campaign.update()
+    for trial in campaign.history:
+        anew.attach(trial.action, trial.x)
+    anew.update()
+    assert torch.equal(draws(campaign), draws(anew))
+    again = Campaign.load(tmp_path / "c", simulator=mended)
+    assert not again.state.is_stale  # the update after the change was saved
+    assert torch.equal(draws(again), draws(anew))
+
+
 def price(action):
     return 1 + action[:, 0]
 
