@@ -1,5 +1,6 @@
 """Campaigns that go on from their directory, as if they had never been left."""
 
+import dataclasses
 import json
 import pickle
 from dataclasses import replace
@@ -217,6 +218,28 @@ def test_a_changed_simulator_is_not_forgotten_by_a_kill(tmp_path, told_since):
     again = Campaign.load(tmp_path / "c", simulator=mended)
     assert not again.state.is_stale  # the update after the change was saved
     assert torch.equal(draws(again), draws(anew))
+
+
+def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
+    listed = [0.5, 1.0, 2.0]
+    whole = Campaign(
+        *(drawn, PRIOR, listed),
+        method="nsbi",
+        options=OPTIONS,
+        directory=tmp_path / "c",
+    )
+    go_on(whole, 1).close()
+    fields = {f.name: getattr(OPTIONS, f.name) for f in dataclasses.fields(OPTIONS)}
+    again = Campaign.load(
+        tmp_path / "c", simulator=drawn, options=fields, actions=listed
+    )
+    assert again.state.options == whole.state.options
+    assert again.actions.listed()[:, 0].tolist() == listed
+    assert torch.equal(draws(again), draws(whole))
+    with pytest.raises(TypeError, match="expected options among"):
+        Campaign.load(tmp_path / "c", simulator=drawn, options={"rows": 3})
+    with pytest.raises(TypeError, match="expected an action space or a list"):
+        Campaign.load(tmp_path / "c", simulator=drawn, actions="fast")
 
 
 def price(action):
