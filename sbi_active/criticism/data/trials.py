@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import pandas as pd
 import torch
@@ -21,6 +21,7 @@ from sbi_active.criticism.data.arrays import (
 from sbi_active.criticism.data.table import read_table
 
 Role = Literal["fit", "held out"]
+Order = Literal["known", "unknown"]
 
 
 class Trials:
@@ -39,6 +40,9 @@ class Trials:
             NaN.
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
+        order: "known", or "unknown" where the index says nothing of when a trial was
+            executed, as for records that were collected: nothing is then traced to
+            wear, warming or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
             none; None takes trials of equal actions as repeats of the first. A repeat
@@ -64,6 +68,7 @@ class Trials:
         role: Sequence[Role] | None = None,
         mask: Any = None,
         index: Any = None,
+        order: Order = "known",
         sample_times: Any = None,
         repeat_of: Any = None,
         action_labels: Sequence[str] | None = None,
@@ -102,6 +107,12 @@ class Trials:
                 f"expected finite places in index; got {self.index.tolist()}; pass the "
                 "place of each trial in the order of execution, or leave index out"
             )
+        if order not in get_args(Order):
+            raise ValueError(
+                f"expected order 'known' or 'unknown'; got {order!r}; pass 'unknown' "
+                "where the index is not the order of execution"
+            )
+        self.order: Order = order
         self.sample_times = self._times(sample_times)
         self.repeat_of = (
             repeated(self.action)
@@ -135,6 +146,7 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        order: Order = "known",
     ) -> Trials:
         r"""Return the trials of a CSV file with one row a trial or one row a sample.
 
@@ -153,11 +165,13 @@ class Trials:
                 ignored. Several columns may name a trial together.
             units: By column, where the header has none. Numbers are taken as they are,
                 but for the time, which is converted to seconds.
+            order: As in the constructor; "unknown" where rows are in any order.
 
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        return cls(**read_table(path, columns=columns, units=units).arguments)
+        found = read_table(path, columns=columns, units=units)
+        return cls(**found.arguments, order=order)
 
     @classmethod
     def from_dataframe(
@@ -166,6 +180,7 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        order: Order = "known",
     ) -> Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
 
@@ -182,7 +197,8 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        return cls(**read_table(frame, columns=columns, units=units).arguments)
+        found = read_table(frame, columns=columns, units=units)
+        return cls(**found.arguments, order=order)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -257,6 +273,7 @@ class Trials:
             self.x[at],
             role=[self.role[i] for i in at],
             index=self.index[at],
+            order=self.order,
             sample_times=times if times is None or times.ndim == 1 else times[at],
             repeat_of=repeat_of,
             action_labels=self.action_labels,

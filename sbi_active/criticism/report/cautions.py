@@ -236,6 +236,8 @@ def _of_verdict(
 
 def _aliased(trials: Trials) -> bool:
     """Return whether an entry of the action goes with the order of execution."""
+    if trials.order == "unknown":
+        return False
     order = rankdata(trials.index.numpy())
     for value in trials.action.numpy().T:
         ranks = rankdata(value)

@@ -35,6 +35,16 @@ def test_units_of_the_header_are_carried_along():
     assert (named.action_labels, named.channel_labels) == (("v",), ("y [mm]",))
 
 
+def test_rows_in_no_order_are_declared_and_stay_so():
+    trials = read([*SAMPLES, "c,0,3,4"], order="unknown")
+    assert trials.order == trials.select([2, 0]).order == trials.fit.order == "unknown"
+    frame = pd.DataFrame({"action_v": [1.0, 2.0], "x_y": [3.0, 4.0]})
+    assert Trials.from_dataframe(frame, order="unknown").order == "unknown"
+    assert Trials.from_dataframe(frame).order == "known"
+    with pytest.raises(ValueError, match="expected order 'known' or 'unknown'; got"):
+        read(SAMPLES, order="sorted")
+
+
 @pytest.mark.parametrize(
     "time", ["time_ms", "time[ms]", "time"], ids=["suffix", "bracket", "told"]
 )
