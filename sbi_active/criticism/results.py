@@ -72,6 +72,7 @@ class Residuals:
         roughness: Deviation of the simulator, which jumps, from any smooth function of
             its parameters, shape of x; it counts as noise here. None where it is
             smooth.
+        names: What each trial is called; empty for positions from 0.
     """
 
     action: Array
@@ -86,6 +87,7 @@ class Residuals:
     noise: Literal["declared", "estimated", "stochastic"]
     probability_valid: Array | None = None
     roughness: Array | None = None
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,6 +254,7 @@ class Tracing:
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials before and after, which is why;
             None where it is not.
+        trial_names: What each trial is called, by its index; others by their index.
     """
 
     verdict: str
@@ -272,6 +275,7 @@ class Tracing:
     needed: tuple[float, ...] = ()
     instead_of: str = ""
     refuted: tuple[float, float] | None = None
+    trial_names: dict[float, str] = field(default_factory=dict)
 
     @property
     def key(self) -> ModelKey:
@@ -299,6 +303,7 @@ class Evaluation:
             density and the coverage), and its 90 % bootstrap interval, paired over
             trials; NaN below 8 trials.
         selected: Verdict of each fold, shape (s,).
+        names: What each scored trial is called; empty for its position.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -307,6 +312,7 @@ class Evaluation:
     after: dict[str, Array]
     table: pd.DataFrame
     selected: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

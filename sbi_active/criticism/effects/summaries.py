@@ -125,6 +125,7 @@ def summarize(
             role=trials.role,
             index=trials.index,
             order=trials.order,
+            names=trials.names,
             repeat_of=trials.repeat_of,
         ),
         [_before_summary(e) for e in effects],

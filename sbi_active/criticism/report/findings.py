@@ -6,7 +6,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import added, probability, with_error
-from sbi_active.criticism.report.section import Section, joined
+from sbi_active.criticism.report.section import Section, called, joined
 from sbi_active.criticism.report.suspects import label
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
 
@@ -141,7 +141,7 @@ def leave_one_out(report: Contents) -> Section:
             title,
             f"{one.total:.1f}",
             f"{one.pareto_k.max():.2f}",
-            ", ".join(map(str, one.unreliable)) or "none",
+            ", ".join(called(one.names, i) for i in one.unreliable) or "none",
         )
         for title, one in zip(titles, found, strict=False)
     ]

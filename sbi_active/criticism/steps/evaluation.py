@@ -44,6 +44,7 @@ def evaluate_held_out(
         _scores(before, held_out),
         _scores(after, held_out),
         (tracing.verdict,) * num,
+        held_out.names,
     )
 
 
@@ -65,8 +66,9 @@ def evaluate_left_out(trials: Trials, fold: Fold) -> Evaluation:
         ):
             scores.append(_scores(prediction, one))
         selected.append(tracing.verdict)
+    names = tuple(trials.names[i] for i in valid)
     return _summary(
-        "leave one out", valid, _joined(before), _joined(after), (*selected,)
+        "leave one out", valid, _joined(before), _joined(after), (*selected,), names
     )
 
 
@@ -119,6 +121,7 @@ def _summary(
     before: dict[str, Array],
     after: dict[str, Array],
     selected: tuple[str, ...],
+    names: tuple[str, ...],
 ) -> Evaluation:
     rng = np.random.default_rng(0)
     num = len(positions)
@@ -136,15 +139,16 @@ def _summary(
             )
             low, high = np.quantile(many, [0.05, 0.95])
         rows.append((metric, float(first), float(second), float(ratio), low, high))
-    names = ["metric", "before", "after", "ratio", "low", "high"]
+    columns = ["metric", "before", "after", "ratio", "low", "high"]
     keep = ("rmse", "energy score", *DIFFERENCES)
     return Evaluation(
         scheme=scheme,
         trials=positions,
         before={name: before[name] for name in keep},
         after={name: after[name] for name in keep},
-        table=pd.DataFrame(rows, columns=pd.Index(names)),
+        table=pd.DataFrame(rows, columns=pd.Index(columns)),
         selected=selected,
+        names=names,
     )
 
 
