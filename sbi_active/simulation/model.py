@@ -52,7 +52,8 @@ class SimulatorModel:
             receives what it returns as keyword argument ``context``. It is neither
             pickled nor freed before the process ends.
         parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis.
+        channel_names: One an entry of x's last axis; a single one where x is a
+            trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
 

@@ -22,13 +22,18 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseGrid
+from sbi_active.criticism.rivals.noise_grid import measurement_sds
+
+Array = NDArray[Any]
 
 
 def coarsening(rivals: RivalSet, log_p: Mapping[ModelKey, float]) -> float:
@@ -38,14 +43,19 @@ def coarsening(rivals: RivalSet, log_p: Mapping[ModelKey, float]) -> float:
         rivals: The models, with their evidence.
         log_p: Unnormalized log posterior probabilities of those that count.
     """
-    measurement_sd = getattr(rivals.model.noise, "measurement_sd", None)
+    measurement_sd = measurement_sds(rivals.model.noise, rivals.measurements)
     if measurement_sd is None:
         return 1.0
     explained = [k for k in log_p if isinstance(rivals.fit(k).rival.error, NoiseGrid)]
     best = max(explained, key=log_p.__getitem__)
     trials = int(np.unique(rivals.measurements.trial).size)
+    fit = rivals.fit(best)
+    if np.ndim(measurement_sd) == 0:
+        share = measurement_sd**2 / error_variance(fit)
+    else:  # channels have units of their own
+        share = float(np.minimum(measurement_sd**2 / error_variances(fit), 1).mean())
     return power(
-        measurement_sd**2 / error_variance(rivals.fit(best)),
+        share,
         num_trials=trials,
         num_measurements=len(rivals.measurements),
     )
@@ -58,6 +68,15 @@ def error_variance(fit: Fit) -> float:
     share = noise.posterior(fit.rival.residual(fit.likeliest, penalized=False)[0][0])
     variance = np.array([(cell.sd**2).mean() for cell in noise.cells])
     return float(variance @ share @ noise.scales**2)
+
+
+def error_variances(fit: Fit) -> Array:
+    """Return the variance of each measured number's error, shape (N,), likewise."""
+    noise = fit.rival.error
+    assert isinstance(noise, NoiseGrid)
+    share = noise.posterior(fit.rival.residual(fit.likeliest, penalized=False)[0][0])
+    weight = share @ noise.scales**2
+    return weight @ np.array([cell.sd**2 for cell in noise.cells])
 
 
 def power(share: float, *, num_trials: int, num_measurements: int) -> float:

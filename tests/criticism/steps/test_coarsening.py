@@ -7,7 +7,9 @@ from torch.distributions import Normal
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps import power
+from sbi_active.criticism.steps.coarsening import coarsening
 from sbi_active.simulation import AutocorrelatedNoise
 
 SENSOR = 0.01
@@ -74,6 +76,33 @@ def test_a_model_that_is_right_keeps_its_evidence():
     assert right.verdict == "t^1.5"
     assert right.coarsening > 0.7
     assert right.probabilities["t^1.5"] > 0.95
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_a_channel_in_another_unit_counts_as_in_the_same(unit):
+    """The second channel is known to the sensor's error, the first is missed."""
+    units = torch.tensor([1.0, unit])
+
+    def fn(theta, action):
+        both = [theta * action * (5 * TIMES).sin(), theta * action * (3 * TIMES).cos()]
+        return torch.stack(both, -1) * units
+
+    noise = AutocorrelatedNoise(
+        torch.tensor([20 * SENSOR, SENSOR]) * units, 1e-3, measurement_sd=SENSOR * units
+    )
+    model = SimulatorModel(fn, noise=noise, sample_times=tuple(TIMES.tolist()))
+    gen = torch.Generator().manual_seed(0)
+    action = 1 + torch.rand(4, 1, generator=gen)
+    x = fn(torch.full((4, 1), 0.8), action)
+    x = x + SENSOR * units * torch.randn(x.shape, generator=gen)
+    x[..., 0] -= 0.2 * action * step(TIMES)
+    loop = Criticism(model, PRIOR, Trials(action, x, sample_times=TIMES))
+    none = ModelKey()
+    loop.rivals.fit(none)
+    # Half of the numbers count in full, the others a 400th, and else once a trial.
+    share = (1 + 1 / 400) / 2
+    expected = power(share, num_trials=4, num_measurements=320)
+    assert coarsening(loop.rivals, {none: 0.0}) == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_power_lies_between_a_trial_and_a_number():
