@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -181,7 +181,8 @@ def _trial_axis(ax: Axes, residuals: Residuals) -> None:
     ax.set_xlabel("trial")
     numbered = all(n == f"{i:.15g}" for n, i in zip(names, index, strict=False))
     if numbered or len(names) > MOST_NAMED:
-        ax.xaxis.get_major_locator().set_params(integer=True)
+        locator: Any = ax.xaxis.get_major_locator()
+        locator.set_params(integer=True)
         return
     ax.set_xticks(index, names, rotation=45, ha="right", fontsize=7)
 

@@ -120,7 +120,7 @@ class AutocorrelatedNoise(ScaleNoise):
                     f"expected bounds 0 < low < high of {name}; got {low:g} and "
                     f"{high:g}; pass the orders of magnitude that are possible"
                 )
-        sds = torch.stack([_edges(*pair, num_sds) for pair in pairs])
+        sds = torch.stack([_edges(low, high, num_sds) for low, high in pairs])
         times = _edges(*correlation_time, num_times)
         prior = NoisePosterior(
             SdGrid(sds, _uniform(num_sds).expand(num_times, len(pairs), num_sds)),
@@ -130,7 +130,7 @@ class AutocorrelatedNoise(ScaleNoise):
         each = torch.tensor(middles[:-1], dtype=torch.float64)
         return cls(
             each if several else middles[0],
-            middles[-1],
+            correlation_time=middles[-1],
             posterior=prior,
             measurement_sd=measurement_sd,
         )
