@@ -8,6 +8,9 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 
+#: Digits of a number that any deviation leaves.
+MOST_DIGITS = 6
+
 
 def verdict_line(report: Contents) -> str:
     """Return the verdict with what limits it, in one line."""
@@ -122,9 +125,13 @@ def number(value: float) -> str:
 def with_error(mean: float, sd: float) -> str:
     """Return a mean to the second digit of its deviation; nothing for NaN.
 
+    Of a mean that is known better than that, six digits are enough.
+
     Example:
         >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
         ('0.35992 +- 0.00071', '1234 +- 57')
+        >>> with_error(159.873313255, 2.8e-14)
+        '159.873 +- 2.8e-14'
     """
     if np.isnan(mean):
         return ""
@@ -133,4 +140,7 @@ def with_error(mean: float, sd: float) -> str:
         return f"{mean:.4g} +- {sd:.2g}"
     exponent = int(f"{sd:.1e}".split("e")[1])  # after rounding to two digits
     places = max(1 - exponent, 0)
+    most = max(MOST_DIGITS - int(f"{mean:.{MOST_DIGITS - 1}e}".split("e")[1]) - 1, 0)
+    if places > most:
+        return f"{mean:.{most}f} +- {sd:.2g}"
     return f"{mean:.{places}f} +- {sd:.{places}f}"
