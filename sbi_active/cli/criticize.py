@@ -68,7 +68,7 @@ def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
             columns={key: text.split(",") for key, text in columns.items()} or None,
             units=_pairs(arguments.units, "--units"),
         )
-        trials = Trials(**table.arguments)
+        trials = Trials(**table.arguments, order=arguments.order)
     for note in noted:
         print(f"sbi-active: note: {note.message}", file=sys.stderr)
     num, held = len(trials), len(trials.held_out_positions)

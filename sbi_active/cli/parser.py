@@ -191,6 +191,12 @@ def _add_criticize(commands: Any) -> None:
         metavar="NAME=UNIT",
         help="of columns without a unit in the header",
     )
+    criticize.add_argument(
+        "--order",
+        choices=("known", "unknown"),
+        default="known",
+        help="unknown: rows (or the column index) are not the order of execution",
+    )
     source = criticize.add_mutually_exclusive_group()
     _add_task(source, "--task")
     source.add_argument("--simulator", metavar="MODULE:FUNCTION")

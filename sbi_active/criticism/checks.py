@@ -120,8 +120,9 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
         return
     places = outside.nonzero()[:, 0].tolist()
     warnings.warn(
-        f"the executed action {trials.action[places[0]].tolist()} of trial {places[0]} "
-        f"is not in {actions} (trials {places}); it is simulated where it was executed",
+        f"the executed action {trials.action[places[0]].tolist()} of trial "
+        f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
+        "is simulated where it was executed",
         stacklevel=5,
     )
 

@@ -59,7 +59,8 @@ class Criticism:
             deterministic one without is estimated from repeated trials.
         prior: Of its parameters.
         trials: Measured trials.
-        effects: What the simulator may lack.
+        effects: What the simulator may lack; those of the order of the trials are left
+            out where that is unknown.
         actions: The permitted actions, for what no action separates and for the next
             one; None leaves both to the trials at hand.
         summaries: Compare at most this many summaries of x in place of all its numbers,
@@ -104,7 +105,11 @@ class Criticism:
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.trials = model, prior, trials
-        self.effects, self.actions, self.seed = [*effects], actions, seed
+        self.actions, self.seed = actions, seed
+        unordered = trials.order == "unknown"
+        #: Names of effects of the order of the trials where that is unknown.
+        self.left_out = [e.name for e in effects if unordered and e.needs_order]
+        self.effects = [e for e in effects if e.name not in self.left_out]
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
         if summaries is None:
@@ -329,12 +334,19 @@ class Criticism:
 
     def _given(self) -> tuple[str, ...]:
         """Return what the comparison was made given, a sentence each."""
-        if not self.num_summaries:
-            return ()
-        return (
-            f"given {self.num_summaries} summaries of the {self.trials.x[0].numel()} "
-            "numbers of a trial: what they leave out was not looked at",
-        )
+        found = []
+        if self.num_summaries:
+            found.append(
+                f"given {self.num_summaries} summaries of the "
+                f"{self.trials.x[0].numel()} numbers of a trial: what they leave out "
+                "was not looked at"
+            )
+        if self.left_out:
+            found.append(
+                "the order of the trials is unknown: what grows from trial to trial "
+                f"was not looked for ({', '.join(self.left_out)})"
+            )
+        return (*found,)
 
 
 def close_loop(

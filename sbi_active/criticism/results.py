@@ -74,6 +74,7 @@ class Residuals:
         roughness: Deviation of the simulator, which jumps, from any smooth function of
             its parameters, shape of x; it counts as noise here. None where it is
             smooth.
+        names: What each trial is called; empty for positions from 0.
     """
 
     action: Array
@@ -88,6 +89,7 @@ class Residuals:
     noise: Literal["declared", "estimated", "stochastic"]
     probability_valid: Array | None = None
     roughness: Array | None = None
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,6 +257,7 @@ class Tracing:
         misfit: Why, where every model misses by more than the sensor's error. Effects
             that help are then ``chosen``, those that are probably the cause are the
             verdict, and the rest stand in ``beside``.
+        trial_names: What each trial is called, by its index; others by their index.
     """
 
     verdict: str
@@ -275,6 +278,7 @@ class Tracing:
     instead_of: str = ""
     refuted: tuple[float, float] | None = None
     misfit: Misfit | None = None
+    trial_names: dict[float, str] = field(default_factory=dict)
 
     @property
     def key(self) -> ModelKey:
@@ -309,6 +313,7 @@ class Evaluation:
             density and the coverage), and its 90 % bootstrap interval, paired over
             trials; NaN below 8 trials.
         selected: Verdict of each fold, shape (s,).
+        names: What each scored trial is called; empty for its position.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -317,6 +322,7 @@ class Evaluation:
     after: dict[str, Array]
     table: pd.DataFrame
     selected: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,7 +52,8 @@ class SimulatorModel:
             receives what it returns as keyword argument ``context``. It is neither
             pickled nor freed before the process ends.
         parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis.
+        channel_names: One an entry of x's last axis; a single one where x is a
+            trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
 
@@ -267,7 +268,9 @@ class SimulatorModel:
             x = self.fn(theta.clone(), action.clone(), **own, **keywords)
         x = outcome_tensor(x, len(theta))
         names = self.channel_names
-        if names is not None and x.shape[-1] != len(names):
+        # A trajectory of one channel has no axis of its own for it.
+        sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
+        if names is not None and len(names) not in sizes:
             raise ValueError(
                 f"expected {len(names)} channels, {', '.join(names)}; got x of shape "
                 f"{tuple(x.shape)}; name the entries of its last axis"

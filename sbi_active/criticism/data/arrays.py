@@ -81,6 +81,24 @@ def root(repeat_of: Tensor) -> Tensor:
     return first.where(first != own, torch.tensor(-1))
 
 
+def require_names(names: Sequence[object] | None, num: int) -> tuple[str, ...] | None:
+    """Return names of trials as text, or raise where they are not one each.
+
+    Args:
+        names: None for none.
+        num: Number of trials.
+    """
+    if names is None:
+        return None
+    found = () if isinstance(names, str) else tuple(str(name).strip() for name in names)
+    if len(found) != num or "" in found or len({*found}) < num:
+        raise ValueError(
+            f"expected names of {num} trials, each another; got {names!r}; name each "
+            "trial, or leave names out"
+        )
+    return found
+
+
 def require_labels(
     name: str, labels: Sequence[str] | None, sizes: Sequence[int]
 ) -> tuple[str, ...] | None:

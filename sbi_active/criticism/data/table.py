@@ -119,6 +119,8 @@ class _Rows:
                 "own index where both were executed"
             )
         found: dict[str, Any] = {"action": action, "x": x, "index": index}
+        if columns.trial:
+            found["names"] = self.names
         if columns.time is not None:
             each = [s[:, 1] if len(columns.x) == 1 else s[:, 1:] for s in samples]
             found |= {"x": each, "sample_times": [s[:, 0] for s in samples]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import pandas as pd
 import torch
@@ -16,11 +16,13 @@ from sbi_active.criticism.data.arrays import (
     padded,
     repeated,
     require_labels,
+    require_names,
     root,
 )
 from sbi_active.criticism.data.table import read_table
 
 Role = Literal["fit", "held out"]
+Order = Literal["known", "unknown"]
 
 
 class Trials:
@@ -39,7 +41,12 @@ class Trials:
             NaN.
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
+        order: "known", or "unknown" where the index says nothing of when a trial was
+            executed, as for records that were collected: nothing is then traced to
+            wear, warming or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
+        names: What reports, warnings and figures call each trial; None takes its index.
+            A selection keeps them.
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
             none; None takes trials of equal actions as repeats of the first. A repeat
             of a repeat is one of the first.
@@ -64,7 +71,9 @@ class Trials:
         role: Sequence[Role] | None = None,
         mask: Any = None,
         index: Any = None,
+        order: Order = "known",
         sample_times: Any = None,
+        names: Sequence[object] | None = None,
         repeat_of: Any = None,
         action_labels: Sequence[str] | None = None,
         channel_labels: Sequence[str] | None = None,
@@ -94,7 +103,6 @@ class Trials:
             )
         if mask is not None:
             self.x = self.x.where(self._kept(mask), torch.nan)
-        self.x = _without_inf(self.x)
         self.role = _roles(role, n)
         self.index = self._rows("index", torch.arange(n) if index is None else index)
         if not bool(self.index.isfinite().all()):
@@ -102,6 +110,14 @@ class Trials:
                 f"expected finite places in index; got {self.index.tolist()}; pass the "
                 "place of each trial in the order of execution, or leave index out"
             )
+        if order not in get_args(Order):
+            raise ValueError(
+                f"expected order 'known' or 'unknown'; got {order!r}; pass 'unknown' "
+                "where the index is not the order of execution"
+            )
+        self.order: Order = order
+        self._names = require_names(names, n)
+        self.x = self._without_inf()
         self.sample_times = self._times(sample_times)
         self.repeat_of = (
             repeated(self.action)
@@ -124,8 +140,8 @@ class Trials:
         lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
         if lost:
             raise ValueError(
-                f"expected measurements in the held-out trials; got NaN in trials "
-                f"{lost}; hold out other trials"
+                f"expected measurements in the held-out trials; got NaN in "
+                f"{self.called(lost)}; hold out other trials"
             )
 
     @classmethod
@@ -135,12 +151,14 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        order: Order = "known",
     ) -> Trials:
         r"""Return the trials of a CSV file with one row a trial or one row a sample.
 
         A row is a sample where there are columns "trial" and "time" (in s, or as in
         "time_ms"). Either way "action_\*" is the action, which like all else that
         belongs to a trial stands in each of its rows, and "x_\*" the observation.
+        What stands in "trial" is what reports call it.
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in
@@ -153,11 +171,13 @@ class Trials:
                 ignored. Several columns may name a trial together.
             units: By column, where the header has none. Numbers are taken as they are,
                 but for the time, which is converted to seconds.
+            order: As in the constructor; "unknown" where rows are in any order.
 
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        return cls(**read_table(path, columns=columns, units=units).arguments)
+        found = read_table(path, columns=columns, units=units)
+        return cls(**found.arguments, order=order)
 
     @classmethod
     def from_dataframe(
@@ -166,6 +186,7 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        order: Order = "known",
     ) -> Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
 
@@ -182,7 +203,8 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        return cls(**read_table(frame, columns=columns, units=units).arguments)
+        found = read_table(frame, columns=columns, units=units)
+        return cls(**found.arguments, order=order)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -196,6 +218,16 @@ class Trials:
 
     def __getitem__(self, positions: Any) -> Trials:
         return self.select(positions)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each trial is called: as given, or its index."""
+        return self._names or tuple(f"{value:.15g}" for value in self.index.tolist())
+
+    def called(self, positions: Sequence[int]) -> str:
+        """Return trials in words, as in "trials a, b"."""
+        which = ", ".join(self.names[i] for i in positions)
+        return f"trial{'s' * (len(positions) != 1)} {which}"
 
     @property
     def mask(self) -> Tensor:
@@ -252,16 +284,20 @@ class Trials:
         new |= {int(old): i for i, old in enumerate(at)}
         repeat_of = torch.tensor([new[int(place)] for place in first])
         times = self.sample_times
-        return Trials(
+        found = Trials(
             self.action[at],
             self.x[at],
             role=[self.role[i] for i in at],
             index=self.index[at],
+            order=self.order,
             sample_times=times if times is None or times.ndim == 1 else times[at],
             repeat_of=repeat_of,
             action_labels=self.action_labels,
             channel_labels=self.channel_labels,
         )
+        if self._names is not None:  # of trials that may be there twice now
+            found._names = tuple(self._names[i] for i in at)
+        return found
 
     def _of(self, role: Role) -> Trials:
         positions = [i for i, r in enumerate(self.role) if r == role]
@@ -280,6 +316,16 @@ class Trials:
                 f"{tuple(tensor.shape)}; give one each"
             )
         return tensor
+
+    def _without_inf(self) -> Tensor:
+        """Return x with NaN for inf, and say so: no sensor measures it."""
+        lost = self.x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
+        if lost:
+            warnings.warn(
+                f"x is inf in {self.called(lost)}: taken as not measured, as NaN is",
+                stacklevel=3,
+            )
+        return self.x.where(self.x.isfinite(), torch.nan)
 
     def _kept(self, mask: Any) -> Tensor:
         """Return where x is a measurement; what pads a ragged mask is none."""
@@ -317,14 +363,15 @@ class Trials:
                 raise ValueError(
                     f"expected as many sample_times as samples in each trial; got "
                     f"{int(stamps[i].isfinite().sum())} for "
-                    f"{int(measured[i].nonzero().max()) + 1} samples in trial {i}; "
+                    f"{int(measured[i].nonzero().max()) + 1} samples in trial "
+                    f"{self.names[i]}; "
                     "give one an entry of x's first axis"
                 )
             own = stamps[i][stamps[i].isfinite()]
             if bool((own.diff() <= 0).any()):
                 raise ValueError(
                     f"expected sample_times that increase; got {own.tolist()[:6]}... "
-                    f"in trial {i}; sort its samples by time"
+                    f"in trial {self.names[i]}; sort its samples by time"
                 )
         return tensor
 
@@ -338,14 +385,3 @@ def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
             "give one each"
         )
     return roles
-
-
-def _without_inf(x: Tensor) -> Tensor:
-    """Return x with NaN for inf, and say so: no sensor measures it."""
-    lost = x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
-    if lost:
-        warnings.warn(
-            f"x is inf in trials {lost}: taken as not measured, as NaN is",
-            stacklevel=3,
-        )
-    return x.where(x.isfinite(), torch.nan)

@@ -56,6 +56,8 @@ class Effect:
         scope: "campaign" for one phi in all trials; "trial" for a nuisance that every
             trial draws afresh and every rival model marginalizes.
         describe: A sentence for the report.
+        needs_order: Whether it acts by ``context.index``, the order of the trials; it
+            is then left out where that is unknown.
 
     Raises:
         ValueError: If the hook or scope is unknown, a part is of another type, null and
@@ -80,6 +82,7 @@ class Effect:
     family: str | None = None
     scope: Literal["campaign", "trial"] = "campaign"
     describe: str | None = None
+    needs_order: bool = False
 
     def __post_init__(self) -> None:
         _require_parts(self)

@@ -44,7 +44,8 @@ def generic_effects(
     zone. Of the observation: bias, gain, drift with the trial's index, an offset of
     the clock where x has sample times, and saturation where the prior is given. Scales
     come from the range of the actions, the noise, and the prior predictive. Noise
-    inflation needs no effect: it is always among the rivals.
+    inflation needs no effect: it is always among the rivals. The drift is left out of a
+    comparison with trials whose order is unknown.
 
     Args:
         model: The simulator.
@@ -138,6 +139,7 @@ def _of_observation(
             apply=_drift,
             units="a trial",
             describe="the sensor's bias grows from trial to trial",
+            needs_order=True,
         ),
     ]
     if model.sample_times is not None:

@@ -124,6 +124,8 @@ def summarize(
             (x - center) @ weight.T,
             role=trials.role,
             index=trials.index,
+            order=trials.order,
+            names=trials.names,
             repeat_of=trials.repeat_of,
         ),
         [_before_summary(e) for e in effects],

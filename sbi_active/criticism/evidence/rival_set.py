@@ -222,7 +222,8 @@ class RivalSet:
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
         """Return the order of trials in the span of the fit; None where it has none.
 
-        Among a few trials it is no structure: any differences of theirs follow it.
+        Among a few trials it is no structure: any differences of theirs follow it. Nor
+        is one that is not that of execution.
 
         Args:
             trials: Further trials.
@@ -231,7 +232,7 @@ class RivalSet:
         if trials is not None:
             index = np.concatenate([own, trials.index.double().numpy()])
         span = np.ptp(own)
-        if span == 0 or len(own) < FEW_TRIALS:
+        if span == 0 or len(own) < FEW_TRIALS or self.trials.order == "unknown":
             return None
         return (index - own.min()) / span
 

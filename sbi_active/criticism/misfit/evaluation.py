@@ -40,7 +40,10 @@ def evaluate_linear(misfit: Misfit, trials: Trials) -> Evaluation | None:
         for kept, model in ((before, ModelKey()), (after, key)):
             kept.append(scores(_prediction(misfit, model, fold, int(place)), one))
         selected.append(str(key) if key.effects else UNEXPLAINED)
-    return summary("leave one out", places, joined(before), joined(after), (*selected,))
+    names = tuple(trials.names[int(i)] for i in places)
+    return summary(
+        "leave one out", places, joined(before), joined(after), (*selected,), names
+    )
 
 
 def _prediction(misfit: Misfit, key: ModelKey, fold: int, place: int) -> Prediction:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.rivals.error_models import NoiseCell
+from sbi_active.criticism.rivals.noise_grid import measurement_sds
 
 Array = NDArray[Any]
 
@@ -26,10 +26,9 @@ def sensor_error(rivals: RivalSet) -> tuple[Array, list[NoiseCell]] | None:
     noise, m = rivals.model.noise, rivals.measurements
     if noise is None or not m.has_time or not np.isfinite(m.gap).any():
         return None
-    measured = getattr(noise, "measurement_sd", None)
+    measured = measurement_sds(noise, m)
     if measured is not None:
-        sd = np.atleast_1d(torch.as_tensor(measured).double().numpy())
-        unit = np.broadcast_to(sd, (int(m.channel.max()) + 1,))[m.channel].copy()
+        unit = np.broadcast_to(measured, len(m)).astype(float)
         return unit, [NoiseCell.of(m, sd=unit)]
     jumps = not rivals.is_smooth or bool(rivals.roughness.any())
     if jumps or noise.posterior is not None or len(rivals.noise.scales) > 1:

@@ -12,6 +12,7 @@ from scipy.stats import rankdata
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
+from sbi_active.criticism.report.section import called
 from sbi_active.criticism.report.suspects import of_noise, of_trials
 from sbi_active.criticism.results import (
     NONE,
@@ -113,7 +114,8 @@ def _of_errors(
         yield (
             "outcomes that disagree: "
             + " and ".join(
-                f"trial{'s' * (len(which) > 1)} {', '.join(map(str, which))} {what}"
+                f"trial{'s' * (len(which) > 1)} "
+                f"{', '.join(called(own.names, i) for i in which)} {what}"
                 for which, what in (
                     (lost, "gave no measurement where the model is sure of one"),
                     (kept, "gave a measurement where the model is sure of none"),
@@ -231,6 +233,8 @@ def _of_verdict(
 
 def _aliased(trials: Trials) -> bool:
     """Return whether an entry of the action goes with the order of execution."""
+    if trials.order == "unknown":
+        return False
     order = rankdata(trials.index.numpy())
     for value in trials.action.numpy().T:
         ranks = rankdata(value)

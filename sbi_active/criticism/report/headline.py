@@ -71,10 +71,10 @@ def summary_sentence(report: Contents) -> str:
             "explains it."
         )
     elif report.verdict == OUTLIER:
-        which = in_words(report.tracing).capitalize()
+        which = in_words(report.tracing)
         found.append(
-            f"{which} does not agree with the others: check it, and correct, withdraw "
-            "or repeat it."
+            f"{which[0].upper()}{which[1:]} does not agree with the others: check it, "
+            "and correct, withdraw or repeat it."
         )
     others = [n for n in report.credible_set if n != report.verdict]
     if others:

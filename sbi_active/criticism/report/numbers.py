@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+#: Digits of a number that any deviation leaves.
+MOST_DIGITS = 6
+
 
 def stated(value: float) -> str:
     """Return a probability as an equation."""
@@ -28,9 +31,13 @@ def number(value: float) -> str:
 def with_error(mean: float, sd: float) -> str:
     """Return a mean to the second digit of its deviation; nothing for NaN.
 
+    Of a mean that is known better than that, six digits are enough.
+
     Example:
         >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
         ('0.35992 +- 0.00071', '1234 +- 57')
+        >>> with_error(159.873313255, 2.8e-14)
+        '159.873 +- 2.8e-14'
     """
     if np.isnan(mean):
         return ""
@@ -39,4 +46,7 @@ def with_error(mean: float, sd: float) -> str:
         return f"{mean:.4g} +- {sd:.2g}"
     exponent = int(f"{sd:.1e}".split("e")[1])  # after rounding to two digits
     places = max(1 - exponent, 0)
+    most = max(MOST_DIGITS - int(f"{mean:.{MOST_DIGITS - 1}e}".split("e")[1]) - 1, 0)
+    if places > most:
+        return f"{mean:.{most}f} +- {sd:.2g}"
     return f"{mean:.{places}f} +- {sd:.{places}f}"

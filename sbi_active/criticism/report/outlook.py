@@ -8,7 +8,7 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import METRICS
 from sbi_active.criticism.report.headline import added
 from sbi_active.criticism.report.numbers import number, with_error
-from sbi_active.criticism.report.section import Section, joined, setting
+from sbi_active.criticism.report.section import Section, called, joined, setting
 from sbi_active.criticism.results import (
     NONE,
     SCATTER,
@@ -173,5 +173,6 @@ def _pairs(evaluation: Evaluation) -> list[str]:
             for name in ("rmse", "log predictive density")
         ]
         which = "held-out trial" if evaluation.scheme == "held out" else "trial"
-        found.append(f"{which} {int(trial)}: {', '.join(each)}")
+        name = called(evaluation.names, i) if evaluation.names else int(trial)
+        found.append(f"{which} {name}: {', '.join(each)}")
     return found

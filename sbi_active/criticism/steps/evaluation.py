@@ -44,6 +44,7 @@ def evaluate_held_out(
         scores(before, held_out),
         scores(after, held_out),
         (tracing.verdict,) * num,
+        held_out.names,
     )
 
 
@@ -65,7 +66,10 @@ def evaluate_left_out(trials: Trials, fold: Fold) -> Evaluation:
         ):
             kept.append(scores(prediction, one))
         selected.append(tracing.verdict)
-    return summary("leave one out", valid, joined(before), joined(after), (*selected,))
+    names = tuple(trials.names[i] for i in valid)
+    return summary(
+        "leave one out", valid, joined(before), joined(after), (*selected,), names
+    )
 
 
 def _predictions(
@@ -118,6 +122,7 @@ def summary(
     before: dict[str, Array],
     after: dict[str, Array],
     selected: tuple[str, ...],
+    names: tuple[str, ...],
 ) -> Evaluation:
     """Return scores before and after with their contrast, and its interval."""
     rng = np.random.default_rng(0)
@@ -136,15 +141,16 @@ def summary(
             )
             low, high = np.quantile(many, [0.05, 0.95])
         rows.append((metric, float(first), float(second), float(ratio), low, high))
-    names = ["metric", "before", "after", "ratio", "low", "high"]
+    columns = ["metric", "before", "after", "ratio", "low", "high"]
     keep = ("rmse", "energy score", *DIFFERENCES)
     return Evaluation(
         scheme=scheme,
         trials=positions,
         before={name: before[name] for name in keep},
         after={name: after[name] for name in keep},
-        table=pd.DataFrame(rows, columns=pd.Index(names)),
+        table=pd.DataFrame(rows, columns=pd.Index(columns)),
         selected=selected,
+        names=names,
     )
 
 

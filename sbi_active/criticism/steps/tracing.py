@@ -145,6 +145,9 @@ def trace(
         beside=beside,
         outliers=gross_errors(rivals) if detection.alarm else {},
         needed=needed_trials(rivals, verdict) if verdict.effects else (),
+        trial_names=dict(
+            zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
+        ),
     )
     return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 

@@ -165,3 +165,33 @@ def test_draws_of_every_recorded_model_are_its_posterior(named):
         abs(fit.evidence.draws[:, -1].mean() - LAG)
         < 3 * fit.evidence.draws[:, -1].std()
     )
+
+
+def test_the_sensor_has_an_error_in_each_channel():
+    """The lag is that of the first sensor, in its own unit."""
+    units = torch.tensor([1.0, 100.0], dtype=torch.float64)
+
+    def fn(theta, action, *, lag=0.0):
+        x = MODEL.fn(theta, action, lag=lag)
+        return torch.stack([x, MODEL.fn(theta, action)], -1) * units
+
+    noise = AutocorrelatedNoise(
+        SENSOR * units, 1e-3, measurement_sd=(SENSOR * units).tolist()
+    )
+    model = SimulatorModel(
+        fn, noise=noise, batched=True, sample_times=MODEL.sample_times
+    )
+    one, other = trials(lag=LAG, hidden=HIDDEN).x, trials(seed=1, hidden=HIDDEN).x
+    own = Trials(
+        ACTION, torch.stack([one, 100 * other], -1), sample_times=MODEL.sample_times
+    )
+    found = loop(own, [EFFECTS[2]], model).trace()
+    assert found.misfit.sensor == pytest.approx([SENSOR, 100 * SENSOR])
+    bare, after = (found.misfit.of(name).left_out for name in ("none", "lag"))
+    assert after[0] < 0.7 * bare[0]
+    assert 100 * SENSOR < after[1] < bare[1]
+
+
+def test_an_error_of_measurement_is_positive():
+    with pytest.raises(ValueError, match="expected measurement_sd > 0; got 0"):
+        AutocorrelatedNoise(0.1, 1.0, measurement_sd=0.0)
