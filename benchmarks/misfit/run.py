@@ -1,0 +1,110 @@
+"""The closed loop where every model is wrong, on worlds whose truth is known.
+
+    python -m benchmarks.misfit.run --group own --kind E --first 1000 --cases 40
+    python -m benchmarks.misfit.run --group letters --first 1000 --cases 40
+    python -m benchmarks.misfit.run --summary --first 1000
+    python -m benchmarks.misfit.run --truth --kind E --cases 12
+
+Machines have a declared sensor, wide priors, about nine declared effects, and a smooth
+discrepancy of 2 to 10 sensor deviations that nobody declared. Kinds: E, an effect
+beside it; R, the same with the effect removed from the library; M, the discrepancy
+alone; P, a fast and a slow effect beside it; C, clean; CE, an effect alone. Groups: own
+(pendulum, driven spring, tanks; 10 trials of 20 samples and 6 of 30 by turns) and
+letters (worlds A, B, C of the benchmark of criticism with a discrepancy).
+
+Seeds are the numbers of cases. **Those below 1,000 are for tuning; those from 1,000 on
+judge**: they have other undeclared forms, and rough processes besides, and nothing may
+be tuned on them.
+
+Resumable: a case that stands in the CSV is not run again. One row a case, one file a
+group and kind, in benchmarks/misfit/results. Give each command a core of its own
+(OMP_NUM_THREADS=1) and another --first, which writes its own file. ``--truth`` prints
+the cases and runs no loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from benchmarks.criticism.run import append, read
+from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
+from benchmarks.misfit.machines import GROUPS
+from benchmarks.misfit.scores import COLUMNS, score_case
+from benchmarks.misfit.summary import summary
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def run_kind(group: str, kind: Kind, first: int, cases: int) -> None:
+    """Run the cases that are in none of the files yet."""
+    done = {int(row["case"]) for row in rows_of(group, kind)}
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    path = RESULTS / f"{group}_{kind}_from_{first}.csv"
+    for number in range(first, first + cases):
+        if number in done:
+            continue
+        row = score_case(draw_case(group, kind, number), number)
+        append(path, [row], COLUMNS)
+        outcome = row.get("failure") or row.get("verdict")
+        print(
+            f"{group} {kind} {number}, {row['machine']}: {row['true']} beside "
+            f"{row['discrepancy'] or 'nothing'} of {row['size']:.1f} -> {outcome}; "
+            f"{float(str(row.get('cpu_seconds') or 'nan')):.0f} CPU s",
+            flush=True,
+        )
+
+
+def rows_of(group: str, kind: str) -> list[dict[str, str]]:
+    """Return the rows of all files of a group and kind."""
+    files = sorted(RESULTS.glob(f"{group}_{kind}_from_*.csv"))
+    return [row for file in files for row in read(file)]
+
+
+def print_truth(group: str, kind: Kind, first: int, cases: int) -> None:
+    """Print what cases are made of."""
+    for number in range(first, first + cases):
+        truth = draw_case(group, kind, number).truth
+        what, bare = truth.discrepancy, truth.held_out_error(())
+        full = truth.held_out_error(truth.effects)
+        print(
+            f"{kind} {number}: {truth.machine.name}, {truth.machine.num_trials} "
+            f"trials, {' + '.join(truth.names) or 'none'} "
+            f"{[round(size, 1) for size in truth.sizes]}, "
+            f"{f'{what.kind} {what.detail} {truth.size:.1f}' if what else 'nothing'}; "
+            f"excess {truth.excess():.1f}, held out {bare:.2f} -> {full:.2f}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Run what is asked for and print the summary."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--group", choices=[*GROUPS])
+    parser.add_argument("--kind", choices=KINDS)
+    parser.add_argument("--first", type=int, default=FIRST_JUDGED)
+    parser.add_argument("--cases", type=int, default=40)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    parser.add_argument("--truth", action="store_true", help="print cases, run nothing")
+    arguments = parser.parse_args()
+    groups = (arguments.group,) if arguments.group else (*GROUPS,)
+    kinds = (arguments.kind,) if arguments.kind else KINDS
+    is_judged = arguments.first >= FIRST_JUDGED
+    for group in groups:
+        rows = []
+        for kind in kinds:
+            if arguments.truth:
+                print_truth(group, kind, arguments.first, arguments.cases)
+            elif not arguments.summary:
+                run_kind(group, kind, arguments.first, arguments.cases)
+            every = rows_of(group, kind)
+            rows += [r for r in every if (int(r["case"]) >= FIRST_JUDGED) == is_judged]
+        if rows and not arguments.truth:
+            seeds = "judging" if is_judged else "tuning"
+            print(f"\n## {group}, {seeds} seeds", *summary(rows), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""The measures of verdicts when every model is wrong, with binomial intervals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.criticism.intervals import rate
+from benchmarks.misfit.verdicts import CAUSE
+
+__all__ = ["summary"]
+
+Row = Mapping[str, str]
+#: Gains of the true effect, 1 - held-out error with it / without.
+LARGE, SOME = 0.5, 0.2
+MATTERS = 0.9  # error of a pair to that of its better member, from which both matter
+CLAIM = 0.9
+BINS = ((0.9, 1.01), (0.5, 0.9), (0.1, 0.5), (0.0, 0.1))
+
+
+def summary(rows: Sequence[Row]) -> list[str]:
+    """Return the lines of the summary.
+
+    Args:
+        rows: Of all kinds, as the CSV files have them.
+    """
+    failed = [r for r in rows if r["failure"]]
+    rows = [r for r in rows if not r["failure"]]
+    lines = [f"{len(rows)} cases, {len(failed)} failed"]
+    lines += [f"failed {r['kind']} {r['case']}: {r['failure']}" for r in failed]
+    if not rows:
+        return lines
+    groups = _groups(rows)
+    lines += ["", "| measure | P(cause) > .5 | helps |", "|---|---|---|"]
+    for name, (own, hit) in _measures(groups).items():
+        cells = [rate([hit(r, column) for r in own]) for column in ("cause", "helps")]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    lines += ["", *_calibration(rows), "", *_coverage(groups), "", *_harm(rows)]
+    return [*lines, "", *_cost(rows)]
+
+
+def _groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for r in rows:
+        found.setdefault(r["kind"], []).append(r)
+        if r["kind"] == "E":
+            gain = 1 - float(r["held_true"]) / float(r["held_bare"])
+            part = "large" if gain >= LARGE else "some" if gain >= SOME else "little"
+            found.setdefault(f"E {part}", []).append(r)
+        if r["kind"] == "P":
+            ratio = float(r["held_true"]) / float(r["held_single"])
+            if ratio < MATTERS:
+                found.setdefault("P matters", []).append(r)
+    return found
+
+
+def _measures(
+    groups: Mapping[str, list[Row]],
+) -> dict[str, tuple[list[Row], Callable[[Row, str], bool]]]:
+    def of(name: str) -> list[Row]:
+        return groups.get(name, [])
+
+    found = {
+        "E, gain >= 50 %: right": (of("E large"), _has_all),
+        "E, gain 20 to 50 %: right": (of("E some"), _has_all),
+        "E, gain < 20 %: right": (of("E little"), _has_all),
+    }
+    found |= {f"{k}: a wrong name": (of(k), _has_wrong) for k in ("E", "P")}
+    found |= {f"{k}: any name": (of(k), _has_wrong) for k in ("R", "M", "C")}
+    return found | {
+        "CE: right": (of("CE"), _has_all),
+        "CE: a wrong name": (of("CE"), _has_wrong),
+        "P, where both matter: both": (of("P matters"), _has_all),
+    }
+
+
+def _said(row: Row, column: str) -> set[str]:
+    """Return the effects that are said to be a cause, or to help."""
+    if column == "helps":
+        return {*json.loads(row["helps"])}
+    return {name for name, p in json.loads(row["cause"]).items() if p > CAUSE}
+
+
+def _true(row: Row) -> set[str]:
+    """Return the names that are right; none where the effect was removed."""
+    return set() if row["kind"] == "R" else {*json.loads(row["equivalent"])}
+
+
+def _has_all(row: Row, column: str) -> bool:
+    said, wanted = _said(row, column), json.loads(row["true"])
+    if len(wanted) == 1:
+        return bool(said & _true(row))
+    return {*wanted} <= said
+
+
+def _has_wrong(row: Row, column: str) -> bool:
+    return bool(_said(row, column) - _true(row))
+
+
+def _calibration(rows: Sequence[Row]) -> list[str]:
+    """Return the Brier score of P(cause) and what claims are worth."""
+    pairs = np.array(
+        [
+            (p, name in _true(row))
+            for row in rows
+            for name, p in json.loads(row["cause"]).items()
+        ],
+        dtype=float,
+    )
+    claimed, right = pairs.T
+    brier = float(((claimed - right) ** 2).mean())
+    lines = [f"Brier score of P(cause): {brier:.3f} over {len(pairs)} effects"]
+    for low, high in BINS:
+        at = (claimed >= low) & (claimed < high)
+        mean = f"{claimed[at].mean():.2f}" if at.any() else "-"
+        text = f"claims of {low:g} to {min(high, 1):g}: mean {mean}, right "
+        lines.append(text + rate(right[at] > 0))
+    return lines
+
+
+def _coverage(groups: Mapping[str, list[Row]]) -> list[str]:
+    """Return how often 90 % intervals hold the truth, given the right effects."""
+    lines = []
+    for title, kinds in (("with misfit", ("M", "E", "P")), ("without", ("C", "CE"))):
+        for column in ("theta_covered", "phi_covered"):
+            cells = [r[column] for k in kinds for r in groups.get(k, []) if r[column]]
+            pairs = [tuple(map(int, cell.split("/"))) for cell in cells]
+            hits = [i < k for k, n in pairs for i in range(n)]
+            what = column.removesuffix("_covered")
+            lines.append(f"90 % intervals of {what} {title}: {rate(hits)}")
+    return lines
+
+
+def _harm(rows: Sequence[Row]) -> list[str]:
+    """Return what wrong effects do to the error on held-out trials."""
+    wrong = [r for r in rows if r["kind"] in ("R", "M") and json.loads(r["helps"])]
+    ratios = np.array([float(r["held_verdict"]) / float(r["held_bare"]) for r in wrong])
+    if not len(ratios):
+        return ["no effects in R and M that are said to help"]
+    return [
+        "held-out error with effects said to help in R and M over bare: median "
+        f"{np.median(ratios):.2f}, 90 % quantile {np.quantile(ratios, 0.9):.2f}, "
+        f"worse in {rate(ratios > 1)}"
+    ]
+
+
+def _cost(rows: Iterable[Row]) -> list[str]:
+    found: dict[str, list[Any]] = {}
+    for r in rows:
+        figures = float(r["trial_simulations"]), float(r["cpu_seconds"])
+        found.setdefault(r["machine"], []).append(figures)
+    lines = ["| machine | cases | simulated trials, median | largest | CPU s, median |"]
+    lines.append("|---|---|---|---|---|")
+    for machine, figures in found.items():
+        trials, seconds = np.array(figures).T
+        lines.append(
+            f"| {machine} | {len(figures)} | {np.median(trials):,.0f} | "
+            f"{trials.max():,.0f} | {np.median(seconds):.0f} |"
+        )
+    return lines

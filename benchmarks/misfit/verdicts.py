@@ -1,0 +1,70 @@
+"""What a report says, as the scores take it: the one place that knows its layout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sbi_active.criticism import Report
+from sbi_active.criticism.results import NONE
+
+__all__ = ["Outcome", "read_report"]
+
+LEVEL = 0.9  # of intervals
+CAUSE = 0.5  # P(cause) above which an effect counts as named
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What the loop says of one case.
+
+    Attributes:
+        line: The verdict in its words.
+        alarm: Whether the bare model is said to miss.
+        cause: Probability that an effect is a cause, by declared effect.
+        named: Effects given as a cause.
+        helps: Effects said to predict better, those named among them.
+        intervals: Of theta and phi by name, 90 %, given the effects asked for; empty
+            where the loop has no such model.
+    """
+
+    line: str
+    alarm: bool
+    cause: Mapping[str, float]
+    named: tuple[str, ...]
+    helps: tuple[str, ...]
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def read_report(report: Report, effects: Sequence[str]) -> Outcome:
+    """Return what a report says.
+
+    Verdicts today name the effects of the likeliest set and state the probability that
+    an effect belongs to the model; what helps is then what is named.
+
+    Args:
+        report: Of ``close_loop``.
+        effects: Names of those of the model whose intervals are wanted, in the order
+            of the library.
+    """
+    tracing, alarm = report.tracing, bool(report.detection.alarm)
+    intervals = {}
+    evidence = tracing.evidences.get(" + ".join(effects) or NONE)
+    if evidence is not None:
+        ends = np.quantile(evidence.draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+        intervals = {
+            name: (float(low), float(high))
+            for name, low, high in zip(evidence.names, *ends, strict=True)
+        }
+    return Outcome(
+        line=tracing.verdict,
+        alarm=alarm,
+        cause={
+            name: float(p) if alarm else 0.0 for name, p in tracing.inclusion.items()
+        },
+        named=tracing.chosen,
+        helps=tracing.chosen,
+        intervals=intervals,
+    )
