@@ -27,6 +27,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
+from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
@@ -100,9 +101,12 @@ class Criticism:
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.trials = model, prior, trials
-        self.effects, self.actions, self.seed = [*effects], actions, seed
+        self.effects, self.seed = [*effects], seed
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
+        if actions is not None:
+            actions = with_known_inputs(trials.fit, actions)
+        self.actions = actions
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
@@ -201,7 +205,9 @@ class Criticism:
             beyond: Whether to name one that is not permitted where rivals are
                 separated by no other.
         """
-        space = self.actions if actions is None else actions
+        space = self.actions
+        if actions is not None:
+            space = with_known_inputs(self.trials.fit, actions)
         if space is None:
             raise ValueError(
                 "expected the permitted actions; got None; give "
