@@ -153,8 +153,13 @@ def _conditions(model: SimulatorModel, trials: Trials, theta: Tensor) -> dict[st
 
 
 def _some_trials(trials: Trials) -> Tensor:
-    """Return positions of trials for a few rows, shape (16,)."""
-    return torch.arange(NUM_CHECKED) % len(trials)
+    """Return positions of trials for a few rows, shape (16,), none with padding."""
+    whole = torch.arange(len(trials))
+    if trials.sample_times is not None:
+        times = trials.sample_times.expand(len(trials), -1)
+        sampled = times.isfinite().sum(1)
+        whole = whole[sampled == sampled.max()]
+    return whole[torch.arange(NUM_CHECKED) % len(whole)]
 
 
 def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor]:

@@ -195,6 +195,8 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        inputs: str | Path | pd.DataFrame | None = None,
+        input_hold: Hold = "previous",
     ) -> Trials:
         r"""Return the trials of a CSV file with one row a trial or one row a sample.
 
@@ -204,20 +206,26 @@ class Trials:
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in
-        brackets, as in "x_height[m]", and goes into reports.
+        brackets, as in "x_height[m]", and goes into reports. "start_\*" is the measured
+        start state. "input_\*" varies within a trial, in a table with one row a sample,
+        which then needs no action; rows may have an input and no x.
 
         Args:
             path: Of the file; lines that begin with # are comments.
-            columns: Which columns are "trial", "time", "action", "x", "role", "index"
-                and "repeat_of", where they have other names; those left out are then
-                ignored. Several columns may name a trial together.
+            columns: Which columns are "trial", "time", "action", "x", "input", "start",
+                "role", "index" and "repeat_of", where they have other names; those left
+                out are then ignored. Several columns may name a trial together.
             units: By column, where the header has none. Numbers are taken as they are,
                 but for the time, which is converted to seconds.
+            inputs: Another file, or a data frame, with the inputs at times of their
+                own: "time", "input_\*", and "trial" unless all trials share them.
+            input_hold: As in the constructor.
 
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        return cls(**read_table(path, columns=columns, units=units).arguments)
+        table = read_table(path, columns=columns, units=units, inputs=inputs)
+        return cls(**table.arguments, input_hold=input_hold)
 
     @classmethod
     def from_dataframe(
@@ -226,6 +234,8 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        inputs: str | Path | pd.DataFrame | None = None,
+        input_hold: Hold = "previous",
     ) -> Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
 
@@ -242,7 +252,8 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        return cls(**read_table(frame, columns=columns, units=units).arguments)
+        table = read_table(frame, columns=columns, units=units, inputs=inputs)
+        return cls(**table.arguments, input_hold=input_hold)
 
     def __len__(self) -> int:
         return len(self.x)

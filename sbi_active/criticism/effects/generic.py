@@ -213,9 +213,10 @@ def _shift_in_time(
     wanted = (times + phi).contiguous()
     last = times.shape[1] - 2
     low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)
-    weight = (wanted - times.gather(1, low)) / (
-        times.gather(1, low + 1) - times.gather(1, low)
-    )
+    step = times.gather(1, low + 1) - times.gather(1, low)
+    # What pads a shorter trial has the time of its last sample.
+    step = step.where(step > 0, torch.ones_like(step))
+    weight = (wanted - times.gather(1, low)) / step
     shape = (*low.shape, *[1] * (value.ndim - 2))
     index = low.reshape(shape).expand_as(value)
     weight = weight.reshape(shape)
