@@ -17,11 +17,13 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
 from sbi_active.criticism.effects.declarations import require_distinct, require_nested
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
+from sbi_active.criticism.effects.trial_conditions import (
+    conditions_for,
+    conditions_of_trials,
+)
 from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.conditions import typed
 from sbi_active.simulation.noise.estimation import estimate_noise
 
 FEWEST_REPEATS = 3
@@ -143,13 +145,7 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
 
 def _conditions(model: SimulatorModel, trials: Trials, theta: Tensor) -> dict[str, Any]:
     """Return how some trials were run, as far as the model's function takes it."""
-    context = vars(conditions_of_trials(trials, _some_trials(trials), model))
-    found = {
-        name: context[name] for name in model.conditions if context[name] is not None
-    }
-    if "times" in found:
-        found["times"] = found["times"].expand(len(theta), -1)
-    return typed(found, theta.dtype)
+    return conditions_for(model, trials, _some_trials(trials), theta.dtype)
 
 
 def _some_trials(trials: Trials) -> Tensor:

@@ -150,11 +150,11 @@ class _TrialRows(Rows):
         members = self.members
         if columns.input:
             inputs = self.inputs(time)
-            has_x: Array = np.asarray(np.isfinite(x).any(1))
-            inputs.note_empty(has_x)
+            filled: Array = np.asarray(np.isfinite(x).any(1))
+            inputs.note_empty(filled)
             # Inputs may come more often than x: then a row without x is no sample.
-            only = np.isfinite(inputs.values).any(1) & ~has_x
-            members = [at[~only[at]] if has_x[at].any() else at for at in members]
+            only = np.isfinite(inputs.values).any(1) & ~filled
+            members = [at[~only[at]] if filled[at].any() else at for at in members]
         samples = [np.column_stack([time[at], x[at]]) for at in members]
         index = np.arange(len(first), dtype=float)
         if "index" in optional:

@@ -16,7 +16,7 @@ from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.null_check import change_at_null, require_positive
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.conditions import at_rows, typed
+from sbi_active.simulation.conditions import CONDITIONS, at_rows, typed
 from sbi_active.simulation.model import NOISE_STREAM
 
 #: Rows on which an effect is compared with the simulator without it.
@@ -203,9 +203,13 @@ class AugmentedSimulator(SimulatorModel):
         theta, phi = self.split(torch.as_tensor(theta))
         phi |= drawn or {}
         action = torch.as_tensor(action)
+        told = {name: effects[name] for name in CONDITIONS if name in effects}
+        rest = {name: value for name, value in effects.items() if name not in told}
         context = self._row_context(action)
+        if told:
+            context = self._row_context(action, given=replace(context, **told))
         self._check_first(theta, action, context)
-        return self._evaluate(theta, phi, action, context, seeds, effects)
+        return self._evaluate(theta, phi, action, context, seeds, rest)
 
     def _trial_draws(
         self, num: int, dtype: torch.dtype, seeds: Tensor | None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from sbi_active.criticism.data.arrays import rows_at
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context
 from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.conditions import typed
 
 
 def conditions_of_trials(
@@ -32,6 +35,24 @@ def conditions_of_trials(
         input_times=trials.input_times,
         start=rows_at(trials.start, rows),
     )
+
+
+def conditions_for(
+    model: SimulatorModel, trials: Trials, rows: Tensor, dtype: torch.dtype
+) -> dict[str, Any]:
+    """Return how trials were run as keyword arguments that a model's function takes.
+
+    Args:
+        model: The simulator.
+        trials: Measured ones.
+        rows: Position of each row's trial, shape (n,).
+        dtype: Of the tensors.
+    """
+    context = vars(conditions_of_trials(trials, rows, model))
+    found = {k: context[k] for k in model.conditions if context[k] is not None}
+    if "times" in found:
+        found["times"] = found["times"].expand(len(rows), -1)
+    return typed(found, dtype)
 
 
 def has_own_times(model: SimulatorModel, trials: Trials) -> bool:
