@@ -38,9 +38,10 @@ def criticize(arguments: argparse.Namespace) -> int:
     simulator, prior, actions, effects = _source(arguments, trials)
     # Only scales are taken from these where the permitted actions are unknown.
     space = actions or DiscreteActions(trials.action.unique(dim=0).float())
+    over_time = trials.inputs is not None
     own = [*effects, *_declared(arguments)]
     taken = {effect.name for effect in own}
-    generic = generic_effects(simulator, space, prior=prior)
+    generic = generic_effects(simulator, trials if over_time else space, prior=prior)
     report = close_loop(
         simulator,
         prior,
@@ -67,8 +68,13 @@ def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
             arguments.trials,
             columns={key: text.split(",") for key, text in columns.items()} or None,
             units=_pairs(arguments.units, "--units"),
+            inputs=arguments.inputs,
         )
-        trials = Trials(**table.arguments, order=arguments.order)
+        trials = Trials(
+            **table.arguments,
+            order=arguments.order,
+            input_hold=arguments.input_hold,
+        )
     for note in noted:
         print(f"sbi-active: note: {note.message}", file=sys.stderr)
     num, held = len(trials), len(trials.held_out_positions)
@@ -96,8 +102,14 @@ def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
 def _described(path: Path, table: TrialTable, trials: Trials) -> str:
     """Return what was read, with its units."""
     columns, num = table.columns, len(trials)
-    action, x = (map(columns.label, names) for names in (columns.action, columns.x))
-    what = f"{num} trials of {path}: action {', '.join(action)}; x {', '.join(x)}"
+    parts = {
+        "action": map(columns.label, columns.action),
+        "inputs": trials.input_labels or (),
+        "x": map(columns.label, columns.x),
+    }
+    named = {key: ", ".join(names) for key, names in parts.items()}
+    what = "; ".join(f"{key} {names}" for key, names in named.items() if names)
+    what = f"{num} trials of {path}: {what}"
     if columns.time is None:
         return what
     counts = trials.mask.flatten(2).any(-1) if trials.x.ndim > 2 else trials.mask

@@ -31,6 +31,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
+from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
@@ -105,13 +106,16 @@ class Criticism:
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.trials = model, prior, trials
-        self.actions, self.seed = actions, seed
+        self.seed = seed
         unordered = trials.order == "unknown"
         #: Names of effects of the order of the trials where that is unknown.
         self.left_out = [e.name for e in effects if unordered and e.needs_order]
         self.effects = [e for e in effects if e.name not in self.left_out]
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
+        if actions is not None:
+            actions = with_known_inputs(trials.fit, actions)
+        self.actions = actions
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
@@ -242,7 +246,9 @@ class Criticism:
             beyond: Whether to name one that is not permitted where rivals are
                 separated by no other.
         """
-        space = self.actions if actions is None else actions
+        space = self.actions
+        if actions is not None:
+            space = with_known_inputs(self.trials.fit, actions)
         if space is None:
             raise ValueError(
                 "expected the permitted actions; got None; give "

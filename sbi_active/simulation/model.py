@@ -15,6 +15,14 @@ from torch import Tensor
 
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_seeds
+from sbi_active.simulation.conditions import (
+    as_arrays,
+    at_rows,
+    conditions_of,
+    one_row,
+    require_conditions,
+    require_rows_each,
+)
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.simulator import (
@@ -37,7 +45,11 @@ class SimulatorModel:
     r"""A simulator that owns its noise, :math:`x = f(\theta, \xi) + \epsilon`.
 
     Further keyword arguments of ``fn`` are its *effects*, given to the model by name:
-    a number, or one a row, shape (n, ...).
+    a number, or one a row, shape (n, ...). Four names say how a trial was run instead:
+    ``times``, shape (n, k), at which x is measured; ``inputs`` over time, {name:
+    (n, m)}, with their uniform grid ``input_times``, shape (m,); and ``start``,
+    measured start states, (n, d) or {name: (n,)}. Trials hand them over, and the model
+    its ``sample_times``.
 
     Args:
         fn: ``fn(theta, action)``, shapes (n, theta_dim) and (n, action_dim), giving
@@ -60,6 +72,8 @@ class SimulatorModel:
     Attributes:
         noise: With the time stamps, where there are any.
         effect_names: Names of the effects that ``fn`` declares.
+        conditions: Which of ``times``, ``inputs``, ``input_times`` and ``start`` ``fn``
+            takes as keyword arguments.
         is_batched: Whether ``fn`` takes all rows at once.
         fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
 
@@ -108,6 +122,7 @@ class SimulatorModel:
                 "expected fn(theta, action) of all rows; got fn with an argument "
                 "'rng'; pass batched=False with a fn(theta, action, rng) of one row"
             )
+        self.conditions, self._needs = conditions_of(fn, keywords)
         reserved = ("seeds", "context") if batched else ("context",)
         self.effect_names = tuple(k for k in keywords if k not in reserved)
         if setup is not None and "context" not in keywords and not self._takes_any:
@@ -211,7 +226,7 @@ class SimulatorModel:
             effects: By name, a number or one a row.
         """
         if self._is_deterministic is None:
-            few = {k: v[:FEW] if np.ndim(v) else v for k, v in effects.items()}
+            few = at_rows(effects, slice(FEW))
             self._is_deterministic = self._agrees(theta[:FEW], action[:FEW], few)
         return self._is_deterministic
 
@@ -226,9 +241,9 @@ class SimulatorModel:
                 raise
             answers = []
             for i in range(len(theta)):
-                own = {k: v[i : i + 1] if np.ndim(v) else v for k, v in effects.items()}
+                row = slice(i, i + 1)
+                own = at_rows(effects, row)
                 try:
-                    row = slice(i, i + 1)
                     answers.append(self._agrees(theta[row], action[row], own))
                 except Exception:
                     continue
@@ -253,7 +268,9 @@ class SimulatorModel:
         effects: Mapping[str, Any],
     ) -> Tensor:
         theta, action = torch.as_tensor(theta), torch.as_tensor(action)
+        effects = {**self._own_conditions(theta), **effects}
         self._check(theta, action, effects)
+        require_conditions(self._needs, effects)
         if self.fn_takes_seeds and seeds is None:
             seeds = torch.randint(2**62, (len(theta),))
         keywords = {}
@@ -264,8 +281,7 @@ class SimulatorModel:
         else:
             if self.fn_takes_seeds:
                 keywords["seeds"] = _copied(seeds)
-            own = {k: _copied(v) for k, v in effects.items()}
-            x = self.fn(theta.clone(), action.clone(), **own, **keywords)
+            x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
         names = self.channel_names
         # A trajectory of one channel has no axis of its own for it.
@@ -277,6 +293,12 @@ class SimulatorModel:
             )
         return x
 
+    def _own_conditions(self, theta: Tensor) -> dict[str, Any]:
+        """Return what the model itself knows of how its trials are run."""
+        if "times" not in self.conditions or self.sample_times is None:
+            return {}
+        return {"times": self.sample_times.to(theta.dtype).expand(len(theta), -1)}
+
     def _run_rows(
         self,
         theta: Tensor,
@@ -287,15 +309,14 @@ class SimulatorModel:
     ) -> np.ndarray:
         thetas = theta.detach().cpu().double().numpy()
         actions = action.detach().cpu().double().numpy()
-        arrays = {k: np.asarray(v, dtype=np.float64) for k, v in effects.items()}
+        arrays = as_arrays(effects)
         own_seeds = [] if seeds is None else seeds.tolist()
         rows: np.ndarray | None = None
         for i in range(len(theta)):
-            own = {k: v[i].copy() if v.ndim else float(v) for k, v in arrays.items()}
             row = [thetas[i].copy(), actions[i].copy()]
             if self._takes_rng:
                 row.append(np.random.default_rng(own_seeds[i]))
-            x = self.fn(*row, **own, **keywords)
+            x = self.fn(*row, **one_row(arrays, i), **keywords)
             outcome = outcome_array(x)
             if rows is None:
                 rows = np.empty((len(theta), *outcome.shape))
@@ -330,15 +351,13 @@ class SimulatorModel:
                     f"expected effects among the keyword arguments of fn, {known}; got "
                     f"{name!r}; add it to fn, with its null value as the default"
                 )
-            if np.ndim(value) and len(value) != len(theta):
-                raise ValueError(
-                    f"expected {name} as a number or one a row, shape ({len(theta)}, "
-                    f"...); got {tuple(np.shape(value))}; repeat it for each row"
-                )
+            require_rows_each(name, value, len(theta))
 
 
 def _copied(value: Any) -> Any:
-    """Return an array that ``fn`` may change; a number is what it is."""
+    """Return arrays that ``fn`` may change; a number is what it is."""
+    if isinstance(value, Mapping):
+        return {name: _copied(part) for name, part in value.items()}
     if isinstance(value, Tensor):
         return value.clone()
     return value.copy() if isinstance(value, np.ndarray) else value

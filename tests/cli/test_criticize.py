@@ -227,3 +227,76 @@ def test_notes_on_a_table_are_printed(capsys):
     write([*rows, "4,"], "action_xi,x_y")
     assert run("--task", "numerical", "--noise", "0") == 2
     assert "note: 1 of 4 cells of column x_y" in capsys.readouterr().err
+
+
+MOTOR = """
+import torch
+
+def speed(theta, action, *, inputs, times, input_times):
+    u, step = inputs["voltage"], float(input_times[1] - input_times[0])
+    keep = torch.exp(-step / theta[:, 1])
+    w, found = torch.zeros(len(theta)).to(theta), []
+    for k in range(u.shape[1]):
+        found.append(w)
+        w = keep * w + (1 - keep) * theta[:, 0] * u[:, k]
+    series = torch.stack(found, 1)
+    return series.gather(1, (times / step).round().long())
+"""
+
+
+def record(other_file):
+    """Write recordings of a motor with a dead zone, at two rates."""
+    space: dict = {}
+    exec(MOTOR, space)
+    gen = torch.Generator().manual_seed(0)
+    levels = 2 * torch.rand(6, 10, generator=gen).double() - 1
+    u = levels.repeat_interleave(10, 1)
+    acts = u.sign() * (u.abs() - 0.2).clamp(min=0)
+    grid = 0.02 * torch.arange(100).double()
+    times = grid[::5].expand(6, -1)
+    x = space["speed"](
+        torch.tensor([[3.0, 0.3]]).double().expand(6, -1),
+        None,
+        inputs={"voltage": acts},
+        times=times,
+        input_times=grid,
+    )
+    x = x + 0.03 * torch.randn(x.shape, generator=gen)
+    role = ["fit"] * 5 + ["held out"]
+    each = [(i, k) for i in range(6) for k in range(100)]
+    if other_file:
+        rows = [f"{i},{20 * k},{u[i, k]:.4f}" for i, k in each]
+        write(rows, "trial,time_ms,input_voltage[V]")
+        Path("trials.csv").rename("inputs.csv")
+        write(
+            [
+                f"{i},{0.1 * k:.1f},{x[i, k]:.4f},{role[i]}"
+                for i in range(6)
+                for k in range(20)
+            ],
+            "trial,time,x_speed[rad/s],role",
+        )
+    else:
+        rows = [
+            f"{i},{20 * k},{u[i, k]:.4f},{_cell(x[i], k)},{role[i]}" for i, k in each
+        ]
+        write(rows, "trial,time_ms,input_voltage[V],x_speed[rad/s],role")
+
+
+def _cell(x, k):
+    return "" if k % 5 else f"{x[k // 5]:.4f}"
+
+
+@pytest.mark.parametrize("other_file", [True, False])
+def test_recordings_with_inputs_give_a_report(other_file, capsys):
+    record(other_file)
+    module = f"my_motor_{'beside' if other_file else 'within'}.py"
+    Path(module).write_text(MOTOR)
+    command = ["criticize", "trials.csv", "--simulator", f"{module}:speed"]
+    command += ["--theta-low=1,.1", "--theta-high=6,1", "--noise", "0.03"]
+    command += ["--inputs", "inputs.csv"] if other_file else []
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Verdict: dead zone (P")
+    shown = "6 trials of trials.csv: inputs voltage [V]; x speed [rad/s]; 20 to 20"
+    assert shown in printed

@@ -83,4 +83,3 @@ def make_letter(letter: str, num_trials: int) -> Machine:
         declares_times=letter == "C",
         equivalences=world.equivalences,
     )
-

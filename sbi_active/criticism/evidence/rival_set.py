@@ -63,6 +63,8 @@ ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
 NUM_SPREAD = 200
 #: Factors on the declared noise where every model misses by more.
 NUM_FACTORS = 14
+#: Ranges of the action space between two trials whose actions are labels.
+APART = 100.0
 #: Deviations of the prior predictive beyond which a number counts as that far.
 FARTHEST = 1e3
 #: Draws of largest weight, among which the best fit is sought.
@@ -207,9 +209,16 @@ class RivalSet:
     def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.
 
+        Those that are labels are so far from each other that a smooth function of them
+        has another value at each.
+
         Args:
             trials: Further trials.
         """
+        if self.trials.action_is_label:  # which says nothing of how near trials are
+            parts = [self.trials, *([] if trials is None else [trials])]
+            labels = np.concatenate([part.action.numpy() for part in parts])
+            return labels * APART
         action = some = self.trials.action.numpy()
         if self.actions is not None:
             draws = self.actions.sample((256,), seed=0).double().numpy()
@@ -357,7 +366,14 @@ class RivalSet:
         """Return mean and deviation of each number before the data, shapes (N,)."""
         m = simulator.measurements
         trials = simulator.trials
-        asked = (trials.action, trials.index, trials.sample_times, m.position)
+        asked = (
+            trials.action,
+            trials.settings(),
+            trials.index,
+            trials.sample_times,
+            trials.input_times,
+            m.position,
+        )
         key = tuple(None if a is None else np.asarray(a).tobytes() for a in asked)
         if key not in self._predictives:
             self._predictives[key] = self._prior_predictive(simulator)

@@ -93,7 +93,7 @@ def _of_trials(
             f"fewer than {FEW_TRIALS} trials ({num}): several effects may explain as "
             "few"
         )
-    if _aliased(trials):
+    if not trials.action_is_label and _aliased(trials):
         yield (
             "drift aliased with the order of actions: they were executed in sorted "
             "order, so that what grows with time looks like what grows with the action"

@@ -76,6 +76,8 @@ def _times(far: float) -> str:
 
 def _tried(report: Contents) -> str:
     """Return which actions were executed."""
+    if report.action_is_label:
+        return "No other inputs were tried than those of these trials."
     action = np.unique(report.residuals.action, axis=0)
     if len(action) == 1:
         only = setting(report.action_labels, action[0])

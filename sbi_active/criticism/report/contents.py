@@ -54,6 +54,7 @@ class Contents:
             are independent given their parameters.
         severe_tests: Where a verdict that names effects would be put to the test most:
             a permitted action, and one beyond.
+        action_is_label: Whether the action is only the trial's number.
     """
 
     residuals: Residuals
@@ -72,6 +73,7 @@ class Contents:
     digest: str = ""
     leave_one_out: tuple[LeaveOneOut, ...] = ()
     severe_tests: tuple[SevereTest, ...] = ()
+    action_is_label: bool = False
 
     @property
     def verdict(self) -> str:

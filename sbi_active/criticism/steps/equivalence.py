@@ -15,6 +15,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.further_trials import conditions_at, together
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.seeding import derive_seed, forked_generators
@@ -265,11 +266,15 @@ def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     if times is not None and times.ndim == 2:
         assert first is not None
         times = torch.cat([times, first.expand(len(values), -1)])
-    return Trials(
+    conditions = together(own, conditions_at(own, values[order]))
+    every = Trials(
         torch.cat([own.action, values[order].double()]),
         torch.cat([own.x, template.expand(len(values), *template.shape)]),
         index=torch.cat(
             [own.index, own.index.max() + 1 + torch.arange(len(values)).double()]
         ),
         sample_times=times,
+        **conditions,
     )
+    every.action_is_label = own.action_is_label
+    return every

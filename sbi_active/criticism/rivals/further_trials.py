@@ -1,0 +1,105 @@
+"""Trials that were not executed: what a model would be asked at other actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.criticism.data.arrays import rows_at
+from sbi_active.criticism.data.trials import Trials
+
+#: Relative and absolute difference of actions that are the same in single precision.
+RTOL, ATOL = 1e-5, 1e-7
+
+
+def with_known_inputs(trials: Trials, actions: ActionSpace) -> ActionSpace:
+    """Return the permitted actions that could be simulated.
+
+    Where inputs over time were recorded, what would be played at another action is not
+    known: those are left that some trial has, with its inputs.
+
+    Args:
+        trials: Measured ones.
+        actions: The permitted ones.
+    """
+    if trials.inputs is None:
+        return actions
+    recorded = trials.action.unique(dim=0)
+    kept = recorded[actions.contains(recorded.float())]
+    return DiscreteActions(
+        kept if len(kept) else recorded, names=actions.names, units=actions.units
+    )
+
+
+def are_known(trials: Trials, action: Tensor) -> Tensor:
+    """Return at which actions, shape (a, action_dim), trials can be simulated, (a,)."""
+    if trials.inputs is None:
+        return torch.ones(len(action), dtype=torch.bool)
+    return _same(trials, action).any(1)
+
+
+def conditions_at(trials: Trials, action: Tensor) -> dict[str, Any]:
+    """Return how trials at some actions would be run, as arguments of ``Trials``.
+
+    Inputs and start state are those of the first trial of the action; at an action that
+    none has, the start is the mean of those measured.
+
+    Args:
+        trials: Measured ones.
+        action: Shape (a, action_dim).
+
+    Raises:
+        ValueError: If inputs were recorded, and none at some of these actions.
+    """
+    if trials.inputs is None and trials.start is None:
+        return {}
+    same = _same(trials, action)
+    found = same.any(1)
+    first = same.int().argmax(1)
+    if trials.inputs is not None and not bool(found.all()):
+        i = int((~found).nonzero()[0])
+        raise ValueError(
+            "expected actions whose inputs were recorded; got "
+            f"{action[i].tolist()}; permit actions of the trials alone"
+        )
+    return {
+        "inputs": rows_at(trials.inputs, first),
+        "input_times": trials.input_times,
+        "start": _starts(trials.start, first, found),
+    }
+
+
+def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
+    """Return how trials were run, with further ones behind them.
+
+    Args:
+        trials: Measured ones.
+        further: From :func:`conditions_at`.
+    """
+    own = {"inputs": trials.inputs, "start": trials.start}
+    joined = {key: _joined(own[key], further[key]) for key in own if key in further}
+    return {**further, **joined}
+
+
+def _same(trials: Trials, action: Tensor) -> Tensor:
+    """Return which trials have which actions, shape (a, t)."""
+    own, asked = trials.action.double(), action.double()
+    return torch.isclose(asked[:, None], own[None], rtol=RTOL, atol=ATOL).all(-1)
+
+
+def _starts(start: Any, first: Tensor, found: Tensor) -> Any:
+    if isinstance(start, dict):
+        return {name: _starts(part, first, found) for name, part in start.items()}
+    if start is None:
+        return None
+    known = found.reshape(-1, *[1] * (start.ndim - 1))
+    return start[first].where(known, start.mean(0))
+
+
+def _joined(own: Any, further: Any) -> Any:
+    if isinstance(own, dict):
+        return {name: torch.cat([own[name], further[name]]) for name in own}
+    return None if own is None else torch.cat([own, further])
