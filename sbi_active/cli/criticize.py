@@ -49,6 +49,7 @@ def criticize(arguments: argparse.Namespace) -> int:
         actions=actions,
         seed=arguments.seed,
         designed=arguments.designed,
+        show_progress=sys.stderr.isatty(),
     )
     print(report)
     if table.columns.time is not None or any(table.columns.units.values()):
