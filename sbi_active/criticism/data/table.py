@@ -47,6 +47,7 @@ def read_table(
     *,
     columns: Mapping[str, str | Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
+    source: str = "",
 ) -> TrialTable:
     """Read trials from a CSV file or a data frame.
 
@@ -57,14 +58,16 @@ def read_table(
         table: Path of a CSV file, or a data frame.
         columns: As in :func:`.find_columns`.
         units: As there.
+        source: What messages call the table; "" takes its path.
 
     Raises:
         ValueError: If a column is missing or unknown, a cell is no number, an action,
             time or index is empty, what belongs to a trial differs within it, or a
             sample or a trial is there twice. The text says where.
     """
-    source = "the table" if isinstance(table, pd.DataFrame) else str(table)
-    frame = table if isinstance(table, pd.DataFrame) else _read_csv(Path(table))
+    if not source:
+        source = "the table" if isinstance(table, pd.DataFrame) else str(table)
+    frame = table if isinstance(table, pd.DataFrame) else read_csv(Path(table))
     frame = frame.set_axis([str(c).strip() for c in frame.columns], axis=1)
     found = find_columns([*frame.columns], columns=columns, units=units, source=source)
     if frame.empty:
@@ -297,7 +300,7 @@ def _remedy(column: str, text: str) -> str:
     return "write decimals with a point" if re.fullmatch(r"[-+]?\d+,\d+", text) else ""
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
+def read_csv(path: Path) -> pd.DataFrame:
     """Return a CSV file as text, its first row as the names of the columns."""
     if not path.is_file():
         raise FileNotFoundError(

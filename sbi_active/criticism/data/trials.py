@@ -19,6 +19,7 @@ from sbi_active.criticism.data.arrays import (
     require_names,
     root,
 )
+from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import read_table
 
 Role = Literal["fit", "held out"]
@@ -165,7 +166,9 @@ class Trials:
         brackets, as in "x_height[m]", and goes into reports.
 
         Args:
-            path: Of the file; lines that begin with # are comments.
+            path: Of the file; lines that begin with # are comments. Or of a folder
+                with ``trials.csv`` or any number of such files: one with times and
+                without a column "trial" is one trial, called as the file.
             columns: Which columns are "trial", "time", "action", "x", "role", "index"
                 and "repeat_of", where they have other names; those left out are then
                 ignored. Several columns may name a trial together.
@@ -176,7 +179,7 @@ class Trials:
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        found = read_table(path, columns=columns, units=units)
+        found = read_trials(path, columns=columns, units=units)
         return cls(**found.arguments, order=order)
 
     @classmethod
