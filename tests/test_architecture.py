@@ -20,6 +20,7 @@ FLOORS = (
     "seeding",
     "threads",
     "notebook",
+    "progress",
     "arviz_versions",
     "arrays",
     "actions",

@@ -178,7 +178,16 @@ def _add_criticize(commands: Any) -> None:
         "trials",
         metavar="TRIALS.csv",
         type=Path,
-        help="or the folder of a campaign, which knows its simulator and its prior",
+        help="or a folder: of a campaign, which knows its simulator and its prior, or "
+        "of recordings, with trials.csv or one file *.csv a trial",
+    )
+    criticize.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE.toml",
+        help="options by their names without the dashes in front; in a folder of "
+        "recordings problem.toml, beside which problem.py may have a simulator, prior, "
+        "actions and effects",
     )
     criticize.add_argument(
         "--columns",

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
@@ -300,3 +301,84 @@ def test_recordings_with_inputs_give_a_report(other_file, capsys):
     assert printed.startswith("Verdict: dead zone (P")
     shown = "6 trials of trials.csv: inputs voltage [V]; x speed [rad/s]; 20 to 20"
     assert shown in printed
+
+
+PROBLEM = """
+simulator = "my_swing.py:place"
+theta-low = "0.1"
+theta-high = "1"
+noise = 0.004
+effects = "my_swing.py:effects"
+order = "unknown"
+seed = 3
+
+[columns]
+time = "time_ms"
+x = "x_place"
+action = "action_speed"
+role = "role"
+"""
+
+
+def folder_of_films(folder="films"):
+    """Write one file a push, and the simulator beside them."""
+    Path(folder).mkdir()
+    film(f"{folder}/my_swing")
+    table = pd.read_csv("trials.csv")
+    for i, push in enumerate(table["push"].unique()):
+        rows = table[table["push"] == push].drop(columns="push")
+        rows["role"] = "held out" if i == 2 else "fit"
+        rows.to_csv(f"{folder}/push {i + 1}.csv", index=False)
+    Path("trials.csv").rename("all.csv")
+    return Path(folder), len(table["push"].unique())
+
+
+def test_a_folder_of_recordings_with_its_problem_file(capsys):
+    folder, num = folder_of_films()
+    (folder / "problem.toml").write_text(PROBLEM)
+    assert main(["criticize", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Verdict: drag")
+    assert "held-out trial push 3: " in printed
+    assert f"{num} trials of films: action speed" in printed
+    assert "the order of the trials is unknown" in printed
+    # What the command line says goes before what the file says.
+    assert main(["criticize", str(folder), "--noise", "-1"]) == 2
+    assert "expected --noise > 0; got -1" in capsys.readouterr().err
+
+
+def test_a_problem_in_python_and_options_in_another_file(capsys):
+    folder, _ = folder_of_films()
+    problem = (folder / "my_swing.py").read_text() + PROBLEM_PY
+    (folder / "problem.py").write_text(problem)
+    Path("mine.toml").write_text('theta-low = "0.1"\ntheta-high = "1"\nnoise = 0.004\n')
+    assert main(["criticize", str(folder), "--config", "mine.toml"]) == 0
+    assert capsys.readouterr().out.startswith("Verdict: drag")
+
+
+PROBLEM_PY = """
+simulator = place
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: [p.unlink() for p in d.glob("*.csv")], "campaign or recordings in"),
+        (lambda d: (d / "problem.toml").unlink(), "expected --simulator or --task"),
+        (
+            lambda d: (d / "problem.toml").write_text('simulater = "a:b"'),
+            "got 'simulater' in",
+        ),
+        (
+            lambda d: (d / "push 2.csv").write_text("time_ms,action_speed\n1,2\n"),
+            "same columns in each recording; got time_ms",
+        ),
+    ],
+)
+def test_a_folder_that_is_not_understood(capsys, change, message):
+    folder, _ = folder_of_films()
+    (folder / "problem.toml").write_text(PROBLEM)
+    change(folder)
+    assert main(["criticize", str(folder)]) == 2
+    assert message in capsys.readouterr().err

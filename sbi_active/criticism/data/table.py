@@ -49,6 +49,7 @@ def read_table(
     columns: Mapping[str, str | Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
     inputs: str | Path | pd.DataFrame | None = None,
+    source: str = "",
 ) -> TrialTable:
     """Read trials from a CSV file or a data frame.
 
@@ -62,6 +63,7 @@ def read_table(
         inputs: A table of their inputs at times of their own, with columns "time",
             "input_*", and "trial" unless all trials share them. What is said of
             columns and units holds for it too.
+        source: What messages call the table; "" takes its path.
 
     Raises:
         ValueError: If a column is missing or unknown, a cell is no number, an action,
@@ -69,7 +71,8 @@ def read_table(
             or a trial is there twice, or inputs have gaps or do not cover x. The text
             says where.
     """
-    frame, source = read_frame(table, "the table")
+    frame, own_name = read_frame(table, "the table")
+    source = source or own_name
     beside, names = None, set()
     if inputs is not None:
         beside, names = _inputs_beside(inputs, columns or {}, units or {})

@@ -21,7 +21,7 @@ EMPTY = ("", "nan", "none", "na", "<na>")
 def read_frame(table: str | Path | pd.DataFrame, name: str) -> tuple[pd.DataFrame, str]:
     """Return a table with clean names of its columns, and what messages call it."""
     is_frame = isinstance(table, pd.DataFrame)
-    frame = table if is_frame else _read_csv(Path(table))
+    frame = table if is_frame else read_csv(Path(table))
     frame = frame.set_axis([str(c).strip() for c in frame.columns], axis=1)
     return frame, name if is_frame else str(table)
 
@@ -180,7 +180,7 @@ def _remedy(column: str, text: str) -> str:
     return "write decimals with a point" if re.fullmatch(r"[-+]?\d+,\d+", text) else ""
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
+def read_csv(path: Path) -> pd.DataFrame:
     """Return a CSV file as text, its first row as the names of the columns."""
     if not path.is_file():
         raise FileNotFoundError(

@@ -26,6 +26,7 @@ from sbi_active.criticism.data.arrays import (
     without_inf,
 )
 from sbi_active.criticism.data.input_series import Hold, inputs_of
+from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import read_table
 
 Order = Literal["known", "unknown"]
@@ -161,8 +162,7 @@ class Trials:
             )
         if order not in get_args(Order):
             raise ValueError(
-                f"expected order 'known' or 'unknown'; got {order!r}; pass 'unknown' "
-                "where the index is not the order of execution"
+                f"expected order 'known' or 'unknown'; got {order!r}; pass one of them"
             )
         self.order: Order = order
         self._names = require_names(names, n)
@@ -227,7 +227,8 @@ class Trials:
         which then needs no action; rows may have an input and no x.
 
         Args:
-            path: Of the file; lines that begin with # are comments.
+            path: Of the file; lines that begin with # are comments. Or of a folder with
+                ``trials.csv`` or such files: one with times and no "trial" is a trial.
             columns: Which columns are "trial", "time", "action", "x", "input", "start",
                 "role", "index" and "repeat_of", where they have other names; those left
                 out are then ignored. Several columns may name a trial together.
@@ -241,7 +242,7 @@ class Trials:
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        table = read_table(path, columns=columns, units=units, inputs=inputs)
+        table = read_trials(path, columns=columns, units=units, inputs=inputs)
         return cls(**table.arguments, order=order, input_hold=input_hold)
 
     @classmethod
@@ -258,10 +259,8 @@ class Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
 
         Example:
-            >>> frame = pd.DataFrame(
-            ...     {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2.0, 4.0]}
-            ... )
-            >>> frame["mass"] = [0.1, 0.1, 0.2]
+            >>> columns = {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2, 4]}
+            >>> frame = pd.DataFrame({**columns, "mass": [0.1, 0.1, 0.2]})
             >>> trials = Trials.from_dataframe(
             ...     frame,
             ...     columns={"trial": "ball", "time": "t", "x": "h", "action": "mass"},
