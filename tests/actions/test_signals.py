@@ -137,7 +137,7 @@ def test_signals_can_be_pickled():
         ),
         (
             lambda: SignalActions(chirp(), 0.1, 1.0, input_times=TIMES),
-            "expected 1 names and units, .* start frequency",
+            "expected 1 names and units, one an entry of the action",
         ),
         (
             lambda: SignalActions(lambda a, t: a, 0.1, 1.0, input_times=TIMES),
