@@ -121,7 +121,7 @@ class Criticism:
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
         if actions is not None:
-            actions = with_known_inputs(trials.fit, actions)
+            actions = with_known_inputs(model, trials.fit, actions)
         self.actions = actions
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
@@ -256,7 +256,7 @@ class Criticism:
         """
         space = self.actions
         if actions is not None:
-            space = with_known_inputs(self.trials.fit, actions)
+            space = with_known_inputs(self.model, self.trials.fit, actions)
         if space is None:
             raise ValueError(
                 "expected the permitted actions; got None; give "

@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
+
+from sbi_active.actions.signals import SignalActions
 
 #: Names of these arguments.
 CONDITIONS = ("times", "inputs", "input_times", "start")
@@ -53,6 +56,32 @@ def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> Non
                 f"expected {name} for a simulator whose function requires it; got "
                 f"none; pass {SOURCES[name]}, or give the argument a default"
             )
+
+
+def require_taken(inputs: SignalActions | None, conditions: tuple[str, ...]) -> None:
+    """Raise where signals are given that a function does not take."""
+    if inputs is not None and "inputs" not in conditions:
+        raise ValueError(
+            "expected a function that takes the signals of its actions; got one "
+            "without an argument 'inputs'; write fn(theta, action, *, inputs)"
+        )
+
+
+def played(space: SignalActions, action: Tensor, dtype: torch.dtype) -> dict[str, Any]:
+    """Return the signals of actions as inputs and input_times.
+
+    Args:
+        space: Of the actions.
+        action: Shape (n, action_dim); equal ones are generated once.
+        dtype: Of the series.
+    """
+    each, place = torch.unique(action, dim=0, return_inverse=True)
+    return {
+        "inputs": {
+            name: series[place].to(dtype) for name, series in space.inputs(each).items()
+        },
+        "input_times": space.input_times.to(dtype),
+    }
 
 
 def require_rows_each(name: str, value: Any, num: int) -> None:

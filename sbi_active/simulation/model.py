@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import threading
 import uuid
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.actions.signals import SignalActions
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.conditions import (
@@ -20,11 +20,14 @@ from sbi_active.simulation.conditions import (
     at_rows,
     conditions_of,
     one_row,
+    played,
     require_conditions,
     require_rows_each,
+    require_taken,
 )
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
+from sbi_active.simulation.signatures import keywords_of, parameters_of, takes_rng
 from sbi_active.simulation.simulator import (
     outcome_array,
     outcome_tensor,
@@ -68,6 +71,8 @@ class SimulatorModel:
             trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
+        inputs: Where actions are parameters of a signal, their space: ``fn`` receives
+            its signals as ``inputs``, unless trials bring those that were recorded.
 
     Attributes:
         noise: With the time stamps, where there are any.
@@ -79,7 +84,7 @@ class SimulatorModel:
 
     Raises:
         ValueError: If ``setup`` is given and ``fn`` takes no ``context``, or ``fn``
-            takes ``rng`` and all rows at once.
+            takes ``rng`` and all rows at once, or takes no inputs that are given.
 
     Example:
         >>> from sbi_active.simulation import GaussianNoise
@@ -98,6 +103,7 @@ class SimulatorModel:
         parameter_names: Sequence[str] | None = None,
         channel_names: Sequence[str] | None = None,
         sample_times: Tensor | None = None,
+        inputs: SignalActions | None = None,
     ) -> None:
         self.fn = fn
         self.is_batched = batched
@@ -114,8 +120,8 @@ class SimulatorModel:
         self.noise = noise
         if noise is not None and self.sample_times is not None:
             self.noise = noise.at(self.sample_times)
-        self._takes_rng = not batched and _takes_rng(fn)
-        keywords, self._takes_any = _keywords(fn, 3 if self._takes_rng else 2)
+        self._takes_rng = not batched and takes_rng(fn)
+        keywords, self._takes_any = keywords_of(fn, 3 if self._takes_rng else 2)
         self.fn_takes_seeds = self._takes_rng or (batched and "seeds" in keywords)
         if batched and "rng" in keywords:
             raise ValueError(
@@ -123,6 +129,8 @@ class SimulatorModel:
                 "'rng'; pass batched=False with a fn(theta, action, rng) of one row"
             )
         self.conditions, self._needs = conditions_of(fn, keywords)
+        self.inputs = inputs
+        require_taken(inputs, self.conditions)
         reserved = ("seeds", "context") if batched else ("context",)
         self.effect_names = tuple(k for k in keywords if k not in reserved)
         if setup is not None and "context" not in keywords and not self._takes_any:
@@ -211,7 +219,13 @@ class SimulatorModel:
 
     def without_noise(self) -> SimulatorModel:
         """Return a model of ``fn`` alone, which has other worker processes."""
-        bare = SimulatorModel(self.fn, setup=self.setup, batched=self.is_batched)
+        bare = SimulatorModel(
+            self.fn,
+            setup=self.setup,
+            batched=self.is_batched,
+            sample_times=self.sample_times if "times" in self.conditions else None,
+            inputs=self.inputs,
+        )
         bare._is_deterministic = self._is_deterministic
         return bare
 
@@ -268,7 +282,7 @@ class SimulatorModel:
         effects: Mapping[str, Any],
     ) -> Tensor:
         theta, action = torch.as_tensor(theta), torch.as_tensor(action)
-        effects = {**self._own_conditions(theta), **effects}
+        effects = {**self._own_conditions(theta, action, effects), **effects}
         self._check(theta, action, effects)
         require_conditions(self._needs, effects)
         if self.fn_takes_seeds and seeds is None:
@@ -293,11 +307,18 @@ class SimulatorModel:
             )
         return x
 
-    def _own_conditions(self, theta: Tensor) -> dict[str, Any]:
+    def _own_conditions(
+        self, theta: Tensor, action: Tensor, given: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """Return what the model itself knows of how its trials are run."""
-        if "times" not in self.conditions or self.sample_times is None:
-            return {}
-        return {"times": self.sample_times.to(theta.dtype).expand(len(theta), -1)}
+        found = {}
+        if "times" in self.conditions and self.sample_times is not None:
+            times = self.sample_times.to(theta.dtype)
+            found["times"] = times.expand(len(theta), -1)
+        if self.inputs is not None and "inputs" not in given:
+            signals = played(self.inputs, action, theta.dtype)
+            found |= {k: v for k, v in signals.items() if k in self.conditions}
+        return found
 
     def _run_rows(
         self,
@@ -363,38 +384,9 @@ def _copied(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-def _parameters(fn: Callable[..., Any]) -> list[inspect.Parameter]:
-    try:
-        return [*inspect.signature(fn).parameters.values()]
-    except (TypeError, ValueError):  # builtins and C functions have no signature
-        return []
-
-
-def _keywords(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
-    """Return names of keyword arguments behind the positional ones, and if any go."""
-    parameters = _parameters(fn)
-    kinds = inspect.Parameter
-    named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
-    positional = [p for p in parameters if p.kind != kinds.KEYWORD_ONLY][:num_rows]
-    names = [p.name for p in parameters if p.kind in named and p not in positional]
-    return names, any(p.kind == kinds.VAR_KEYWORD for p in parameters)
-
-
-def _takes_rng(fn: Callable[..., Any]) -> bool:
-    """Return whether a function of one row takes a third argument, its generator."""
-    parameters = _parameters(fn)
-    kinds = inspect.Parameter
-    if any(p.kind == kinds.VAR_POSITIONAL for p in parameters) or not parameters:
-        return True
-    behind = [p for p in parameters if p.kind < kinds.VAR_POSITIONAL][2:3]
-    return any(
-        p.name != "context" and not isinstance(p.default, int | float) for p in behind
-    )
-
-
 def takes_seeds(simulator: Callable[..., Any]) -> bool:
     """Return whether each row of the simulator is a function of its seed."""
     if isinstance(simulator, SimulatorModel):
         has_no_use = simulator.noise is None and simulator._is_deterministic is True
         return simulator.fn_takes_seeds or has_no_use
-    return "seeds" in [p.name for p in _parameters(simulator)]
+    return "seeds" in [p.name for p in parameters_of(simulator)]

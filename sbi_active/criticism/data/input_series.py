@@ -21,6 +21,8 @@ GAP = 5.0
 FAR = 0.1
 #: Relative difference of steps that are the same.
 SAME = 1e-6
+#: Share of a step by which a time may be off and count as that of a grid point.
+ON_TIME = 1e-3
 #: Grid points per sample of the longest trial, at most: beyond, clocks disagree.
 MOST = 20
 
@@ -152,6 +154,22 @@ def on_one_grid(
     return found, torch.from_numpy(grid)
 
 
+def held_at(
+    series: Mapping[str, Tensor], own: Tensor, times: Tensor
+) -> dict[str, Tensor]:
+    """Return series, each held until its next value, at the times of another grid.
+
+    Args:
+        series: By name, shape (t, m).
+        own: Their grid, shape (m,).
+        times: The other, shape (n,).
+    """
+    slack = ON_TIME * (own[1] - own[0])
+    place = torch.searchsorted(own, times + slack, right=True) - 1
+    place = place.clamp(0, len(own) - 1)
+    return {name: value[:, place] for name, value in series.items()}
+
+
 def require_covered(
     x_times: Tensor,
     series: Mapping[str, Tensor],
@@ -276,7 +294,7 @@ def _grid(stamps: Tensor, lengths: Mapping[str, list[int]]) -> Array | None:
             "one unit"
         )
     # Where the last time is between two steps, the grid goes up to the next.
-    num = max(int(np.ceil((high - low) / step - 1e-3)), 1)
+    num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
     return low + step * np.arange(num + 1)
 
 
@@ -285,6 +303,6 @@ def _at(grid: Array, times: Array, values: Array, hold: Hold) -> Array:
     if hold == "linear":
         return np.interp(grid, times, values)
     # A time that rounding puts just after a grid point is that point's.
-    slack = 1e-3 * (grid[1] - grid[0])
+    slack = ON_TIME * (grid[1] - grid[0])
     place = np.searchsorted(times, grid + slack, side="right") - 1
     return values[np.clip(place, 0, len(values) - 1)]

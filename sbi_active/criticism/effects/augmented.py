@@ -16,7 +16,7 @@ from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.null_check import change_at_null, require_positive
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.conditions import CONDITIONS, at_rows, typed
+from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
 from sbi_active.simulation.model import NOISE_STREAM
 
 #: Rows on which an effect is compared with the simulator without it.
@@ -88,6 +88,7 @@ class AugmentedSimulator(SimulatorModel):
             parameter_names=names,
             channel_names=base.channel_names,
             sample_times=self._times,
+            inputs=base.inputs,
         )
         self._unchecked = [e for e in effects if e not in before]
         if check is not None:
@@ -270,6 +271,9 @@ class AugmentedSimulator(SimulatorModel):
             theta = applied(effect, theta, phi[effect.name], commanded, context)
         for effect in self._active("action", phi):
             action = applied(effect, action, phi[effect.name], commanded, context)
+        if context.inputs is None and self.base.inputs is not None:
+            signals = played(self.base.inputs, action, action.dtype)
+            context = replace(context, **signals)
         changed: dict[str, Any] = {
             **self._handed_over(phi, action, commanded, context),
             **(keywords or {}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -60,12 +61,13 @@ def generic_effects(
     inflation needs no effect: it is always among the rivals. The drift is left out of a
     comparison with trials whose order is unknown.
 
-    Trials in place of the actions say more. An action that is a label is left as it is.
-    Of each input over time there are gain, offset, saturation, dead zone, delay,
-    first-order lag and backlash of its actuator, with the input's name where there are
-    several. Where x has sample times, a drift along them, delay, first-order lag and
-    quantum of the sensor take the place of the clock's offset. Delays and lags are a
-    fiftieth of a recording, and ten samples at most.
+    Trials in place of the actions say more, and so do the signals of a model that has
+    some. An action that is a label, or stands for a signal, is left as it is. Of each
+    input over time there are gain, offset, saturation, dead zone, delay, first-order
+    lag and backlash of its actuator, with the input's name where there are several.
+    Where x has sample times, a drift along them, delay, first-order lag and quantum of
+    the sensor take the place of the clock's offset. Delays and lags are a fiftieth of
+    a recording, and ten samples at most.
 
     Args:
         model: The simulator.
@@ -87,9 +89,14 @@ def generic_effects(
         spread, within = _predictive_spread(model, actions, prior)
         sd = within if sd is None else sd
     assert sd is not None
-    if not isinstance(actions, Trials):
-        return [*_of_action(actions), *_of_observation(sd, spread, model.sample_times)]
-    return _of_trials(model, actions, sd, spread)
+    if isinstance(actions, Trials):
+        return _of_trials(model, actions, sd, spread)
+    if model.inputs is not None:
+        signals = model.inputs.inputs(actions.sample((NUM_ACTIONS,), seed=0).double())
+        grid, times = model.inputs.input_times, model.sample_times
+        found = [*_of_series(signals, grid, times), *_of_observation(sd, spread, None)]
+        return found if times is None else [*found, *of_samples(sd, times)]
+    return [*_of_action(actions), *_of_observation(sd, spread, model.sample_times)]
 
 
 def _of_trials(
@@ -100,23 +107,34 @@ def _of_trials(
         times = model.sample_times
     if times is not None and trials.x.ndim == 2:
         sd = sd.mean().reshape(1)  # a sample is no channel
-    found = []
-    if not trials.action_is_label:
+    found, inputs, grid = [], trials.inputs, trials.input_times
+    if inputs is None and model.inputs is not None:
+        inputs = model.inputs.inputs(trials.action)
+        grid = model.inputs.input_times
+    if not trials.action_is_label and model.inputs is None:
         labels = trials.action_labels or ()
         units = [label.partition(" [")[2].removesuffix("]") for label in labels]
         recorded = trials.action.unique(dim=0)
         found += _of_action(DiscreteActions(recorded, units=units or None))
-    if trials.inputs is not None:
-        assert trials.input_times is not None
-        delay = typical_delay(trials.input_times)
-        if times is not None:
-            delay = min(delay, typical_delay(times))
-        labels = trials.input_labels or [""] * len(trials.inputs)
-        units = [label.partition(" [")[2].removesuffix("]") for label in labels]
-        by_name = dict(zip(trials.inputs, units, strict=True))
-        found += of_inputs(trials.inputs, delay, by_name)
+    if inputs is not None:
+        assert grid is not None
+        found += _of_series(inputs, grid, times, trials.input_labels)
     found += _of_observation(sd, spread, None)
     return found if times is None else [*found, *of_samples(sd, times)]
+
+
+def _of_series(
+    inputs: dict[str, Tensor],
+    grid: Tensor,
+    times: Tensor | None,
+    labels: Sequence[str] | None = None,
+) -> list[Effect]:
+    delay = typical_delay(grid)
+    if times is not None:
+        delay = min(delay, typical_delay(times))
+    stated = labels or [""] * len(inputs)
+    units = [label.partition(" [")[2].removesuffix("]") for label in stated]
+    return of_inputs(inputs, delay, dict(zip(inputs, units, strict=True)))
 
 
 def _of_action(actions: ActionSpace) -> list[Effect]:

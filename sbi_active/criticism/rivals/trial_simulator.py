@@ -117,10 +117,7 @@ class TrialSimulator:
     ) -> tuple[Array, Array | None, Array]:
         m = self.measurements
         repeats = NUM_REPLICATES if self.is_stochastic else 1
-        numbers = int(np.prod(m.shape)) + sum(
-            u.numel() for u in (self.trials.inputs or {}).values()
-        )
-        size = max(1, numbers * repeats)
+        size = max(1, (int(np.prod(m.shape)) + self._num_inputs()) * repeats)
         most = max(1, CHUNK // size)
         parts = []
         for start in range(0, len(theta), most):
@@ -130,6 +127,13 @@ class TrialSimulator:
         mean, sd, valid = zip(*parts, strict=True)
         joined = None if sd[0] is None else np.concatenate(sd)
         return np.concatenate(mean), joined, np.concatenate(valid)
+
+    def _num_inputs(self) -> int:
+        """Return how many numbers all trials' inputs have."""
+        inputs, source = self.trials.inputs, self.model.base.inputs
+        if inputs is None and source is not None:
+            inputs = source.inputs(self.trials.action)
+        return sum(u.numel() for u in (inputs or {}).values())
 
     def noise_scale(self, phi: dict[str, Tensor], num: int) -> Array | None:
         """Return the factor on the noise, shape (n, N); None without such effects."""

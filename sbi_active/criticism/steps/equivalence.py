@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
@@ -255,9 +255,8 @@ def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
 
 def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     """Return the trials at hand and one of every permitted action, in random order."""
-    if isinstance(actions, DiscreteActions) and len(actions) <= MAX_ACTIONS:
-        values = actions.values
-    else:
+    values = actions.listed()
+    if values is None or len(values) > MAX_ACTIONS:
         values = actions.sample((MAX_ACTIONS,), seed=derive_seed(rivals.seed, "every"))
     order = np.random.default_rng(rivals.seed).permutation(len(values))
     own = rivals.trials
@@ -266,7 +265,7 @@ def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     if times is not None and times.ndim == 2:
         assert first is not None
         times = torch.cat([times, first.expand(len(values), -1)])
-    conditions = together(own, conditions_at(own, values[order]))
+    conditions = together(own, conditions_at(rivals.model, own, values[order]))
     every = Trials(
         torch.cat([own.action, values[order].double()]),
         torch.cat([own.x, template.expand(len(values), *template.shape)]),
