@@ -95,7 +95,7 @@ def test_methods(run, capsys):
 
 
 def test_closing_the_loop(run, capsys):
-    _, bare, _, drag, campaign = run("docs/closing_the_loop.md")
+    _, bare, _, drag, campaign, *motor = run("docs/closing_the_loop.md")
     printed = capsys.readouterr().out
     assert bare.report.verdict == "unexplained"
     assert printed.startswith("unexplained\nVerdict: drag (P ")
@@ -104,7 +104,11 @@ def test_closing_the_loop(run, capsys):
     assert table.loc["rmse", "after"] < 0.005 + 4 * 0.0018
     assert table.loc["rmse", "ratio"] < 0.5
     assert drag.page.exists()
-    assert printed.splitlines()[-2:] == ["alarm", "('drag',)"]
+    assert "alarm\n('drag',)\n" in printed
+    *_, found, names = printed.splitlines()
+    assert found == "dead zone"
+    assert names == "['amplitude', 'end frequency'] True"
+    assert motor[-1].series.shape == (101,)
     truth = torch.tensor([0.4, 0.3])
     belief = campaign.campaign.belief
     assert ((belief.mean - truth).abs() < 4 * belief.variance.sqrt()).all()

@@ -88,7 +88,6 @@ def judge(
         "log_bayes_factor": detection.log_bayes_factor,
         "robust": tracing.robust,
         "probabilities": tracing.probabilities,
-        "coarsening": tracing.coarsening,
         "credible_set": [*tracing.credible_set],
         "near": [sorted(group) for group in tracing.near],
         "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},

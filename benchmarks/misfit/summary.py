@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.criticism.intervals import rate
-from benchmarks.misfit.verdicts import CAUSE
+from sbi_active.criticism.under_misfit import NAMED
 
 __all__ = ["summary"]
 
@@ -81,7 +81,7 @@ def _said(row: Row, column: str) -> set[str]:
     """Return the effects that are said to be a cause, or to help."""
     if column == "helps":
         return {*json.loads(row["helps"])}
-    return {name for name, p in json.loads(row["cause"]).items() if p > CAUSE}
+    return {name for name, p in json.loads(row["cause"]).items() if p > NAMED}
 
 
 def _true(row: Row) -> set[str]:

@@ -13,7 +13,6 @@ from sbi_active.criticism.results import NONE
 __all__ = ["Outcome", "read_report"]
 
 LEVEL = 0.9  # of intervals
-CAUSE = 0.5  # P(cause) above which an effect counts as named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +40,8 @@ class Outcome:
 def read_report(report: Report, effects: Sequence[str]) -> Outcome:
     """Return what a report says.
 
-    Verdicts today name the effects of the likeliest set and state the probability that
-    an effect belongs to the model; what helps is then what is named.
+    Where a model fits to the sensor's error, what is named is what helps, and an effect
+    is the cause with the probability of belonging to the model.
 
     Args:
         report: Of ``close_loop``.
@@ -58,13 +57,16 @@ def read_report(report: Report, effects: Sequence[str]) -> Outcome:
             name: (float(low), float(high))
             for name, low, high in zip(evidence.names, *ends, strict=True)
         }
+    misfit = tracing.misfit
+    cause = dict(tracing.inclusion) if misfit is None else misfit.cause
     return Outcome(
-        line=tracing.verdict,
+        line=str(report).splitlines()[0],
         alarm=alarm,
         cause={
-            name: float(p) if alarm else 0.0 for name, p in tracing.inclusion.items()
+            name: float(cause.get(name, 0.0)) if alarm else 0.0
+            for name in tracing.inclusion
         },
-        named=tracing.chosen,
+        named=tracing.chosen if misfit is None else misfit.named,
         helps=tracing.chosen,
         intervals=intervals,
     )

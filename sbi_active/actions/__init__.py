@@ -6,6 +6,7 @@ Here live the spaces alone. Which action is taken lives in ``design``.
 from sbi_active.actions.box import BoxActions
 from sbi_active.actions.discrete import DiscreteActions
 from sbi_active.actions.mixed import MixedActions
+from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.space import ActionSpace
 
 __all__ = [
@@ -13,4 +14,5 @@ __all__ = [
     "BoxActions",
     "DiscreteActions",
     "MixedActions",
+    "SignalActions",
 ]

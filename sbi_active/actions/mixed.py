@@ -79,6 +79,12 @@ class MixedActions(ActionSpace):
         inside = [p.contains(c) for p, c in zip(self._parts, columns, strict=True)]
         return torch.stack(inside).all(0)
 
+    @override
+    def permits(self, action: Tensor) -> Tensor:
+        columns = torch.as_tensor(action).split([p.action_dim for p in self._parts], -1)
+        each = [p.permits(c) for p, c in zip(self._parts, columns, strict=True)]
+        return torch.stack(each).all(0)
+
     def listed(self) -> Tensor | None:
         """Return all combinations, the last part varying fastest."""
         values = [part.listed() for part in self._parts]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 
@@ -46,6 +47,17 @@ class ActionSpace(ABC):
         Returns:
             Shape (...), bool.
         """
+
+    def permits(self, action: Tensor) -> Tensor:
+        """Return which actions keep limits beyond those of their entries.
+
+        Args:
+            action: Within the limits of each entry, shape (n, action_dim).
+
+        Returns:
+            Shape (n,), bool.
+        """
+        return torch.ones(len(action)).bool()
 
     def listed(self) -> Tensor | None:
         """Return all actions, shape (a, action_dim); None where there is no end."""

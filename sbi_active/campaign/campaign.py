@@ -149,11 +149,11 @@ class Campaign(CampaignTrials):
         *,
         simulator: Callable[..., Any] | None = None,
         prior: Distribution | None = None,
-        actions: ActionSpace | None = None,
+        actions: Actions | None = None,
         effects: Sequence[Effect] = (),
         cost: Callable[[Tensor], Tensor] | Tensor | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
-        options: CampaignOptions | None = None,
+        options: CampaignOptions | Mapping[str, Any] | None = None,
         on_trial: Callable[[Trial], None] | None = None,
         on_update: Callable[[Trial], None] | None = None,
         show_progress: bool = False,
@@ -171,13 +171,14 @@ class Campaign(CampaignTrials):
                 corrected, and neither :meth:`ask` nor :meth:`update` compute.
             prior: Needed where it is a class of your own; else None takes the
                 directory's.
-            actions: Likewise.
+            actions: Likewise; a space, or a list of actions, as there.
             effects: As given to the constructor, and those that were adopted since:
                 functions are not stored.
             cost: As given to the constructor.
             constraint: As given to the constructor.
             options: None takes the directory's; needed where an estimator is of your
-                own. Sizes may be others than before.
+                own. Sizes may be others than before. A dict gives all that are not
+                default, as in the constructor.
             on_trial: As in the constructor.
             on_update: As in the constructor.
             show_progress: As in the constructor.
@@ -194,9 +195,9 @@ class Campaign(CampaignTrials):
             directory,
             simulator=simulator,
             prior=prior,
-            actions=actions,
+            actions=None if actions is None else action_space(actions),
             effects=effects,
-            options=options,
+            options=None if options is None else CampaignOptions.of(options),
             has_cost=cost is not None,
             has_constraint=constraint is not None,
             simulator_changed=simulator_changed,

@@ -1,4 +1,4 @@
-"""``sbi-active criticize TRIALS.csv``: what a simulator lacks, from measured trials."""
+"""``sbi-active criticize TRIALS``: what a simulator lacks, from measured trials."""
 
 from __future__ import annotations
 
@@ -14,11 +14,15 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.campaign.storage.manifest import MANIFEST, has_manifest
 from sbi_active.cli import campaign
 from sbi_active.cli.check import actions_of, prior_of, with_noise
+from sbi_active.cli.folder import read_config
 from sbi_active.cli.loading import load_object
+from sbi_active.cli.problem import read_problem
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
-from sbi_active.criticism.data.table import TrialTable, read_table
+from sbi_active.criticism.data.recordings import read_trials
+from sbi_active.criticism.data.table import TrialTable
 from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks import get_task  # pyright: ignore
@@ -27,20 +31,32 @@ from sbi_active.tasks import get_task  # pyright: ignore
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare a simulator with measured trials, and print the report."""
     if arguments.trials.is_dir():
-        arguments.folder = arguments.trials
-        return campaign.criticize(arguments)
+        if has_manifest(arguments.trials):
+            arguments.folder = arguments.trials
+            return campaign.criticize(arguments)
+        if not [*arguments.trials.glob("*.csv")]:
+            raise ValueError(
+                f"expected a campaign or recordings in {arguments.trials}; got neither "
+                f"{MANIFEST} nor a file *.csv; make a campaign by sbi-active init, or "
+                "write one table of all trials, or one a trial"
+            )
+        read_problem(arguments)
+    elif arguments.config is not None:
+        read_config(arguments)
     if arguments.task is None and arguments.simulator is None:
         raise ValueError(
             "expected --simulator or --task with a table of trials; got neither; name "
-            "it, as in --simulator my_robot.py:simulator"
+            "it, as in --simulator my_robot.py:simulator, or in problem.toml beside "
+            "recordings in a folder"
         )
     table, trials = _trials(arguments)
     simulator, prior, actions, effects = _source(arguments, trials)
     # Only scales are taken from these where the permitted actions are unknown.
     space = actions or DiscreteActions(trials.action.unique(dim=0).float())
+    over_time = trials.inputs is not None
     own = [*effects, *_declared(arguments)]
     taken = {effect.name for effect in own}
-    generic = generic_effects(simulator, space, prior=prior)
+    generic = generic_effects(simulator, trials if over_time else space, prior=prior)
     report = close_loop(
         simulator,
         prior,
@@ -49,6 +65,7 @@ def criticize(arguments: argparse.Namespace) -> int:
         actions=actions,
         seed=arguments.seed,
         designed=arguments.designed,
+        show_progress=sys.stderr.isatty(),
     )
     print(report)
     if table.columns.time is not None or any(table.columns.units.values()):
@@ -63,12 +80,17 @@ def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
     columns = _pairs(arguments.columns, "--columns")
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always", UserWarning)
-        table = read_table(
+        table = read_trials(
             arguments.trials,
             columns={key: text.split(",") for key, text in columns.items()} or None,
             units=_pairs(arguments.units, "--units"),
+            inputs=arguments.inputs,
         )
-        trials = Trials(**table.arguments)
+        trials = Trials(
+            **table.arguments,
+            order=arguments.order,
+            input_hold=arguments.input_hold,
+        )
     for note in noted:
         print(f"sbi-active: note: {note.message}", file=sys.stderr)
     num, held = len(trials), len(trials.held_out_positions)
@@ -96,8 +118,14 @@ def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
 def _described(path: Path, table: TrialTable, trials: Trials) -> str:
     """Return what was read, with its units."""
     columns, num = table.columns, len(trials)
-    action, x = (map(columns.label, names) for names in (columns.action, columns.x))
-    what = f"{num} trials of {path}: action {', '.join(action)}; x {', '.join(x)}"
+    parts = {
+        "action": map(columns.label, columns.action),
+        "inputs": trials.input_labels or (),
+        "x": map(columns.label, columns.x),
+    }
+    named = {key: ", ".join(names) for key, names in parts.items()}
+    what = "; ".join(f"{key} {names}" for key, names in named.items() if names)
+    what = f"{num} trials of {path}: {what}"
     if columns.time is None:
         return what
     counts = trials.mask.flatten(2).any(-1) if trials.x.ndim > 2 else trials.mask

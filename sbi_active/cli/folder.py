@@ -21,7 +21,7 @@ from sbi_active.simulation import SimulatorModel
 #: How the command line made the campaign: where its simulator is.
 DECLARED = "command.json"
 #: Of ``init``, which a file may change.
-DEFAULTS = {"method": "asbi", "seed": 0}
+DEFAULTS = {"method": "asbi", "seed": 0, "order": "known", "designed": False}
 
 
 def read_config(arguments: argparse.Namespace) -> None:
@@ -45,7 +45,7 @@ def read_config(arguments: argparse.Namespace) -> None:
             f"expected TOML in {arguments.config}; got {error}; write options as in "
             'theta-low = "0,1"'
         ) from error
-    known = vars(arguments).keys() - {"folder", "config", "command"}
+    known = vars(arguments).keys() - {"folder", "trials", "config", "command"}
     for name, value in values.items():
         key = name.replace("-", "_")
         if key not in known:
@@ -60,6 +60,11 @@ def read_config(arguments: argparse.Namespace) -> None:
 
 def _as_written(key: str, value: Any) -> Any:
     """Return a value of TOML as the command line writes it."""
+    if isinstance(value, dict):  # as in columns = {trial = "ball", x = "height"}
+        pairs = {k: v if isinstance(v, list) else [v] for k, v in value.items()}
+        return [f"{k}={','.join(map(str, v))}" for k, v in pairs.items()]
+    if key == "out":
+        return Path(value)
     if key == "actions":
         return [str(part) for part in (value if isinstance(value, list) else [value])]
     if isinstance(value, list):

@@ -166,9 +166,11 @@ def _add_criticize(commands: Any) -> None:
             "an effect that the simulator lacks, add it, and report the error before "
             "and after. TRIALS.csv has one row a trial, with columns action_* and x_* "
             "and optionally role (fit or 'held out'), index and repeat_of; or one row "
-            "a sample, with columns trial and time besides. Units stand in brackets, "
-            "as in x_height[m], and are those of the simulator. An empty cell is what "
-            "was not measured. Write negative numbers as in --theta-low=-5,-5."
+            "a sample, with columns trial and time besides, and with input_* in place "
+            "of actions that vary in time. start_* is a measured start state. Units "
+            "stand in brackets, as in x_height[m], and are those of the simulator. An "
+            "empty cell is what was not measured. Write negative numbers as in "
+            "--theta-low=-5,-5."
         ),
     )
     criticize.set_defaults(command=("criticize", "criticize"))
@@ -176,20 +178,49 @@ def _add_criticize(commands: Any) -> None:
         "trials",
         metavar="TRIALS.csv",
         type=Path,
-        help="or the folder of a campaign, which knows its simulator and its prior",
+        help="or a folder: of a campaign, which knows its simulator and its prior, or "
+        "of recordings, with trials.csv or one file *.csv a trial",
+    )
+    criticize.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE.toml",
+        help="options by their names without the dashes in front; in a folder of "
+        "recordings problem.toml, beside which problem.py may have a simulator, prior, "
+        "actions and effects",
     )
     criticize.add_argument(
         "--columns",
         nargs="+",
         metavar="KEY=NAME[,NAME...]",
-        help="columns that are trial, time, action, x, role, index or repeat_of, where "
-        "they are named otherwise, as in trial=ball,drop time=time_s x=height_m",
+        help="columns that are trial, time, action, x, input, start, role, index or "
+        "repeat_of, where they are named otherwise, as in trial=ball,drop time=time_s "
+        "x=height_m",
     )
     criticize.add_argument(
         "--units",
         nargs="+",
         metavar="NAME=UNIT",
         help="of columns without a unit in the header",
+    )
+    criticize.add_argument(
+        "--order",
+        choices=("known", "unknown"),
+        default="known",
+        help="unknown: rows (or the column index) are not the order of execution",
+    )
+    criticize.add_argument(
+        "--inputs",
+        metavar="INPUTS.csv",
+        type=Path,
+        help="inputs at times of their own: time, input_*, and trial unless all share "
+        "them",
+    )
+    criticize.add_argument(
+        "--input-hold",
+        choices=("previous", "linear"),
+        default="previous",
+        help="between two times an input has the value before (default), or is linear",
     )
     source = criticize.add_mutually_exclusive_group()
     _add_task(source, "--task")

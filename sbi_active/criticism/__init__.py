@@ -4,12 +4,13 @@ Here lives what a user calls and declares; the parts of it live in the packages 
 No campaign is known here.
 """
 
-from sbi_active.criticism.criticism import Criticism, close_loop
+from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.generic import generic_effects
 from sbi_active.criticism.effects.joint_prior import joint_prior
+from sbi_active.criticism.loop import close_loop
 from sbi_active.criticism.report.report import Report
 from sbi_active.renamed import former_names
 

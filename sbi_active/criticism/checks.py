@@ -6,6 +6,7 @@ import copy
 import hashlib
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,9 +14,13 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.augmented import AugmentedSimulator, takes_times
+from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
 from sbi_active.criticism.effects.declarations import require_distinct, require_nested
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.trial_conditions import (
+    conditions_for,
+    conditions_of_trials,
+)
 from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
@@ -29,8 +34,8 @@ def with_noise(
 ) -> SimulatorModel:
     """Return the model with noise from repeats where it is deterministic without."""
     theta, action = _some_rows(prior, trials)
-    times = _times(model, len(theta))
-    if model.noise is not None or not model.is_deterministic(theta, action, **times):
+    run = _conditions(model, trials, theta)
+    if model.noise is not None or not model.is_deterministic(theta, action, **run):
         return model
     fit = trials.fit
     first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
@@ -98,18 +103,30 @@ def require_fitting(
             f"expected actions of dimension {trials.action.shape[1]}, that of the "
             f"trials; got {actions.action_dim}; give the space they were drawn from"
         )
+    _require_no_labels_changed(trials, effects)
     if actions is not None:
         _warn_outside(trials, actions)
     theta, action = _some_rows(prior, trials)
     if model.noise is not None:
-        x = model.mean(theta, action, **_times(model, len(theta)))
+        x = model.mean(theta, action, **_conditions(model, trials, theta))
         if not bool(x.isfinite().any()):
             raise ValueError(
                 "expected a simulator that gives numbers at the trials' actions; got "
                 "NaN or inf throughout; check its units and those of the actions"
             )
     # Compares every effect with the simulator at its null.
-    AugmentedSimulator(model, effects, check=(theta, action))
+    context = conditions_of_trials(trials, _some_trials(trials), model)
+    AugmentedSimulator(model, effects, check=(theta, action, context))
+
+
+def _require_no_labels_changed(trials: Trials, effects: Sequence[Effect]) -> None:
+    """Raise where an effect would change an action that is only a trial's number."""
+    for effect in effects:
+        if effect.hook == "action" and trials.action_is_label:
+            raise ValueError(
+                "expected effects on the inputs where the action is the trial's "
+                f"number; got {effect.name!r} on the action; declare hook='input'"
+            )
 
 
 def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
@@ -120,20 +137,29 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
         return
     places = outside.nonzero()[:, 0].tolist()
     warnings.warn(
-        f"the executed action {trials.action[places[0]].tolist()} of trial {places[0]} "
-        f"is not in {actions} (trials {places}); it is simulated where it was executed",
+        f"the executed action {trials.action[places[0]].tolist()} of trial "
+        f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
+        "is simulated where it was executed",
         stacklevel=5,
     )
 
 
-def _times(model: SimulatorModel, num: int) -> dict[str, Tensor]:
-    """Return the model's sample times where its function takes them, (num, k)."""
-    if not takes_times(model) or model.sample_times is None:
-        return {}
-    return {"times": model.sample_times.expand(num, -1)}
+def _conditions(model: SimulatorModel, trials: Trials, theta: Tensor) -> dict[str, Any]:
+    """Return how some trials were run, as far as the model's function takes it."""
+    return conditions_for(model, trials, _some_trials(trials), theta.dtype)
+
+
+def _some_trials(trials: Trials) -> Tensor:
+    """Return positions of trials for a few rows, shape (16,), none with padding."""
+    whole = torch.arange(len(trials))
+    if trials.sample_times is not None:
+        times = trials.sample_times.expand(len(trials), -1)
+        sampled = times.isfinite().sum(1)
+        whole = whole[sampled == sampled.max()]
+    return whole[torch.arange(NUM_CHECKED) % len(whole)]
 
 
 def _some_rows(prior: Distribution, trials: Trials) -> tuple[Tensor, Tensor]:
     with forked_generators(0, "check"):
-        theta = prior.sample((16,))  # type: ignore[arg-type]
-    return theta, trials.action[[i % len(trials) for i in range(16)]].to(theta.dtype)
+        theta = prior.sample((NUM_CHECKED,))  # type: ignore[arg-type]
+    return theta, trials.action[_some_trials(trials)].to(theta.dtype)

@@ -1,8 +1,9 @@
-"""The closed loop, in one call or step by step."""
+"""The closed loop step by step."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,9 +18,13 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.evaluation import evaluate_linear
+from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     NONE,
+    SCATTER,
     UNEXPLAINED,
     Detection,
     Evaluation,
@@ -27,6 +32,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
+from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
@@ -34,6 +40,7 @@ from sbi_active.criticism.steps.formulas import guess
 from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.tracing import trace
+from sbi_active.progress import stage
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
@@ -41,6 +48,7 @@ if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
 
 FEWEST_TRIALS = 4  # to leave one out
+NUM_OTHERS = 3  # models besides those with an effect: none and two catch-alls
 
 
 class Criticism:
@@ -55,13 +63,16 @@ class Criticism:
             deterministic one without is estimated from repeated trials.
         prior: Of its parameters.
         trials: Measured trials.
-        effects: What the simulator may lack.
+        effects: What the simulator may lack; those of the order of the trials are left
+            out where that is unknown.
         actions: The permitted actions, for what no action separates and for the next
             one; None leaves both to the trials at hand.
         summaries: Compare at most this many summaries of x in place of all its numbers,
             0 for none; None takes 20 where a trial has more than 500 numbers without a
             time axis, with independent noise.
         seed: Of all draws.
+        show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
+            of all that takes 2 s anyway.
 
     Raises:
         ValueError: If fewer than two trials can be fitted, shapes differ, an effect
@@ -96,13 +107,22 @@ class Criticism:
         actions: Actions | None = None,
         summaries: int | None = None,
         seed: int = 0,
+        show_progress: bool = False,
     ) -> None:
+        self.show_progress = show_progress
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.trials = model, prior, trials
-        self.effects, self.actions, self.seed = [*effects], actions, seed
+        self.seed = seed
+        unordered = trials.order == "unknown"
+        #: Names of effects of the order of the trials where that is unknown.
+        self.left_out = [e.name for e in effects if unordered and e.needs_order]
+        self.effects = [e for e in effects if e.name not in self.left_out]
         self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
+        if actions is not None:
+            actions = with_known_inputs(model, trials.fit, actions)
+        self.actions = actions
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
@@ -120,18 +140,34 @@ class Criticism:
             self._parts = short.model, short.trials, short.effects
             self.num_summaries = len(short.weight)
         own, measured, some = self._parts
-        self.rivals = RivalSet(
-            own, prior, measured.fit, some, actions=actions, seed=seed
-        )
+        with stage("a look at the simulator", show_progress=show_progress):
+            self.rivals = RivalSet(
+                own, prior, measured.fit, some, actions=actions, seed=seed
+            )
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
         self._equivalent: tuple[frozenset[str], ...] | None = None
         self._residuals: Residuals | None = None
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
+        self._misfit: Misfit | None = None
+        self._is_searched = False
+
+    def misfit(self) -> Misfit | None:
+        """Return the models where none explains the trials to the sensor's error.
+
+        None where one does, or where the size of that error is not declared, x has no
+        time axis, or the simulator is random or jumps.
+        """
+        if not self._is_searched:
+            self._misfit = find_misfit(self.rivals, self.equivalent())
+            self._is_searched = True
+        return self._misfit
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
+        if self.misfit() is not None:
+            self.trace()  # by which models have their posteriors
         if self._residuals is None:
             self._residuals = find_residuals(self.rivals)
         return self._residuals
@@ -143,22 +179,39 @@ class Criticism:
         permitted actions, on those of the trials.
         """
         if self._equivalent is None:
-            self._equivalent = equivalent_effects(self.rivals, self.actions)
+            with stage("effects told apart", show_progress=self.show_progress):
+                self._equivalent = equivalent_effects(self.rivals, self.actions)
         return self._equivalent
 
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            self._detection = detect(self.rivals, self.equivalent())
+            groups, misfit = self.equivalent(), self.misfit()
+            if misfit is None:
+                num = len(self.rivals.effects) + NUM_OTHERS
+                with self._fitting("models fitted", num):
+                    self._detection = detect(self.rivals, groups)
+            else:
+                self._detection = detected(misfit)
         return self._detection
 
     def trace(self) -> Tracing:
         """Return which effect the data point to."""
+        misfit = self.misfit()
+        if self._tracing is None and misfit is not None:
+            self._tracing = traced(misfit, self._parts[1].held_out)
         if self._tracing is None:
-            tracing = trace(
-                self.rivals, self.detect(), self.equivalent(), actions=self.actions
-            )
-            if tracing.verdict == UNEXPLAINED:
+            detection, groups = self.detect(), self.equivalent()
+            with self._fitting("verdict, sets of effects fitted"):
+                tracing = trace(self.rivals, detection, groups, actions=self.actions)
+            if tracing.verdict in (UNEXPLAINED, SCATTER):
+                # It is no error of a sensor: a process that follows the action is.
+                self._misfit = find_misfit(self.rivals, groups, is_known=True)
+            if self._misfit is not None:
+                self._residuals = None
+                self.rivals.fits.clear()
+                tracing = traced(self._misfit, self._parts[1].held_out)
+            if tracing.verdict == UNEXPLAINED and not tracing.chosen:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
         return self._tracing
@@ -201,13 +254,17 @@ class Criticism:
             beyond: Whether to name one that is not permitted where rivals are
                 separated by no other.
         """
-        space = self.actions if actions is None else actions
+        space = self.actions
+        if actions is not None:
+            space = with_known_inputs(self.model, self.trials.fit, actions)
         if space is None:
             raise ValueError(
                 "expected the permitted actions; got None; give "
                 "next_action(actions) or Criticism(actions=...)"
             )
-        return choose_action(self.rivals, self.trace(), space, beyond=beyond)
+        tracing = self.trace()
+        with stage("next action", show_progress=self.show_progress):
+            return choose_action(self.rivals, tracing, space, beyond=beyond)
 
     def evaluate(self) -> Evaluation | None:
         """Return the error before and after, on held-out trials where there are any.
@@ -221,7 +278,33 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        return evaluate_left_out(trials.fit, self._fold)
+        if tracing.misfit is not None and self._misfit is not None:
+            return evaluate_linear(self._misfit, trials.fit)
+        num, done = int(trials.fit.valid.sum()), 0
+
+        def fold(rest: Trials) -> tuple[RivalSet, Tracing]:
+            nonlocal done
+            found = self._fold(rest)
+            done += 1
+            return found
+
+        with stage(
+            "error before and after, a verdict without each trial",
+            show_progress=self.show_progress,
+            count=lambda: (done, num),
+        ):
+            return evaluate_left_out(trials.fit, fold)
+
+    def _fitting(
+        self, what: str, total: int | None = None
+    ) -> AbstractContextManager[None]:
+        """Tell of a block that fits models, and of how many."""
+        fits, before = self.rivals.fits, len(self.rivals.fits)
+        return stage(
+            what,
+            show_progress=self.show_progress,
+            count=lambda: (len(fits) - before, total),
+        )
 
     def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
         model, _, effects = self._parts
@@ -263,63 +346,44 @@ class Criticism:
             evaluation = evaluate_held_out(self.rivals, tracing, held_out)
         simulator, prior = self.add(tracing.chosen)
         space = self.actions if plan else None
-        after = None
-        if tracing.verdict != NONE:
-            after = find_residuals(self.rivals, tracing.key)
+        next_action = None if space is None else self.next_action()
+        with stage("residuals and tests", show_progress=self.show_progress):
+            residuals, after = self.residuals(), None
+            if tracing.verdict != NONE:
+                after = find_residuals(self.rivals, tracing.key)
+            left_out = () if tracing.misfit else leave_one_out(self.rivals, tracing)
+            tests = () if space is None else severe_tests(self.rivals, tracing, space)
         return build_report(
             trials=self.trials,
-            residuals=self.residuals(),
+            residuals=residuals,
             residuals_after=after,
             detection=self.detect(),
             tracing=tracing,
             simulator=simulator,
             prior=prior,
             evaluation=evaluation,
-            next_action=None if space is None else self.next_action(),
+            next_action=next_action,
             actions=self.actions,
             digest=self.digest,
             designed=designed,
             exploratory=exploratory,
-            leave_one_out=leave_one_out(self.rivals, tracing),
-            severe_tests=(
-                () if space is None else severe_tests(self.rivals, tracing, space)
-            ),
+            leave_one_out=left_out,
+            severe_tests=tests,
             warnings=self._given(),
         )
 
     def _given(self) -> tuple[str, ...]:
         """Return what the comparison was made given, a sentence each."""
-        if not self.num_summaries:
-            return ()
-        return (
-            f"given {self.num_summaries} summaries of the {self.trials.x[0].numel()} "
-            "numbers of a trial: what they leave out was not looked at",
-        )
-
-
-def close_loop(
-    model: SimulatorModel,
-    prior: Distribution,
-    trials: Trials,
-    *,
-    effects: Sequence[Effect] = (),
-    actions: Actions | None = None,
-    summaries: int | None = None,
-    seed: int = 0,
-    evaluate: bool = True,
-    plan: bool = True,
-    designed: bool = False,
-) -> Report:
-    """Find the residual, trace it to an effect, add it, and report the error.
-
-    Arguments are those of :class:`Criticism` and of :meth:`Criticism.report`.
-    """
-    return Criticism(
-        model,
-        prior,
-        trials,
-        effects=effects,
-        actions=actions,
-        summaries=summaries,
-        seed=seed,
-    ).report(evaluate=evaluate, plan=plan, designed=designed)
+        found = []
+        if self.num_summaries:
+            found.append(
+                f"given {self.num_summaries} summaries of the "
+                f"{self.trials.x[0].numel()} numbers of a trial: what they leave out "
+                "was not looked at"
+            )
+        if self.left_out:
+            found.append(
+                "the order of the trials is unknown: what grows from trial to trial "
+                f"was not looked for ({', '.join(self.left_out)})"
+            )
+        return (*found,)

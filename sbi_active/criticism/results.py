@@ -9,6 +9,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.criticism.under_misfit import Misfit
+
 Array = NDArray[Any]
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
@@ -72,6 +74,7 @@ class Residuals:
         roughness: Deviation of the simulator, which jumps, from any smooth function of
             its parameters, shape of x; it counts as noise here. None where it is
             smooth.
+        names: What each trial is called; empty for positions from 0.
     """
 
     action: Array
@@ -86,6 +89,7 @@ class Residuals:
     noise: Literal["declared", "estimated", "stochastic"]
     probability_valid: Array | None = None
     roughness: Array | None = None
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,8 +241,6 @@ class Tracing:
         evidences: Of every model tried, by name, effects with priors of unknown scale.
         robust: Whether the verdict is that of effect priors a third and three times as
             wide.
-        coarsening: Power of the evidences in the probabilities; 1 where models are not
-            known to miss by more than the error of measurement.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
@@ -252,6 +254,10 @@ class Tracing:
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials before and after, which is why;
             None where it is not.
+        misfit: Why, where every model misses by more than the sensor's error. Effects
+            that help are then ``chosen``, those that are probably the cause are the
+            verdict, and the rest stand in ``beside``.
+        trial_names: What each trial is called, by its index; others by their index.
     """
 
     verdict: str
@@ -265,19 +271,27 @@ class Tracing:
     estimates: tuple[Estimate, ...]
     evidences: dict[str, Evidence]
     robust: bool
-    coarsening: float = 1.0
     guesses: tuple[tuple[str, float], ...] = ()
     beside: tuple[str, ...] = ()
     outliers: dict[float, float] = field(default_factory=dict)
     needed: tuple[float, ...] = ()
     instead_of: str = ""
     refuted: tuple[float, float] | None = None
+    misfit: Misfit | None = None
+    trial_names: dict[float, str] = field(default_factory=dict)
 
     @property
     def key(self) -> ModelKey:
         """The model of the verdict, of "unexplained" with the effects beside it."""
+        if self.misfit is not None:  # the process is beside every model
+            return ModelKey(self.chosen)
         error = self.verdict if self.verdict in CATCH_ALLS else None
         return ModelKey(self.chosen or self.beside, error)
+
+    @property
+    def model(self) -> str:
+        """What reports call the model of the verdict."""
+        return self.verdict if self.misfit is None else str(self.key)
 
     def has_several(self, name: str) -> bool:
         """Return whether a name in ``probabilities`` is that of several effects."""
@@ -299,6 +313,7 @@ class Evaluation:
             density and the coverage), and its 90 % bootstrap interval, paired over
             trials; NaN below 8 trials.
         selected: Verdict of each fold, shape (s,).
+        names: What each scored trial is called; empty for its position.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -307,6 +322,7 @@ class Evaluation:
     after: dict[str, Array]
     table: pd.DataFrame
     selected: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
-from sbi_active.design.design import Design, action_labels, action_name, are_categories
+from sbi_active.design.design import Design, naming
 from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.information_gain.base import Bound
@@ -64,15 +64,13 @@ def choose(
         bound=bound,
         index=chosen,
         num_simulations=num_simulations,
-        name=action_name(limits.actions),
-        labels=action_labels(limits.actions),
-        categorical=are_categories(limits.actions),
         estimator=estimator,
         num_samples=estimates.num_samples,
         stopped=estimates.stopped,
         num_missing=num_missing,
         notes=estimates.notes,
         cost=None if limits.price is None else price,
+        **naming(limits.actions),
     )
 
 

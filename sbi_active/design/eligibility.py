@@ -38,7 +38,7 @@ class DesignLimits:
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return which of actions (n, action_dim) are permitted, shape (n,), bool."""
-        inside = torch.ones(len(action)).bool()
+        inside = self.actions.permits(action)
         if self.constraint is not None:
             answer = torch.as_tensor(self.constraint(action))
             if answer.shape != inside.shape:

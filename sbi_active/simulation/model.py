@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import threading
 import uuid
@@ -13,10 +12,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.actions.signals import SignalActions
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_seeds
+from sbi_active.simulation.conditions import (
+    as_arrays,
+    at_rows,
+    conditions_of,
+    one_row,
+    played,
+    require_conditions,
+    require_rows_each,
+    require_taken,
+)
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
+from sbi_active.simulation.signatures import keywords_of, parameters_of, takes_rng
 from sbi_active.simulation.simulator import (
     outcome_array,
     outcome_tensor,
@@ -37,7 +48,11 @@ class SimulatorModel:
     r"""A simulator that owns its noise, :math:`x = f(\theta, \xi) + \epsilon`.
 
     Further keyword arguments of ``fn`` are its *effects*, given to the model by name:
-    a number, or one a row, shape (n, ...).
+    a number, or one a row, shape (n, ...). Four names say how a trial was run instead:
+    ``times``, shape (n, k), at which x is measured; ``inputs`` over time, {name:
+    (n, m)}, with their uniform grid ``input_times``, shape (m,); and ``start``,
+    measured start states, (n, d) or {name: (n,)}. Trials hand them over, and the model
+    its ``sample_times``.
 
     Args:
         fn: ``fn(theta, action)``, shapes (n, theta_dim) and (n, action_dim), giving
@@ -52,19 +67,24 @@ class SimulatorModel:
             receives what it returns as keyword argument ``context``. It is neither
             pickled nor freed before the process ends.
         parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis.
+        channel_names: One an entry of x's last axis; a single one where x is a
+            trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
+        inputs: Where actions are parameters of a signal, their space: ``fn`` receives
+            its signals as ``inputs``, unless trials bring those that were recorded.
 
     Attributes:
         noise: With the time stamps, where there are any.
         effect_names: Names of the effects that ``fn`` declares.
+        conditions: Which of ``times``, ``inputs``, ``input_times`` and ``start`` ``fn``
+            takes as keyword arguments.
         is_batched: Whether ``fn`` takes all rows at once.
         fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
 
     Raises:
         ValueError: If ``setup`` is given and ``fn`` takes no ``context``, or ``fn``
-            takes ``rng`` and all rows at once.
+            takes ``rng`` and all rows at once, or takes no inputs that are given.
 
     Example:
         >>> from sbi_active.simulation import GaussianNoise
@@ -83,6 +103,7 @@ class SimulatorModel:
         parameter_names: Sequence[str] | None = None,
         channel_names: Sequence[str] | None = None,
         sample_times: Tensor | None = None,
+        inputs: SignalActions | None = None,
     ) -> None:
         self.fn = fn
         self.is_batched = batched
@@ -99,14 +120,17 @@ class SimulatorModel:
         self.noise = noise
         if noise is not None and self.sample_times is not None:
             self.noise = noise.at(self.sample_times)
-        self._takes_rng = not batched and _takes_rng(fn)
-        keywords, self._takes_any = _keywords(fn, 3 if self._takes_rng else 2)
+        self._takes_rng = not batched and takes_rng(fn)
+        keywords, self._takes_any = keywords_of(fn, 3 if self._takes_rng else 2)
         self.fn_takes_seeds = self._takes_rng or (batched and "seeds" in keywords)
         if batched and "rng" in keywords:
             raise ValueError(
                 "expected fn(theta, action) of all rows; got fn with an argument "
                 "'rng'; pass batched=False with a fn(theta, action, rng) of one row"
             )
+        self.conditions, self._needs = conditions_of(fn, keywords)
+        self.inputs = inputs
+        require_taken(inputs, self.conditions)
         reserved = ("seeds", "context") if batched else ("context",)
         self.effect_names = tuple(k for k in keywords if k not in reserved)
         if setup is not None and "context" not in keywords and not self._takes_any:
@@ -195,7 +219,13 @@ class SimulatorModel:
 
     def without_noise(self) -> SimulatorModel:
         """Return a model of ``fn`` alone, which has other worker processes."""
-        bare = SimulatorModel(self.fn, setup=self.setup, batched=self.is_batched)
+        bare = SimulatorModel(
+            self.fn,
+            setup=self.setup,
+            batched=self.is_batched,
+            sample_times=self.sample_times if "times" in self.conditions else None,
+            inputs=self.inputs,
+        )
         bare._is_deterministic = self._is_deterministic
         return bare
 
@@ -210,7 +240,7 @@ class SimulatorModel:
             effects: By name, a number or one a row.
         """
         if self._is_deterministic is None:
-            few = {k: v[:FEW] if np.ndim(v) else v for k, v in effects.items()}
+            few = at_rows(effects, slice(FEW))
             self._is_deterministic = self._agrees(theta[:FEW], action[:FEW], few)
         return self._is_deterministic
 
@@ -225,9 +255,9 @@ class SimulatorModel:
                 raise
             answers = []
             for i in range(len(theta)):
-                own = {k: v[i : i + 1] if np.ndim(v) else v for k, v in effects.items()}
+                row = slice(i, i + 1)
+                own = at_rows(effects, row)
                 try:
-                    row = slice(i, i + 1)
                     answers.append(self._agrees(theta[row], action[row], own))
                 except Exception:
                     continue
@@ -252,7 +282,9 @@ class SimulatorModel:
         effects: Mapping[str, Any],
     ) -> Tensor:
         theta, action = torch.as_tensor(theta), torch.as_tensor(action)
+        effects = {**self._own_conditions(theta, action, effects), **effects}
         self._check(theta, action, effects)
+        require_conditions(self._needs, effects)
         if self.fn_takes_seeds and seeds is None:
             seeds = torch.randint(2**62, (len(theta),))
         keywords = {}
@@ -263,16 +295,30 @@ class SimulatorModel:
         else:
             if self.fn_takes_seeds:
                 keywords["seeds"] = _copied(seeds)
-            own = {k: _copied(v) for k, v in effects.items()}
-            x = self.fn(theta.clone(), action.clone(), **own, **keywords)
+            x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
         names = self.channel_names
-        if names is not None and x.shape[-1] != len(names):
+        # A trajectory of one channel has no axis of its own for it.
+        sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
+        if names is not None and len(names) not in sizes:
             raise ValueError(
                 f"expected {len(names)} channels, {', '.join(names)}; got x of shape "
                 f"{tuple(x.shape)}; name the entries of its last axis"
             )
         return x
+
+    def _own_conditions(
+        self, theta: Tensor, action: Tensor, given: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return what the model itself knows of how its trials are run."""
+        found = {}
+        if "times" in self.conditions and self.sample_times is not None:
+            times = self.sample_times.to(theta.dtype)
+            found["times"] = times.expand(len(theta), -1)
+        if self.inputs is not None and "inputs" not in given:
+            signals = played(self.inputs, action, theta.dtype)
+            found |= {k: v for k, v in signals.items() if k in self.conditions}
+        return found
 
     def _run_rows(
         self,
@@ -284,15 +330,14 @@ class SimulatorModel:
     ) -> np.ndarray:
         thetas = theta.detach().cpu().double().numpy()
         actions = action.detach().cpu().double().numpy()
-        arrays = {k: np.asarray(v, dtype=np.float64) for k, v in effects.items()}
+        arrays = as_arrays(effects)
         own_seeds = [] if seeds is None else seeds.tolist()
         rows: np.ndarray | None = None
         for i in range(len(theta)):
-            own = {k: v[i].copy() if v.ndim else float(v) for k, v in arrays.items()}
             row = [thetas[i].copy(), actions[i].copy()]
             if self._takes_rng:
                 row.append(np.random.default_rng(own_seeds[i]))
-            x = self.fn(*row, **own, **keywords)
+            x = self.fn(*row, **one_row(arrays, i), **keywords)
             outcome = outcome_array(x)
             if rows is None:
                 rows = np.empty((len(theta), *outcome.shape))
@@ -327,47 +372,16 @@ class SimulatorModel:
                     f"expected effects among the keyword arguments of fn, {known}; got "
                     f"{name!r}; add it to fn, with its null value as the default"
                 )
-            if np.ndim(value) and len(value) != len(theta):
-                raise ValueError(
-                    f"expected {name} as a number or one a row, shape ({len(theta)}, "
-                    f"...); got {tuple(np.shape(value))}; repeat it for each row"
-                )
+            require_rows_each(name, value, len(theta))
 
 
 def _copied(value: Any) -> Any:
-    """Return an array that ``fn`` may change; a number is what it is."""
+    """Return arrays that ``fn`` may change; a number is what it is."""
+    if isinstance(value, Mapping):
+        return {name: _copied(part) for name, part in value.items()}
     if isinstance(value, Tensor):
         return value.clone()
     return value.copy() if isinstance(value, np.ndarray) else value
-
-
-def _parameters(fn: Callable[..., Any]) -> list[inspect.Parameter]:
-    try:
-        return [*inspect.signature(fn).parameters.values()]
-    except (TypeError, ValueError):  # builtins and C functions have no signature
-        return []
-
-
-def _keywords(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
-    """Return names of keyword arguments behind the positional ones, and if any go."""
-    parameters = _parameters(fn)
-    kinds = inspect.Parameter
-    named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
-    positional = [p for p in parameters if p.kind != kinds.KEYWORD_ONLY][:num_rows]
-    names = [p.name for p in parameters if p.kind in named and p not in positional]
-    return names, any(p.kind == kinds.VAR_KEYWORD for p in parameters)
-
-
-def _takes_rng(fn: Callable[..., Any]) -> bool:
-    """Return whether a function of one row takes a third argument, its generator."""
-    parameters = _parameters(fn)
-    kinds = inspect.Parameter
-    if any(p.kind == kinds.VAR_POSITIONAL for p in parameters) or not parameters:
-        return True
-    behind = [p for p in parameters if p.kind < kinds.VAR_POSITIONAL][2:3]
-    return any(
-        p.name != "context" and not isinstance(p.default, int | float) for p in behind
-    )
 
 
 def takes_seeds(simulator: Callable[..., Any]) -> bool:
@@ -375,4 +389,4 @@ def takes_seeds(simulator: Callable[..., Any]) -> bool:
     if isinstance(simulator, SimulatorModel):
         has_no_use = simulator.noise is None and simulator._is_deterministic is True
         return simulator.fn_takes_seeds or has_no_use
-    return "seeds" in [p.name for p in _parameters(simulator)]
+    return "seeds" in [p.name for p in parameters_of(simulator)]

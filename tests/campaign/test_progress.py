@@ -7,8 +7,7 @@ import time
 import pytest
 import torch
 
-from sbi_active import Campaign
-from sbi_active.campaign.display import progress
+from sbi_active import Campaign, progress
 from sbi_active.campaign.display.progress import StageWatch
 from sbi_active.campaign.state import CampaignState, Trial
 

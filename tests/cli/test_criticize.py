@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
@@ -227,3 +228,157 @@ def test_notes_on_a_table_are_printed(capsys):
     write([*rows, "4,"], "action_xi,x_y")
     assert run("--task", "numerical", "--noise", "0") == 2
     assert "note: 1 of 4 cells of column x_y" in capsys.readouterr().err
+
+
+MOTOR = """
+import torch
+
+def speed(theta, action, *, inputs, times, input_times):
+    u, step = inputs["voltage"], float(input_times[1] - input_times[0])
+    keep = torch.exp(-step / theta[:, 1])
+    w, found = torch.zeros(len(theta)).to(theta), []
+    for k in range(u.shape[1]):
+        found.append(w)
+        w = keep * w + (1 - keep) * theta[:, 0] * u[:, k]
+    series = torch.stack(found, 1)
+    return series.gather(1, (times / step).round().long())
+"""
+
+
+def record(other_file):
+    """Write recordings of a motor with a dead zone, at two rates."""
+    space: dict = {}
+    exec(MOTOR, space)
+    gen = torch.Generator().manual_seed(0)
+    levels = 2 * torch.rand(6, 10, generator=gen).double() - 1
+    u = levels.repeat_interleave(10, 1)
+    acts = u.sign() * (u.abs() - 0.2).clamp(min=0)
+    grid = 0.02 * torch.arange(100).double()
+    times = grid[::5].expand(6, -1)
+    x = space["speed"](
+        torch.tensor([[3.0, 0.3]]).double().expand(6, -1),
+        None,
+        inputs={"voltage": acts},
+        times=times,
+        input_times=grid,
+    )
+    x = x + 0.03 * torch.randn(x.shape, generator=gen)
+    role = ["fit"] * 5 + ["held out"]
+    each = [(i, k) for i in range(6) for k in range(100)]
+    if other_file:
+        rows = [f"{i},{20 * k},{u[i, k]:.4f}" for i, k in each]
+        write(rows, "trial,time_ms,input_voltage[V]")
+        Path("trials.csv").rename("inputs.csv")
+        write(
+            [
+                f"{i},{0.1 * k:.1f},{x[i, k]:.4f},{role[i]}"
+                for i in range(6)
+                for k in range(20)
+            ],
+            "trial,time,x_speed[rad/s],role",
+        )
+    else:
+        rows = [
+            f"{i},{20 * k},{u[i, k]:.4f},{_cell(x[i], k)},{role[i]}" for i, k in each
+        ]
+        write(rows, "trial,time_ms,input_voltage[V],x_speed[rad/s],role")
+
+
+def _cell(x, k):
+    return "" if k % 5 else f"{x[k // 5]:.4f}"
+
+
+@pytest.mark.parametrize("other_file", [True, False])
+def test_recordings_with_inputs_give_a_report(other_file, capsys):
+    record(other_file)
+    module = f"my_motor_{'beside' if other_file else 'within'}.py"
+    Path(module).write_text(MOTOR)
+    command = ["criticize", "trials.csv", "--simulator", f"{module}:speed"]
+    command += ["--theta-low=1,.1", "--theta-high=6,1", "--noise", "0.03"]
+    command += ["--inputs", "inputs.csv"] if other_file else []
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Verdict: dead zone (P")
+    shown = "6 trials of trials.csv: inputs voltage [V]; x speed [rad/s]; 20 to 20"
+    assert shown in printed
+
+
+PROBLEM = """
+simulator = "my_swing.py:place"
+theta-low = "0.1"
+theta-high = "1"
+noise = 0.004
+effects = "my_swing.py:effects"
+order = "unknown"
+seed = 3
+
+[columns]
+time = "time_ms"
+x = "x_place"
+action = "action_speed"
+role = "role"
+"""
+
+
+def folder_of_films(folder="films"):
+    """Write one file a push, and the simulator beside them."""
+    Path(folder).mkdir()
+    film(f"{folder}/my_swing")
+    table = pd.read_csv("trials.csv")
+    for i, push in enumerate(table["push"].unique()):
+        rows = table[table["push"] == push].drop(columns="push")
+        rows["role"] = "held out" if i == 2 else "fit"
+        rows.to_csv(f"{folder}/push {i + 1}.csv", index=False)
+    Path("trials.csv").rename("all.csv")
+    return Path(folder), len(table["push"].unique())
+
+
+def test_a_folder_of_recordings_with_its_problem_file(capsys):
+    folder, num = folder_of_films()
+    (folder / "problem.toml").write_text(PROBLEM)
+    assert main(["criticize", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Verdict: drag")
+    assert "held-out trial push 3: " in printed
+    assert f"{num} trials of films: action speed" in printed
+    assert "the order of the trials is unknown" in printed
+    # What the command line says goes before what the file says.
+    assert main(["criticize", str(folder), "--noise", "-1"]) == 2
+    assert "expected --noise > 0; got -1" in capsys.readouterr().err
+
+
+def test_a_problem_in_python_and_options_in_another_file(capsys):
+    folder, _ = folder_of_films()
+    problem = (folder / "my_swing.py").read_text() + PROBLEM_PY
+    (folder / "problem.py").write_text(problem)
+    Path("mine.toml").write_text('theta-low = "0.1"\ntheta-high = "1"\nnoise = 0.004\n')
+    assert main(["criticize", str(folder), "--config", "mine.toml"]) == 0
+    assert capsys.readouterr().out.startswith("Verdict: drag")
+
+
+PROBLEM_PY = """
+simulator = place
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: [p.unlink() for p in d.glob("*.csv")], "campaign or recordings in"),
+        (lambda d: (d / "problem.toml").unlink(), "expected --simulator or --task"),
+        (
+            lambda d: (d / "problem.toml").write_text('simulater = "a:b"'),
+            "got 'simulater' in",
+        ),
+        (
+            lambda d: (d / "push 2.csv").write_text("time_ms,action_speed\n1,2\n"),
+            "same columns in each recording; got time_ms",
+        ),
+    ],
+)
+def test_a_folder_that_is_not_understood(capsys, change, message):
+    folder, _ = folder_of_films()
+    (folder / "problem.toml").write_text(PROBLEM)
+    change(folder)
+    assert main(["criticize", str(folder)]) == 2
+    assert message in capsys.readouterr().err

@@ -105,6 +105,23 @@ def test_all_trials_but_one_have_the_noise_alone(noise):
         assert np.allclose(without[:, k], expected)
 
 
+def test_reports_call_trials_by_their_names():
+    x, names = measured(), [f"Drop {letter}" for letter in "abcdefgh"]
+    x[3] += 20.0
+    held_out = ["fit"] * 6 + ["held out"] * 2
+    report = criticism(x, names=names, role=held_out).report(plan=False)
+    assert str(report).startswith("Verdict: outlier")
+    assert ": trial Drop d" in str(report).splitlines()[0]
+    assert "Trial Drop d does not agree with the others" in flat(report)
+    assert "held-out trial Drop g: " in flat(report)
+    assert "Drop d" in str(report).split("Leave one out")[1].split("Warnings")[0]
+    assert [*report.tracing.outliers][0] == 3.0  # results go on by the index
+    lost = x.clone()
+    lost[1] = torch.nan
+    report = criticism(lost, names=names).report(plan=False, evaluate=False)
+    assert "trial Drop b gave no measurement where the model is sure" in flat(report)
+
+
 @pytest.mark.parametrize("size", [8.0, -20.0])
 def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
     x = measured()

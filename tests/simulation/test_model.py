@@ -265,6 +265,19 @@ def test_bad_input(run, text):
             run(model)
 
 
+def test_one_name_is_that_of_a_trajectory_s_only_channel():
+    def force(theta, action):
+        return theta[:, :1] * action[:, :1] * torch.linspace(0, 1, 5)
+
+    model = SimulatorModel(force, channel_names=["force"], noise=0.1)
+    assert model(THETA, ACTION).shape == (len(THETA), 5)
+    with pytest.raises(ValueError, match="expected 1 channels, force; got x of"):
+        SimulatorModel(
+            lambda theta, action: force(theta, action)[..., None].expand(-1, -1, 2),
+            channel_names=["force"],
+        )(THETA, ACTION)
+
+
 @pytest.mark.parametrize(
     ("fn", "options", "text"),
     [

@@ -64,9 +64,14 @@ class Spread:
 def _shrunk(z: Tensor) -> tuple[float, Tensor]:
     r"""Return the share of the diagonal and each row's squared distance with it.
 
-    With :math:`d_i = z_i^\top C^{-1} z_i` and :math:`b = (1 - \lambda) / (n - 1)`, the
-    covariance without row i has the determinant :math:`|C| (1 - b d_i)`, and row i the
-    squared distance :math:`d_i / (1 - b d_i)` by it.
+    Without row i the sample covariance about the same mean is
+
+    .. math:: \hat C_{-i} = (n \hat C - z_i z_i^\top) / (n - 1).
+
+    With :math:`G = (1 - \lambda) n / (n - 1) \hat C + \lambda I`,
+    :math:`d_i = z_i^\top G^{-1} z_i` and :math:`b = (1 - \lambda) / (n - 1)`, the
+    shrunk covariance without row i has the determinant :math:`|G| (1 - b d_i)`, and row
+    i the squared distance :math:`d_i / (1 - b d_i)` by it.
     """
     n, q = z.shape
     if q <= n:
@@ -75,10 +80,12 @@ def _shrunk(z: Tensor) -> tuple[float, Tensor]:
     else:  # the same from the smaller matrix of products of rows
         value, vector = torch.linalg.eigh(z @ z.T / n)
         square = n * vector.square() * value.clamp_min(0)
-    shrunk = (1 - SHARES) * value.clamp_min(0)[:, None] + SHARES
-    distance = square @ (1 / shrunk)
-    log_det = shrunk.log().sum(0) + (q - len(value)) * SHARES.log()
-    kept = (1 - (1 - SHARES) / max(n - 1, 1) * distance).clamp_min(1e-12)
+    value = value.clamp_min(0)[:, None]
+    others = max(n - 1, 1)
+    left = (1 - SHARES) * value * (n / others) + SHARES
+    distance = square @ (1 / left)
+    log_det = left.log().sum(0) + (q - len(value)) * SHARES.log()
+    kept = (1 - (1 - SHARES) / others * distance).clamp_min(1e-12)
     loss = log_det + (kept.log() + distance / kept).mean(0)
-    best = int(loss.argmin())
-    return float(SHARES[best]), distance[:, best]
+    share = SHARES[int(loss.argmin())]
+    return float(share), square @ (1 / ((1 - share) * value[:, 0] + share))

@@ -213,6 +213,8 @@ def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:
     event = entry["event"]
     if "trial" in entry:
         state.record(_trial(state, entry["trial"]))
+    elif event == "simulator changed":
+        state.is_stale = bool(state.processed)  # until an update is saved
     elif event == "examined":
         state.examined(entry["digest"])
     elif event == "adopted":

@@ -24,7 +24,7 @@ from sbi_active.campaign.storage.described import (
     options_from,
     prior_from,
 )
-from sbi_active.campaign.storage.directory import CampaignDirectory
+from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.manifest import require_same_simulator
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
@@ -160,7 +160,7 @@ def load(
         )
     if simulator_changed:
         disk.write("simulator changed", simulator=fingerprint(simulator))
-        state.is_stale = bool(state.processed)
+        apply(state, disk.events[-1])
     else:
         require_same_simulator(manifest, simulator)
     model, joint = rebuilt(state, simulator, first_prior, space, effects)

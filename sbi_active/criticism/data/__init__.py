@@ -4,7 +4,7 @@ Here lives what is known before any simulator: numbers, masks, roles and units. 
 here simulates.
 """
 
+from sbi_active.criticism.data.arrays import Role
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.data.trials import Role
 
 __all__ = ["Measurements", "Role"]

@@ -1,15 +1,18 @@
-"""Measured numbers of one or of several lengths, repeats, labels."""
+"""Measured numbers of one or of several lengths, times, repeats, labels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sbi_active.arrays import measured
+
+Role = Literal["fit", "held out"]
 
 
 def padded(value: Any) -> Tensor:
@@ -35,6 +38,43 @@ def _is_stacked(value: Any) -> bool:
     if isinstance(value, np.ndarray) and value.dtype == object:
         return all(np.ndim(row) == 0 for row in value.flat)
     return isinstance(value, Tensor | np.ndarray) or bool(np.isscalar(value))
+
+
+def kept(mask: Any, x: Tensor) -> Tensor:
+    """Return where x is a measurement, of its shape; what pads a ragged mask is none.
+
+    Args:
+        mask: As given, one an entry of x.
+        x: Shape (n, ...).
+    """
+    keep = padded(mask)
+    if keep.ndim == 1 and x.shape[1:] == (1,):
+        keep = keep[:, None]
+    if keep.shape != x.shape:
+        raise ValueError(
+            f"expected a mask of shape {tuple(x.shape)}, that of x; got "
+            f"{tuple(keep.shape)}; give one an entry of x"
+        )
+    if not bool(((keep == 0) | (keep == 1) | keep.isnan()).all()):
+        wrong = float(keep[(keep != 0) & (keep != 1) & ~keep.isnan()][0])
+        raise ValueError(
+            f"expected a mask of True and False, or 1 and 0; got {wrong:g}; pass "
+            "True where x is a measurement"
+        )
+    return keep == 1
+
+
+def without_inf(x: Tensor, names: Sequence[str]) -> Tensor:
+    """Return x with NaN for inf, and say so: no sensor measures it."""
+    lost = x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
+    if lost:
+        which = ", ".join(names[int(i)] for i in lost)
+        warnings.warn(
+            f"x is inf in trial{'s' * (len(lost) > 1)} {which}: taken as not measured, "
+            "as NaN is",
+            stacklevel=3,
+        )
+    return x.where(x.isfinite(), torch.nan)
 
 
 def repeated(action: Tensor) -> Tensor:
@@ -81,6 +121,24 @@ def root(repeat_of: Tensor) -> Tensor:
     return first.where(first != own, torch.tensor(-1))
 
 
+def require_names(names: Sequence[object] | None, num: int) -> tuple[str, ...] | None:
+    """Return names of trials as text, or raise where they are not one each.
+
+    Args:
+        names: None for none.
+        num: Number of trials.
+    """
+    if names is None:
+        return None
+    found = () if isinstance(names, str) else tuple(str(name).strip() for name in names)
+    if len(found) != num or "" in found or len({*found}) < num:
+        raise ValueError(
+            f"expected names of {num} trials, each another; got {names!r}; name each "
+            "trial, or leave names out"
+        )
+    return found
+
+
 def require_labels(
     name: str, labels: Sequence[str] | None, sizes: Sequence[int]
 ) -> tuple[str, ...] | None:
@@ -100,3 +158,97 @@ def require_labels(
             "pass a list of as many"
         )
     return found
+
+
+def sample_times_of(times: Any, x: Tensor, names: Sequence[str]) -> Tensor | None:
+    """Return sample times, shape (k,) or (n, k), or raise where they are no such.
+
+    Args:
+        times: As given; None for none.
+        x: Shape (n, k, ...), NaN where nothing was measured.
+        names: Of the n trials.
+    """
+    if times is None:
+        return None
+    tensor = padded(times)
+    n, k = x.shape[:2]
+    if tensor.shape not in ((k,), (n, k)):
+        raise ValueError(
+            f"expected sample_times of shape ({k},) or ({n}, {k}) for x of shape "
+            f"{tuple(x.shape)}; got {tuple(tensor.shape)}; give one an entry of x's "
+            "first axis"
+        )
+    stamps = tensor.expand(n, k)
+    has_x = x.isfinite().reshape(n, k, -1).any(-1)
+    for i in range(n):
+        if bool((has_x[i] & ~stamps[i].isfinite()).any()):
+            raise ValueError(
+                f"expected as many sample_times as samples in each trial; got "
+                f"{int(stamps[i].isfinite().sum())} for "
+                f"{int(has_x[i].nonzero().max()) + 1} samples in trial {names[i]}; "
+                "give one an entry of x's first axis"
+            )
+        own = stamps[i][stamps[i].isfinite()]
+        if bool((own.diff() <= 0).any()):
+            raise ValueError(
+                f"expected sample_times that increase; got {own.tolist()[:6]}... "
+                f"in trial {names[i]}; sort its samples by time"
+            )
+    return tensor
+
+
+def start_states(start: Any, num: int) -> Tensor | dict[str, Tensor] | None:
+    """Return measured start states, shape (num, d) or {name: (num,)}.
+
+    Args:
+        start: As given; None for none.
+        num: Number of trials.
+
+    Raises:
+        ValueError: If there is not one of finite numbers a trial.
+    """
+    if start is None:
+        return None
+    if isinstance(start, Mapping):
+        return {
+            str(name): _starts(value, (num,), str(name))
+            for name, value in start.items()
+        }
+    value = measured(start, name="start")
+    return _starts(value[:, None] if value.ndim == 1 else value, (num, -1), "start")
+
+
+def _starts(start: Any, shape: tuple[int, ...], name: str) -> Tensor:
+    value = measured(start, name=name)
+    if len(shape) != value.ndim or len(value) != shape[0]:
+        raise ValueError(
+            f"expected start states of shape ({shape[0]}, d), or {{name: "
+            f"({shape[0]},)}}; got {tuple(value.shape)} of {name!r}; give one a trial"
+        )
+    lost = ~value.reshape(len(value), -1).isfinite().all(-1)
+    if bool(lost.any()):
+        raise ValueError(
+            f"expected finite start states; got {name!r} without a number in trials "
+            f"{lost.nonzero()[:, 0].tolist()}; leave these trials out, or declare the "
+            "start as an effect of scope 'trial'"
+        )
+    return value
+
+
+def rows_at(value: Any, at: Any) -> Any:
+    """Return some rows of an array, or of each array of a dict; None stays None."""
+    if isinstance(value, Mapping):
+        return {name: part[at] for name, part in value.items()}
+    return None if value is None else value[at]
+
+
+def roles_of(role: Sequence[Role] | None, n: int) -> list[Role]:
+    """Return a role for each of n trials, "fit" where none is given."""
+    given = ["fit"] * n if role is None else role
+    roles: list[Any] = [str(each).replace("_", " ") for each in given]
+    if len(roles) != n or not {*roles} <= {"fit", "held out"}:
+        raise ValueError(
+            f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "
+            "give one each"
+        )
+    return roles

@@ -7,9 +7,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-ACTION, OBSERVATION, TRIAL, TIME = "action_", "x_", "trial", "time"
+TRIAL, TIME = "trial", "time"
+#: Beginnings of the names of columns that there may be several of.
+PREFIXES = {"action": "action_", "x": "x_", "input": "input_", "start": "start_"}
 OPTIONAL = ("role", "index", "repeat_of")
-KEYS = (TRIAL, TIME, "action", "x", *OPTIONAL)
+KEYS = (TRIAL, TIME, *PREFIXES, *OPTIONAL)
 #: Seconds in a unit of time.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 
@@ -21,6 +23,8 @@ class Columns:
     Attributes:
         action: Columns of the action.
         x: Columns of the observation.
+        input: Columns of the inputs over time.
+        start: Columns of the measured start state.
         trial: Columns that name the trial together, in a table with one row a sample;
             empty where a row is a trial.
         time: Column of the time stamps; None where a row is a trial.
@@ -30,6 +34,8 @@ class Columns:
 
     action: tuple[str, ...]
     x: tuple[str, ...]
+    input: tuple[str, ...]
+    start: tuple[str, ...]
     trial: tuple[str, ...]
     time: str | None
     optional: dict[str, str]
@@ -37,11 +43,16 @@ class Columns:
 
     def label(self, column: str) -> str:
         """Return what a column is called, with its unit, as in "speed [m/s]"."""
-        name = _bare(column)
-        for beginning in (ACTION, OBSERVATION):
-            name = name.removeprefix(beginning)
         unit = self.units.get(column, "")
+        name = self.short(column)
         return f"{name} [{unit}]" if unit else name
+
+    def short(self, column: str) -> str:
+        """Return a column's name without its beginning and unit."""
+        name = bare(column)
+        for beginning in PREFIXES.values():
+            name = name.removeprefix(beginning)
+        return name
 
     @property
     def seconds(self) -> float:
@@ -55,15 +66,21 @@ def find_columns(
     columns: Mapping[str, str | Sequence[str]] | None = None,
     units: Mapping[str, str] | None = None,
     source: str = "the table",
+    of_inputs: bool = False,
+    has_inputs: bool = False,
 ) -> Columns:
     """Return what the columns are, by their names or as the user says.
 
     Args:
         names: Of all columns.
-        columns: Names of those that are "trial", "time", "action", "x", "role", "index"
-            or "repeat_of"; others are then ignored. None goes by the names.
+        columns: Names of those that are "trial", "time", "action", "x", "input",
+            "start", "role", "index" or "repeat_of"; others are then ignored. None goes
+            by the names.
         units: By column, with or without what stands in its brackets.
         source: What messages call the table.
+        of_inputs: The table holds times and inputs alone, and those of all trials
+            where no column names the trial.
+        has_inputs: Inputs stand in another table, so that no action is needed.
 
     Raises:
         ValueError: If a column is missing, unknown or there twice, or has two units.
@@ -77,18 +94,29 @@ def find_columns(
     found = (
         _by_name(names, source) if columns is None else _as_told(names, columns, source)
     )
-    if bool(found[TRIAL]) != bool(found[TIME]):
+    if of_inputs:
+        _require_inputs(found, names, source)
+    elif bool(found[TRIAL]) != bool(found[TIME]):
         there, missing = (TRIAL, TIME) if found[TRIAL] else (TIME, TRIAL)
         raise ValueError(
             f"expected columns {TRIAL} and {TIME} in a table with one row a sample; "
             f"got {there} without {missing} in {source}; add a column {missing}, or "
             f"remove {there} where a row is a trial"
         )
-    for key, beginning in (("action", ACTION), ("x", OBSERVATION)):
+    if found["input"] and not found[TIME]:
+        raise ValueError(
+            f"expected columns {TRIAL} and {TIME} with inputs over time; got "
+            f"{', '.join(found['input'])} without in {source}; write one row a sample, "
+            "or call what does not vary in time action_*"
+        )
+    needed = [] if of_inputs else ["x"]
+    if not (of_inputs or has_inputs or found["input"]):
+        needed = ["action", "x"]
+    for key in needed:
         if not found[key]:
             raise ValueError(
-                f"expected columns {beginning}*; got {', '.join(names)} in {source}; "
-                "name them, as in action_speed, x_distance[m]"
+                f"expected columns {PREFIXES[key]}*; got {', '.join(names)} in "
+                f"{source}; name them, as in action_speed, x_distance[m]"
             )
     used = [name for group in found.values() for name in group]
     stated = _units(used, names, units or {}, source)
@@ -104,6 +132,8 @@ def find_columns(
     return Columns(
         action=found["action"],
         x=found["x"],
+        input=found["input"],
+        start=found["start"],
         trial=found[TRIAL],
         time=time,
         optional={key: found[key][0] for key in OPTIONAL if found[key]},
@@ -111,14 +141,32 @@ def find_columns(
     )
 
 
+def _require_inputs(
+    found: Mapping[str, tuple[str, ...]], names: Sequence[str], source: str
+) -> None:
+    """Raise where a table of inputs lacks them or their times, or holds more."""
+    for key, column in ((TIME, TIME), ("input", "input_*")):
+        if not found[key]:
+            raise ValueError(
+                f"expected columns {TRIAL}, {TIME}, input_* in a table of inputs; got "
+                f"{', '.join(names)} in {source}; add {column}"
+            )
+    others = [n for key in ("action", "x", "start", *OPTIONAL) for n in found[key]]
+    if others:
+        raise ValueError(
+            f"expected columns {TRIAL}, {TIME}, input_* in a table of inputs; got "
+            f"{', '.join(others)} in {source}; move them to the table of trials"
+        )
+
+
 def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
     found: dict[str, list[str]] = {key: [] for key in (*KEYS, "")}
     for name in names:
-        bare = _bare(name)
-        key = bare if bare in (TRIAL, TIME, *OPTIONAL) else ""
-        for prefix, kind in ((ACTION, "action"), (OBSERVATION, "x")):
-            key = kind if bare.startswith(prefix) else key
-        if bare.startswith(f"{TIME}_") and _suffix(bare):
+        word = bare(name)
+        key = word if word in (TRIAL, TIME, *OPTIONAL) else ""
+        for kind, prefix in PREFIXES.items():
+            key = kind if word.startswith(prefix) else key
+        if word.startswith(f"{TIME}_") and _suffix(word):
             key = TIME
         found[key].append(name)
     for key in (TRIAL, TIME, *OPTIONAL):
@@ -128,9 +176,10 @@ def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
                 "keep one"
             )
     unknown = found.pop("")
-    if unknown and found["action"] and found["x"]:
+    if unknown and (found["input"] or (found["action"] and found["x"])):
+        every = ", ".join(f"{prefix}*" for prefix in PREFIXES.values())
         raise ValueError(
-            f"expected columns {ACTION}*, {OBSERVATION}*, {TRIAL}, {TIME}, "
+            f"expected columns {every}, {TRIAL}, {TIME}, "
             f"{', '.join(OPTIONAL)}; got {', '.join(unknown)} in {source}; rename "
             "or remove what is none of these, or say which columns are what"
         )
@@ -146,7 +195,7 @@ def _as_told(
             f"expected columns of {', '.join(KEYS)}; got {', '.join(wrong)}; say "
             "which columns are these"
         )
-    of = {_bare(name): name for name in names} | {name: name for name in names}
+    of = {bare(name): name for name in names} | {name: name for name in names}
     found: dict[str, tuple[str, ...]] = dict.fromkeys(KEYS, ())
     for key, value in columns.items():
         told = [value] if isinstance(value, str) else [*value]
@@ -168,7 +217,7 @@ def _as_told(
 def _units(
     used: Sequence[str], names: Sequence[str], units: Mapping[str, str], source: str
 ) -> dict[str, str]:
-    unknown = {*units} - {*names, *map(_bare, names)}
+    unknown = {*units} - {*names, *map(bare, names)}
     if unknown:
         raise ValueError(
             f"expected units of columns {', '.join(names)}; got one of "
@@ -179,14 +228,14 @@ def _units(
     for name in used:
         match = re.search(r"\[(.*)\]\s*$", name)
         header = match.group(1).strip() if match else ""
-        given = units.get(name, units.get(_bare(name), ""))
+        given = units.get(name, units.get(bare(name), ""))
         if header and given and header != given:
             raise ValueError(
                 f"expected one unit of column {name}; got [{header}] in the header of "
                 f"{source} and {given} in units; convert the numbers, or correct one"
             )
         found[name] = header or given
-        other = seen.setdefault(_bare(name), name)
+        other = seen.setdefault(bare(name), name)
         if other != name:
             raise ValueError(
                 f"expected each quantity in one unit; got {other} and {name} in "
@@ -195,12 +244,12 @@ def _units(
     return found
 
 
-def _bare(name: str) -> str:
+def bare(name: str) -> str:
     """Return a column's name without its unit in brackets."""
     return re.sub(r"\s*\[.*\]\s*$", "", name)
 
 
 def _suffix(name: str) -> str:
     """Return the unit in a name like "time_ms"; "" for none."""
-    unit = _bare(name).rpartition("_")[2]
+    unit = bare(name).rpartition("_")[2]
     return unit if unit in SECONDS else ""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import pandas as pd
 import torch
@@ -13,14 +12,24 @@ from torch import Tensor
 
 from sbi_active.arrays import measured
 from sbi_active.criticism.data.arrays import (
+    Role,
+    kept,
     padded,
     repeated,
     require_labels,
+    require_names,
+    roles_of,
     root,
+    rows_at,
+    sample_times_of,
+    start_states,
+    without_inf,
 )
+from sbi_active.criticism.data.input_series import Hold, inputs_of
+from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import read_table
 
-Role = Literal["fit", "held out"]
+Order = Literal["known", "unknown"]
 
 
 class Trials:
@@ -31,7 +40,9 @@ class Trials:
     What is given is copied, and may change afterwards.
 
     Args:
-        action: As commanded, shape (n, action_dim), or (n,) for scalar actions.
+        action: As commanded, shape (n, action_dim), or (n,) for scalar actions. None
+            where the inputs say what was commanded: the action is then the trial's
+            number, a label that no effect changes.
         x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
         role: "fit", or "held out" of everything that is fitted or chosen; one a
             trial, or None for all "fit".
@@ -39,21 +50,54 @@ class Trials:
             NaN.
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
+        order: "known", or "unknown" where the index says nothing of when a trial was
+            executed, as for records that were collected: nothing is then traced to
+            wear, warming or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
+        names: What reports, warnings and figures call each trial; None takes its index.
+            A selection keeps them.
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
             none; None takes trials of equal actions as repeats of the first. A repeat
             of a repeat is one of the first.
         action_labels: What reports call each entry of the action, with its unit.
         channel_labels: The same of each entry of x's last axis.
+        inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
+            all trials share it, or a list of n arrays. An array (n, m) or a list
+            without a name is "input"; (n, m, c) is "input 1" to "input c".
+        input_times: Of the inputs, shape (m,), (n, m), or a list of n, from the same
+            origin as ``sample_times``, which they are where there are as many.
+        input_hold: Between two of its times an input has the "previous" value, as a
+            command is held, or is "linear".
+        input_labels: What reports call each input, with its unit.
+        start: Measured start state, shape (n, d), or {name: (n,)}.
+
+    Attributes:
+        inputs: By name, shape (n, m), on one uniform grid for all trials: its step is
+            the smallest median step of a trial, and before and after a trial's own
+            times its first and last value are held. None where there are none.
+        input_times: The grid, shape (m,).
+        action_is_label: Whether the action is only the trial's number.
 
     Raises:
-        ValueError: If shapes disagree, numbers are not real, actions or the index not
-            finite, all trials are invalid, or held-out data have no measurement.
+        ValueError: If shapes disagree, numbers are not real, actions, inputs, start
+            states or the index not finite, all trials are invalid, held-out data have
+            no measurement, or inputs have a gap or do not cover what was measured.
 
     Example:
         >>> trials = Trials(torch.tensor([1.0, 2.0]), torch.tensor([0.3, 0.5]))
         >>> len(trials), trials.action.shape, trials.x.shape
         (2, torch.Size([2, 1]), torch.Size([2, 1]))
+
+        A motor's position every .5 s, its voltage every .1 s:
+
+        >>> voltage, position = torch.randn(3, 21), torch.randn(3, 5)
+        >>> times = torch.linspace(0, 2, 5)
+        >>> trials = Trials(
+        ...     None, position, sample_times=times,
+        ...     inputs={"voltage": voltage}, input_times=torch.linspace(0, 2, 21),
+        ... )
+        >>> trials.action[:, 0].tolist(), trials.inputs["voltage"].shape
+        ([0.0, 1.0, 2.0], torch.Size([3, 21]))
     """
 
     def __init__(
@@ -64,16 +108,31 @@ class Trials:
         role: Sequence[Role] | None = None,
         mask: Any = None,
         index: Any = None,
+        order: Order = "known",
         sample_times: Any = None,
+        names: Sequence[object] | None = None,
         repeat_of: Any = None,
         action_labels: Sequence[str] | None = None,
         channel_labels: Sequence[str] | None = None,
+        inputs: Any = None,
+        input_times: Any = None,
+        input_hold: Hold = "previous",
+        input_labels: Sequence[str] | None = None,
+        start: Any = None,
     ) -> None:
+        self.x = padded(x)
+        n = len(self.x)
+        self.action_is_label = action is None
+        if action is None:
+            if inputs is None and start is None:
+                raise ValueError(
+                    "expected actions, or inputs over time in their place; got "
+                    "neither; pass what was commanded in each trial"
+                )
+            action = torch.arange(n)
         self.action = measured(action, name="action")
         if self.action.ndim == 1:
             self.action = self.action[:, None]
-        self.x = padded(x)
-        n = len(self.x)
         if self.action.ndim != 2 or len(self.action) != n or 0 in self.action.shape:
             raise ValueError(
                 "expected actions (n, action_dim) and x with as many rows; got "
@@ -93,23 +152,38 @@ class Trials:
                 "pass what was measured, NaN for a trial without a measurement"
             )
         if mask is not None:
-            self.x = self.x.where(self._kept(mask), torch.nan)
-        self.x = _without_inf(self.x)
-        self.role = _roles(role, n)
+            self.x = self.x.where(kept(mask, self.x), torch.nan)
+        self.role = roles_of(role, n)
         self.index = self._rows("index", torch.arange(n) if index is None else index)
         if not bool(self.index.isfinite().all()):
             raise ValueError(
                 f"expected finite places in index; got {self.index.tolist()}; pass the "
                 "place of each trial in the order of execution, or leave index out"
             )
-        self.sample_times = self._times(sample_times)
+        if order not in get_args(Order):
+            raise ValueError(
+                f"expected order 'known' or 'unknown'; got {order!r}; pass one of them"
+            )
+        self.order: Order = order
+        self._names = require_names(names, n)
+        self.x = without_inf(self.x, self.names)
+        self.sample_times = sample_times_of(sample_times, self.x, self.names)
+        self.inputs, self.input_times = inputs_of(
+            inputs, input_times, self.x, self.sample_times, hold=input_hold
+        )
+        self.start = start_states(start, n)
         self.repeat_of = (
-            repeated(self.action)
+            repeated(self.settings())
             if repeat_of is None
             else root(self._rows("repeat_of", repeat_of))
         )
+        if action_labels is None and self.action_is_label:
+            action_labels = ["trial"]
         self.action_labels = require_labels(
             "action_labels", action_labels, [self.action.shape[1]]
+        )
+        self.input_labels = require_labels(
+            "input_labels", input_labels, [len(self.inputs or ())]
         )
         # A trajectory of one channel has none of its own axis.
         one = [1] if self.x.ndim == 2 and self.sample_times is not None else []
@@ -124,8 +198,8 @@ class Trials:
         lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
         if lost:
             raise ValueError(
-                f"expected measurements in the held-out trials; got NaN in trials "
-                f"{lost}; hold out other trials"
+                f"expected measurements in the held-out trials; got NaN in "
+                f"{self.called(lost)}; hold out other trials"
             )
 
     @classmethod
@@ -135,29 +209,41 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        order: Order = "known",
+        inputs: str | Path | pd.DataFrame | None = None,
+        input_hold: Hold = "previous",
     ) -> Trials:
         r"""Return the trials of a CSV file with one row a trial or one row a sample.
 
         A row is a sample where there are columns "trial" and "time" (in s, or as in
         "time_ms"). Either way "action_\*" is the action, which like all else that
         belongs to a trial stands in each of its rows, and "x_\*" the observation.
+        What stands in "trial" is what reports call it.
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in
-        brackets, as in "x_height[m]", and goes into reports.
+        brackets, as in "x_height[m]", and goes into reports. "start_\*" is the measured
+        start state. "input_\*" varies within a trial, in a table with one row a sample,
+        which then needs no action; rows may have an input and no x.
 
         Args:
-            path: Of the file; lines that begin with # are comments.
-            columns: Which columns are "trial", "time", "action", "x", "role", "index"
-                and "repeat_of", where they have other names; those left out are then
-                ignored. Several columns may name a trial together.
+            path: Of the file; lines that begin with # are comments. Or of a folder with
+                ``trials.csv`` or such files: one with times and no "trial" is a trial.
+            columns: Which columns are "trial", "time", "action", "x", "input", "start",
+                "role", "index" and "repeat_of", where they have other names; those left
+                out are then ignored. Several columns may name a trial together.
             units: By column, where the header has none. Numbers are taken as they are,
                 but for the time, which is converted to seconds.
+            order: As in the constructor; "unknown" where rows are in any order.
+            inputs: Another file, or a data frame, with the inputs at times of their
+                own: "time", "input_\*", and "trial" unless all trials share them.
+            input_hold: As in the constructor.
 
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        return cls(**read_table(path, columns=columns, units=units).arguments)
+        table = read_trials(path, columns=columns, units=units, inputs=inputs)
+        return cls(**table.arguments, order=order, input_hold=input_hold)
 
     @classmethod
     def from_dataframe(
@@ -166,14 +252,15 @@ class Trials:
         *,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         units: Mapping[str, str] | None = None,
+        order: Order = "known",
+        inputs: str | Path | pd.DataFrame | None = None,
+        input_hold: Hold = "previous",
     ) -> Trials:
         """Return the trials of a data frame, laid out as for :meth:`from_csv`.
 
         Example:
-            >>> frame = pd.DataFrame(
-            ...     {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2.0, 4.0]}
-            ... )
-            >>> frame["mass"] = [0.1, 0.1, 0.2]
+            >>> columns = {"ball": ["a", "a", "b"], "t": [0, 1, 0], "h": [3.0, 2, 4]}
+            >>> frame = pd.DataFrame({**columns, "mass": [0.1, 0.1, 0.2]})
             >>> trials = Trials.from_dataframe(
             ...     frame,
             ...     columns={"trial": "ball", "time": "t", "x": "h", "action": "mass"},
@@ -182,7 +269,8 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        return cls(**read_table(frame, columns=columns, units=units).arguments)
+        table = read_table(frame, columns=columns, units=units, inputs=inputs)
+        return cls(**table.arguments, order=order, input_hold=input_hold)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -196,6 +284,16 @@ class Trials:
 
     def __getitem__(self, positions: Any) -> Trials:
         return self.select(positions)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each trial is called: as given, or its index."""
+        return self._names or tuple(f"{value:.15g}" for value in self.index.tolist())
+
+    def called(self, positions: Sequence[int]) -> str:
+        """Return trials in words, as in "trials a, b"."""
+        which = ", ".join(self.names[i] for i in positions)
+        return f"trial{'s' * (len(positions) != 1)} {which}"
 
     @property
     def mask(self) -> Tensor:
@@ -252,16 +350,25 @@ class Trials:
         new |= {int(old): i for i, old in enumerate(at)}
         repeat_of = torch.tensor([new[int(place)] for place in first])
         times = self.sample_times
-        return Trials(
+        some = Trials(
             self.action[at],
             self.x[at],
             role=[self.role[i] for i in at],
             index=self.index[at],
+            order=self.order,
             sample_times=times if times is None or times.ndim == 1 else times[at],
             repeat_of=repeat_of,
             action_labels=self.action_labels,
             channel_labels=self.channel_labels,
+            inputs=rows_at(self.inputs, at),
+            input_times=self.input_times,
+            input_labels=self.input_labels,
+            start=rows_at(self.start, at),
         )
+        some.action_is_label = self.action_is_label
+        if self._names is not None:  # of trials that may be there twice now
+            some._names = tuple(self._names[i] for i in at)
+        return some
 
     def _of(self, role: Role) -> Trials:
         positions = [i for i, r in enumerate(self.role) if r == role]
@@ -272,6 +379,16 @@ class Trials:
             )
         return self.select(positions)
 
+    def settings(self) -> Tensor:
+        """Return all that was set in each trial, shape (n, k); a label is not."""
+        parts = [] if self.action_is_label else [self.action]
+        parts += [*(self.inputs or {}).values()]
+        if isinstance(self.start, dict):
+            parts += [value[:, None] for value in self.start.values()]
+        elif self.start is not None:
+            parts.append(self.start)
+        return torch.cat(parts, -1)
+
     def _rows(self, name: str, value: Any) -> Tensor:
         tensor = measured(value, name=name)
         if tensor.shape != (len(self),):
@@ -280,72 +397,3 @@ class Trials:
                 f"{tuple(tensor.shape)}; give one each"
             )
         return tensor
-
-    def _kept(self, mask: Any) -> Tensor:
-        """Return where x is a measurement; what pads a ragged mask is none."""
-        keep = padded(mask)
-        if keep.ndim == 1 and self.x.shape[1:] == (1,):
-            keep = keep[:, None]
-        if keep.shape != self.x.shape:
-            raise ValueError(
-                f"expected a mask of shape {tuple(self.x.shape)}, that of x; got "
-                f"{tuple(keep.shape)}; give one an entry of x"
-            )
-        if not bool(((keep == 0) | (keep == 1) | keep.isnan()).all()):
-            wrong = float(keep[(keep != 0) & (keep != 1) & ~keep.isnan()][0])
-            raise ValueError(
-                f"expected a mask of True and False, or 1 and 0; got {wrong:g}; pass "
-                "True where x is a measurement"
-            )
-        return keep == 1
-
-    def _times(self, times: Any) -> Tensor | None:
-        if times is None:
-            return None
-        tensor = padded(times)
-        k = self.x.shape[1]
-        if tensor.shape not in ((k,), (len(self), k)):
-            raise ValueError(
-                f"expected sample_times of shape ({k},) or ({len(self)}, {k}) for x of "
-                f"shape {tuple(self.x.shape)}; got {tuple(tensor.shape)}; give one "
-                "an entry of x's first axis"
-            )
-        stamps = tensor.expand(len(self), k)
-        measured = self.x.isfinite().reshape(len(self), k, -1).any(-1)
-        for i in range(len(self)):
-            if bool((measured[i] & ~stamps[i].isfinite()).any()):
-                raise ValueError(
-                    f"expected as many sample_times as samples in each trial; got "
-                    f"{int(stamps[i].isfinite().sum())} for "
-                    f"{int(measured[i].nonzero().max()) + 1} samples in trial {i}; "
-                    "give one an entry of x's first axis"
-                )
-            own = stamps[i][stamps[i].isfinite()]
-            if bool((own.diff() <= 0).any()):
-                raise ValueError(
-                    f"expected sample_times that increase; got {own.tolist()[:6]}... "
-                    f"in trial {i}; sort its samples by time"
-                )
-        return tensor
-
-
-def _roles(role: Sequence[Role] | None, n: int) -> list[Role]:
-    given = ["fit"] * n if role is None else role
-    roles: list[Any] = [str(each).replace("_", " ") for each in given]
-    if len(roles) != n or not {*roles} <= {"fit", "held out"}:
-        raise ValueError(
-            f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "
-            "give one each"
-        )
-    return roles
-
-
-def _without_inf(x: Tensor) -> Tensor:
-    """Return x with NaN for inf, and say so: no sensor measures it."""
-    lost = x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
-    if lost:
-        warnings.warn(
-            f"x is inf in trials {lost}: taken as not measured, as NaN is",
-            stacklevel=3,
-        )
-    return x.where(x.isfinite(), torch.nan)

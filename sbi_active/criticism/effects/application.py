@@ -21,7 +21,7 @@ def applied(
 
     Args:
         effect: Of any hook.
-        value: As the hook says; a dict for "dynamics".
+        value: As the hook says; a dict for "dynamics" and "input".
         phi: Shape (n, phi_dim).
         action: As commanded, shape (n, action_dim).
         context: Of the rows.
@@ -30,8 +30,7 @@ def applied(
         ValueError: If ``apply`` gives back another type, shape or kind of number, or a
             standard deviation that is not positive.
     """
-    times = None if context.times is None else context.times.clone()
-    own = Context(context.index.clone(), times)
+    own = Context(**{name: _copied(part) for name, part in vars(context).items()})
     changed = effect.apply(_copied(value), phi.clone(), action.clone(), own)
     if effect.hook == "dynamics":
         if isinstance(changed, Mapping):
@@ -40,6 +39,28 @@ def applied(
             f"expected apply of effect {effect.name!r} to return a dict of keyword "
             f"arguments; got {type(changed).__name__}; return {{**value, name: phi}}"
         )
+    if effect.hook == "input":
+        return _series(effect, value, changed)
+    return _numbers(effect, value, changed, effect.hook)
+
+
+def _series(
+    effect: Effect, value: Mapping[str, Tensor], changed: Any
+) -> dict[str, Tensor]:
+    """Return the changed inputs; those that are left out are not changed."""
+    if not isinstance(changed, Mapping) or not {*changed} <= {*value}:
+        got = [*changed] if isinstance(changed, Mapping) else type(changed).__name__
+        raise ValueError(
+            f"expected apply of effect {effect.name!r} to return a dict of the inputs "
+            f"{', '.join(value)}; got {got}; return {{**value, name: series}}"
+        )
+    return {
+        name: _numbers(effect, part, changed.get(name, part), f"input {name!r}")
+        for name, part in value.items()
+    }
+
+
+def _numbers(effect: Effect, value: Tensor, changed: Any, what: str) -> Tensor:
     try:
         result = torch.as_tensor(changed)
     except (TypeError, ValueError, RuntimeError):
@@ -48,13 +69,13 @@ def applied(
         got = type(changed).__name__ if result is None else tuple(result.shape)
         raise ValueError(
             f"expected apply of effect {effect.name!r} to return the changed "
-            f"{effect.hook} of shape {tuple(value.shape)}; got {got}; return one row "
+            f"{what} of shape {tuple(value.shape)}; got {got}; return one row "
             "for each row, with phi of shape (n, phi_dim)"
         )
     if result.is_complex() or result.dtype == torch.bool:
         raise ValueError(
             f"expected apply of effect {effect.name!r} to return real numbers; got "
-            f"{result.dtype}; return the changed {effect.hook}"
+            f"{result.dtype}; return the changed {what}"
         )
     return result.to(value.dtype, copy=True)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,8 +13,10 @@ from typing_extensions import override
 from sbi_active.criticism.effects.application import applied
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.null_check import change_at_null, require_positive
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
 from sbi_active.simulation.model import NOISE_STREAM
 
 #: Rows on which an effect is compared with the simulator without it.
@@ -27,8 +29,8 @@ TOLERANCE = 1e-4
 class AugmentedSimulator(SimulatorModel):
     r"""A simulator whose parameters are :math:`(\theta, \phi)`.
 
-    In order, effects change the parameters, the action, the keyword arguments of the
-    simulator's function, the noise-free x, and the noise:
+    In order, effects change the parameters, the action, the inputs over time, the
+    keyword arguments of the simulator's function, the noise-free x, and the noise:
 
     .. math::
         x = h_x\bigl(f(h_\theta(\theta), h_\xi(\xi); h_f)\bigr) + h_s(s)\,\epsilon .
@@ -42,8 +44,8 @@ class AugmentedSimulator(SimulatorModel):
         effects: Effects, each adding its phi to the parameters in this order. Those of
             scope "trial" add none: a call draws their phi for each row.
         check: Parameters (n, theta_dim) and actions (n, action_dim) at which every
-            effect is compared with the simulator at its null; None compares in the
-            first evaluation.
+            effect is compared with the simulator at its null, and how these trials were
+            run where it matters; None compares in the first evaluation.
         next_index: Index of the trial that a plain call simulates.
 
     Raises:
@@ -61,7 +63,7 @@ class AugmentedSimulator(SimulatorModel):
         model: SimulatorModel,
         effects: Sequence[Effect],
         *,
-        check: tuple[Tensor, Tensor] | None = None,
+        check: tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Context] | None = None,
         next_index: int = 0,
     ) -> None:
         base, before = model, []
@@ -86,12 +88,14 @@ class AugmentedSimulator(SimulatorModel):
             parameter_names=names,
             channel_names=base.channel_names,
             sample_times=self._times,
+            inputs=base.inputs,
         )
         self._unchecked = [e for e in effects if e not in before]
         if check is not None:
             known = sum(e.phi_dim for e in before if e.scope == "campaign")
-            theta, action = check
-            self._check_null(theta[:, : theta.shape[1] - known], action)
+            theta, action, *own = check
+            context = self._row_context(action, given=own[0] if own else None)
+            self._check_null(theta[:, : theta.shape[1] - known], action, context)
 
     def evaluate(
         self,
@@ -101,6 +105,7 @@ class AugmentedSimulator(SimulatorModel):
         *,
         index: Tensor | None = None,
         times: Tensor | None = None,
+        context: Context | None = None,
         seeds: Tensor | None = None,
         merge: bool = False,
     ) -> Tensor:
@@ -114,6 +119,8 @@ class AugmentedSimulator(SimulatorModel):
             action: As commanded, shape (n, action_dim).
             index: Place of each row's trial, shape (n,); None is ``next_index``.
             times: Sample times, shape (k,) or (n, k); None takes the model's.
+            context: All that is known of how each row's trial was run, in place of
+                index and times.
             seeds: One a row, for a simulator that takes them; None gives each row 0
                 where the noise is declared.
             merge: Simulate rows once that the simulator would be asked for twice, as
@@ -122,9 +129,8 @@ class AugmentedSimulator(SimulatorModel):
         Returns:
             Shape (n, *x_shape).
         """
-        if self._unchecked and len(theta):
-            self._check_null(theta[:NUM_CHECKED], action[:NUM_CHECKED])
-        context = self._row_context(action, index, times)
+        context = self._row_context(action, index, times, context)
+        self._check_first(theta, action, context)
         merge = merge and self.noise is not None  # a draw is another at each call
         return self._evaluate(theta, phi, action, context, seeds, merge=merge)
 
@@ -136,6 +142,7 @@ class AugmentedSimulator(SimulatorModel):
         *,
         index: Tensor | None = None,
         times: Tensor | None = None,
+        context: Context | None = None,
     ) -> Tensor:
         """Return the noise's standard deviation with effects, of the shape of ``sd``.
 
@@ -145,8 +152,9 @@ class AugmentedSimulator(SimulatorModel):
             sd: Without effects, shape (n, *x_shape).
             index: As in :meth:`evaluate`.
             times: As in :meth:`evaluate`.
+            context: As in :meth:`evaluate`.
         """
-        context = self._row_context(action, index, times)
+        context = self._row_context(action, index, times, context)
         for effect in self._active("noise", phi):
             sd = applied(effect, sd, phi[effect.name], action, context)
         return sd
@@ -196,10 +204,13 @@ class AugmentedSimulator(SimulatorModel):
         theta, phi = self.split(torch.as_tensor(theta))
         phi |= drawn or {}
         action = torch.as_tensor(action)
-        if self._unchecked and len(theta):
-            self._check_null(theta[:NUM_CHECKED], action[:NUM_CHECKED])
-        context = self._row_context(action, None, None)
-        return self._evaluate(theta, phi, action, context, seeds, effects)
+        told = {name: effects[name] for name in CONDITIONS if name in effects}
+        rest = {name: value for name, value in effects.items() if name not in told}
+        context = self._row_context(action)
+        if told:
+            context = self._row_context(action, given=replace(context, **told))
+        self._check_first(theta, action, context)
+        return self._evaluate(theta, phi, action, context, seeds, rest)
 
     def _trial_draws(
         self, num: int, dtype: torch.dtype, seeds: Tensor | None
@@ -218,14 +229,26 @@ class AugmentedSimulator(SimulatorModel):
         return {e.name: d for e, d in zip(trial, draws, strict=True)}
 
     def _row_context(
-        self, action: Tensor, index: Tensor | None, times: Tensor | None
+        self,
+        action: Tensor,
+        index: Tensor | None = None,
+        times: Tensor | None = None,
+        given: Context | None = None,
     ) -> Context:
-        if index is None:
-            index = torch.full((len(action),), float(self.next_index))
-        times = self._times if times is None else times
-        return Context(
-            index.to(action.dtype), None if times is None else times.to(action.dtype)
-        )
+        """Return what effects may know of rows, of the type of their actions."""
+        if given is None:
+            if index is None:
+                index = torch.full((len(action),), float(self.next_index))
+            given = Context(index, times)
+        if given.times is None:
+            given = replace(given, times=self._times)
+        return Context(**{k: typed(v, action.dtype) for k, v in vars(given).items()})
+
+    def _check_first(self, theta: Tensor, action: Tensor, context: Context) -> None:
+        """Compare effects that were not yet with the simulator on a few rows."""
+        if self._unchecked and len(theta):
+            few = slice(NUM_CHECKED)
+            self._check_null(theta[few], action[few], context.at(few))
 
     def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:
         return [e for e in self.effects if e.hook == hook and e.name in phi]
@@ -248,10 +271,13 @@ class AugmentedSimulator(SimulatorModel):
             theta = applied(effect, theta, phi[effect.name], commanded, context)
         for effect in self._active("action", phi):
             action = applied(effect, action, phi[effect.name], commanded, context)
-        changed: dict[str, Any] = {**(keywords or {})}
-        if self.takes_times and context.times is not None:
-            # The simulator is read where the trial was, not on a grid of its own.
-            changed.setdefault("times", context.times.expand(len(theta), -1))
+        if context.inputs is None and self.base.inputs is not None:
+            signals = played(self.base.inputs, action, action.dtype)
+            context = replace(context, **signals)
+        changed: dict[str, Any] = {
+            **self._handed_over(phi, action, commanded, context),
+            **(keywords or {}),
+        }
         for effect in self._active("dynamics", phi):
             changed = applied(effect, changed, phi[effect.name], commanded, context)
         run = self._run_merged if merge else self.base._run
@@ -259,6 +285,31 @@ class AugmentedSimulator(SimulatorModel):
         for effect in self._active("observation", phi):
             x = applied(effect, x, phi[effect.name], commanded, context)
         return x
+
+    def _handed_over(
+        self, phi: dict[str, Tensor], action: Tensor, commanded: Tensor, given: Context
+    ) -> dict[str, Any]:
+        """Return what the simulator's function is told of how its trials are run."""
+        inputs = given.inputs
+        for effect in self._active("input", phi):
+            if inputs is None or "inputs" not in self.base.conditions:
+                raise ValueError(
+                    f"expected inputs over time for effect {effect.name!r}, in the "
+                    "trials and as an argument of the simulator's function; got "
+                    f"{'none in the trials' if inputs is None else 'no such argument'}"
+                    "; pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
+                )
+            inputs = applied(effect, inputs, phi[effect.name], commanded, given)
+        # The simulator is read where the trial was, not on a grid of its own.
+        times = None if given.times is None else given.times.expand(len(action), -1)
+        every = {
+            "times": times,
+            "inputs": inputs,
+            "input_times": given.input_times,
+            "start": given.start,
+        }
+        wanted = self.base.conditions
+        return {k: v for k, v in every.items() if k in wanted and v is not None}
 
     def _run_merged(
         self,
@@ -268,29 +319,25 @@ class AugmentedSimulator(SimulatorModel):
         keywords: dict[str, Any],
     ) -> Tensor:
         """Run each distinct row once."""
-        by_row = {
-            k: v
-            for k, v in keywords.items()
-            if torch.is_tensor(v) and v.shape[:1] == theta.shape[:1]
-        }
-        columns = [theta, action, *([] if seeds is None else [seeds]), *by_row.values()]
+        columns = [theta, action, *([] if seeds is None else [seeds])]
+        columns += _row_tensors(keywords, len(theta))
         rows = torch.cat([c.reshape(len(theta), -1).double() for c in columns], 1)
         _, place = torch.unique(rows, dim=0, return_inverse=True)
         first = torch.full((int(place.max()) + 1,), len(theta), dtype=torch.int64)
         first = first.scatter_reduce(0, place, torch.arange(len(theta)), "amin")
-        some = {k: v[first] if k in by_row else v for k, v in keywords.items()}
+        some = at_rows(keywords, first)
         x = self.base._run(
             theta[first], action[first], None if seeds is None else seeds[first], some
         )
         return x[place]
 
-    def _check_null(self, theta: Tensor, action: Tensor) -> None:
+    def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
         """Raise where an effect at its null changes x."""
-        context = self._row_context(action, None, None)
         x = self._seeded(theta, {}, action, context)
-        if len(x) in x.shape[1:] and len(x) > 1:
+        shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
+        if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:
             # As many rows as entries hide phi that is spread over the wrong axis.
-            self._check_null(theta[:-1], action[:-1])
+            self._check_null(theta[:-1], action[:-1], context.at(slice(-1)))
             return
         finite = x[x.isfinite()]
         spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
@@ -305,7 +352,7 @@ class AugmentedSimulator(SimulatorModel):
                     return applied(e, x, null, action, context)
                 return self._seeded(theta, {e.name: null}, action, context)
 
-            difference = _difference(without, at_null, effect)
+            difference = change_at_null(without, at_null, effect)
             if difference > allowed:
                 raise ValueError(
                     f"expected effect {effect.name!r} to vanish at its null "
@@ -313,7 +360,7 @@ class AugmentedSimulator(SimulatorModel):
                     f"{difference:.3g}; correct apply or null"
                 )
             if effect.hook == "noise":
-                _require_positive(effect, torch.ones_like(x), action, context)
+                require_positive(effect, torch.ones_like(x), action, context)
         self._unchecked = []
 
     def _seeded(
@@ -325,40 +372,17 @@ class AugmentedSimulator(SimulatorModel):
             return self._evaluate(theta, phi, action, context, seeds)
 
 
-def _difference(reference: Tensor, at_null: Any, effect: Effect) -> float:
-    """Return the largest change of x at the null; inf where it turns into NaN."""
-    difference = torch.inf
-    for finite in (False, True):
-        null = effect.null_phi(len(reference), finite=finite).to(reference.dtype)
-        x = torch.as_tensor(at_null(null))
-        same = (x == reference) | (x.isnan() & reference.isnan())
-        gap = (x - reference).abs().where(~same, torch.zeros_like(reference))
-        if bool(gap.isfinite().all()):
-            difference = min(difference, float(gap.max()))
-    return difference
-
-
-def _require_positive(
-    effect: Effect, one: Tensor, action: Tensor, context: Context
-) -> None:
-    """Raise where an effect on the noise makes a deviation that is none."""
-    with forked_generators(0, "noise of an effect"):
-        phi = effect.sample(len(one)).to(one.dtype)
-    sd = applied(effect, one, phi, action, context)
-    wrong = ~(sd > 0) & ~one.isnan()
-    if bool(wrong.any()):
-        row = int(wrong.flatten(1).any(1).nonzero()[0])
-        raise ValueError(
-            f"expected effect {effect.name!r} to keep the noise positive; got "
-            f"{float(sd[row].min()):.3g} times its size at phi = {phi[row].tolist()}; "
-            "pass a prior without such phi, or another apply"
-        )
-
-
 def takes_times(model: SimulatorModel) -> bool:
-    """Return whether the simulator is to be asked for each trial's own times.
+    """Return whether the simulator is to be asked for each trial's own times."""
+    return "times" in model.conditions
 
-    A ``functools.partial`` that binds ``times`` has decided them.
-    """
-    bound = getattr(inspect.unwrap(model.fn), "keywords", {})
-    return "times" in model.effect_names and "times" not in bound
+
+def _row_tensors(keywords: Mapping[str, Any], num: int) -> list[Tensor]:
+    """Return the tensors among keyword arguments that have one entry a row."""
+    found = []
+    for name, value in keywords.items():
+        if isinstance(value, Mapping):
+            found += _row_tensors(value, num)
+        elif name != "input_times" and torch.is_tensor(value):
+            found += [value] if value.shape[:1] == (num,) else []
+    return found

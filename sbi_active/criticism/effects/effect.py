@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 
-Hook = Literal["action", "parameter", "dynamics", "observation", "noise"]
+Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
 
 #: Stands for an infinite null where the formula has no limit in floating point.
 LARGE = 1e9
@@ -28,10 +28,27 @@ class Context:
     Attributes:
         index: Place of each row's trial in the order of the trials, shape (n,).
         times: Sample times, shape (k,) or (n, k); None for x without a time axis.
+        inputs: As commanded, {name: (n, m)}; None for trials without.
+        input_times: Their uniform grid, shape (m,).
+        start: Measured start states, shape (n, d) or {name: (n,)}; None for none.
     """
 
     index: Tensor
     times: Tensor | None = None
+    inputs: dict[str, Tensor] | None = None
+    input_times: Tensor | None = None
+    start: Tensor | dict[str, Tensor] | None = None
+
+    def at(self, rows: slice) -> Context:
+        """Return what is known of some rows."""
+        times = self.times
+        return Context(
+            self.index[rows],
+            times if times is None or times.ndim == 1 else times[rows],
+            None if self.inputs is None else _at(self.inputs, rows),
+            self.input_times,
+            _at(self.start, rows),
+        )
 
 
 @dataclass(frozen=True)
@@ -40,22 +57,25 @@ class Effect:
 
     Args:
         name: What reports call it; unique among the effects of a loop.
-        hook: What it changes: the "action" that is executed, the "parameter" vector
-            theta, the keyword arguments of the simulator's function ("dynamics"), the
-            "observation" x, or the standard deviation of the "noise".
+        hook: What it changes: the "action" that is executed, the "input" series, the
+            "parameter" vector theta, the keyword arguments of the simulator's function
+            ("dynamics"), the "observation" x, or the standard deviation of the "noise".
         prior: Distribution of phi, with event or batch shape (phi_dim,) or ().
         null: Value of phi, a number or shape (phi_dim,), at which the effect vanishes;
             may be infinite.
         apply: ``apply(value, phi, action, context) -> value`` on rows: phi is
             (n, phi_dim), action (n, action_dim) as commanded, ``context`` a
-            :class:`Context`. For "dynamics", value is a dict of keyword arguments. For
-            "noise", value is the standard deviation, of the shape of x.
+            :class:`Context`. For "input", value is {name: (n, m)}, on the grid
+            ``context.input_times``. For "dynamics", it is a dict of keyword arguments.
+            For "noise", it is the standard deviation, of the shape of x.
         units: Of phi.
         family: Effects of one family share a prior probability, so that variants of an
             idea dilute nobody; None takes the hook.
         scope: "campaign" for one phi in all trials; "trial" for a nuisance that every
             trial draws afresh and every rival model marginalizes.
         describe: A sentence for the report.
+        needs_order: Whether it acts by ``context.index``, the order of the trials; it
+            is then left out where that is unknown.
 
     Raises:
         ValueError: If the hook or scope is unknown, a part is of another type, null and
@@ -80,6 +100,7 @@ class Effect:
     family: str | None = None
     scope: Literal["campaign", "trial"] = "campaign"
     describe: str | None = None
+    needs_order: bool = False
 
     def __post_init__(self) -> None:
         _require_parts(self)
@@ -170,6 +191,12 @@ class Effect:
         if finite:
             null = torch.nan_to_num(null, posinf=LARGE, neginf=-LARGE)
         return null.expand(self.phi_dim).repeat(num, 1)
+
+
+def _at(value: Any, rows: slice) -> Any:
+    if isinstance(value, dict):
+        return {name: part[rows] for name, part in value.items()}
+    return None if value is None else value[rows]
 
 
 @dataclass(frozen=True)

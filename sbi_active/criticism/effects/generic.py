@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -14,8 +15,18 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.actions import ActionSpace
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.generic_series import (
+    of_inputs,
+    of_samples,
+    typical_delay,
+)
+from sbi_active.criticism.effects.trial_conditions import (
+    conditions_for,
+    has_own_times,
+)
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
@@ -36,7 +47,10 @@ NUM_ACTIONS, NUM_PRIOR = 256, 256
 
 
 def generic_effects(
-    model: SimulatorModel, actions: ActionSpace, *, prior: Distribution | None = None
+    model: SimulatorModel,
+    actions: ActionSpace | Trials,
+    *,
+    prior: Distribution | None = None,
 ) -> list[Effect]:
     r"""Return effects that wrap the inputs and outputs of a simulator.
 
@@ -44,11 +58,20 @@ def generic_effects(
     zone. Of the observation: bias, gain, drift with the trial's index, an offset of
     the clock where x has sample times, and saturation where the prior is given. Scales
     come from the range of the actions, the noise, and the prior predictive. Noise
-    inflation needs no effect: it is always among the rivals.
+    inflation needs no effect: it is always among the rivals. The drift is left out of a
+    comparison with trials whose order is unknown.
+
+    Trials in place of the actions say more, and so do the signals of a model that has
+    some. An action that is a label, or stands for a signal, is left as it is. Of each
+    input over time there are gain, offset, saturation, dead zone, delay, first-order
+    lag and backlash of its actuator, with the input's name where there are several.
+    Where x has sample times, a drift along them, delay, first-order lag and quantum of
+    the sensor take the place of the clock's offset. Delays and lags are a fiftieth of
+    a recording, and ten samples at most.
 
     Args:
         model: The simulator.
-        actions: The permitted actions.
+        actions: The permitted actions, or the measured trials.
         prior: Of the simulator's parameters, for the spread of its predictions; needed
             where the simulator declares no noise.
 
@@ -66,10 +89,52 @@ def generic_effects(
         spread, within = _predictive_spread(model, actions, prior)
         sd = within if sd is None else sd
     assert sd is not None
-    return [
-        *_of_action(actions),
-        *_of_observation(sd, spread, model),
-    ]
+    if isinstance(actions, Trials):
+        return _of_trials(model, actions, sd, spread)
+    if model.inputs is not None:
+        signals = model.inputs.inputs(actions.sample((NUM_ACTIONS,), seed=0).double())
+        grid, times = model.inputs.input_times, model.sample_times
+        found = [*_of_series(signals, grid, times), *_of_observation(sd, spread, None)]
+        return found if times is None else [*found, *of_samples(sd, times)]
+    return [*_of_action(actions), *_of_observation(sd, spread, model.sample_times)]
+
+
+def _of_trials(
+    model: SimulatorModel, trials: Trials, sd: Tensor, spread: Tensor | None
+) -> list[Effect]:
+    times = trials.sample_times
+    if has_own_times(model, trials):
+        times = model.sample_times
+    if times is not None and trials.x.ndim == 2:
+        sd = sd.mean().reshape(1)  # a sample is no channel
+    found, inputs, grid = [], trials.inputs, trials.input_times
+    if inputs is None and model.inputs is not None:
+        inputs = model.inputs.inputs(trials.action)
+        grid = model.inputs.input_times
+    if not trials.action_is_label and model.inputs is None:
+        labels = trials.action_labels or ()
+        units = [label.partition(" [")[2].removesuffix("]") for label in labels]
+        recorded = trials.action.unique(dim=0)
+        found += _of_action(DiscreteActions(recorded, units=units or None))
+    if inputs is not None:
+        assert grid is not None
+        found += _of_series(inputs, grid, times, trials.input_labels)
+    found += _of_observation(sd, spread, None)
+    return found if times is None else [*found, *of_samples(sd, times)]
+
+
+def _of_series(
+    inputs: dict[str, Tensor],
+    grid: Tensor,
+    times: Tensor | None,
+    labels: Sequence[str] | None = None,
+) -> list[Effect]:
+    delay = typical_delay(grid)
+    if times is not None:
+        delay = min(delay, typical_delay(times))
+    stated = labels or [""] * len(inputs)
+    units = [label.partition(" [")[2].removesuffix("]") for label in stated]
+    return of_inputs(inputs, delay, dict(zip(inputs, units, strict=True)))
 
 
 def _of_action(actions: ActionSpace) -> list[Effect]:
@@ -116,7 +181,7 @@ def _of_action(actions: ActionSpace) -> list[Effect]:
 
 
 def _of_observation(
-    sd: Tensor, spread: Tensor | None, model: SimulatorModel
+    sd: Tensor, spread: Tensor | None, times: Tensor | None
 ) -> list[Effect]:
     make = partial(Effect, hook="observation", null=0.0)
     found = [
@@ -138,10 +203,11 @@ def _of_observation(
             apply=_drift,
             units="a trial",
             describe="the sensor's bias grows from trial to trial",
+            needs_order=True,
         ),
     ]
-    if model.sample_times is not None:
-        span = float(model.sample_times.max() - model.sample_times.min())
+    if times is not None:
+        span = float(times.max() - times.min())
         found.append(
             make(
                 "clock offset",
@@ -213,9 +279,10 @@ def _shift_in_time(
     wanted = (times + phi).contiguous()
     last = times.shape[1] - 2
     low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)
-    weight = (wanted - times.gather(1, low)) / (
-        times.gather(1, low + 1) - times.gather(1, low)
-    )
+    step = times.gather(1, low + 1) - times.gather(1, low)
+    # What pads a shorter trial has the time of its last sample.
+    step = step.where(step > 0, torch.ones_like(step))
+    weight = (wanted - times.gather(1, low)) / step
     shape = (*low.shape, *[1] * (value.ndim - 2))
     index = low.reshape(shape).expand_as(value)
     weight = weight.reshape(shape)
@@ -223,14 +290,20 @@ def _shift_in_time(
 
 
 def _predictive_spread(
-    model: SimulatorModel, actions: ActionSpace, prior: Distribution
+    model: SimulatorModel, actions: ActionSpace | Trials, prior: Distribution
 ) -> tuple[Tensor, Tensor]:
     """Return deviations of x over the prior, and within one parameter set."""
     with forked_generators(0, "spread"):
         theta = prior.sample(torch.Size([NUM_PRIOR]))
-        action = actions.sample((NUM_PRIOR,)).to(theta.dtype)
-        x = model(theta, action, seeds=row_seeds(0, NUM_PRIOR))
-        again = model(theta, action, seeds=row_seeds(1, NUM_PRIOR))
+        run = {}
+        if isinstance(actions, Trials):
+            rows = torch.arange(NUM_PRIOR) % len(actions)
+            action = actions.action[rows].to(theta.dtype)
+            run = conditions_for(model, actions, rows, theta.dtype)
+        else:
+            action = actions.sample((NUM_PRIOR,)).to(theta.dtype)
+        x = model(theta, action, seeds=row_seeds(0, NUM_PRIOR), **run)
+        again = model(theta, action, seeds=row_seeds(1, NUM_PRIOR), **run)
     x, again = x.double(), again.double()
     finite = x.flatten(1).isfinite().all(-1) & again.flatten(1).isfinite().all(-1)
     within = (x - again)[finite].square().mean().sqrt().reshape(1) / 2**0.5

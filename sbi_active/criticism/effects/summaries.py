@@ -124,6 +124,8 @@ def summarize(
             (x - center) @ weight.T,
             role=trials.role,
             index=trials.index,
+            order=trials.order,
+            names=trials.names,
             repeat_of=trials.repeat_of,
         ),
         [_before_summary(e) for e in effects],
@@ -138,6 +140,8 @@ def obstacle(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -
         reason = f"noise {model.noise}"
     elif trials.sample_times is not None or model.sample_times is not None:
         reason = "a time axis, along which errors may be correlated"
+    elif trials.inputs is not None or trials.start is not None:
+        reason = "inputs over time or start states"
     elif bool((trials.mask.flatten(1).any(1) != trials.mask.flatten(1).all(1)).any()):
         reason = "numbers that are masked"
     elif any(e.hook == "noise" for e in effects):

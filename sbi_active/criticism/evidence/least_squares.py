@@ -121,12 +121,12 @@ def find_modes(
     u[:, fixed] = 0.0
     u = np.clip(u, rival.coordinates.low, rival.coordinates.high)
     for iterations, most in zip(EARLY, search.num_kept, strict=True):
-        u, cost = _descend(rival, u, whiten, step, iterations, secant=True)
+        u, cost = descend(rival, u, whiten, step, iterations, secant=True)
         u = _distinct(u[np.argsort(cost)], NEAR_MODE)[:most]
     best, stalls = np.inf, 0
     for phase in range(search.phases[1]):
         whiten = rival.error.whitener(rival.residual(u[:1])[0][0])
-        u, cost = _descend(rival, u, whiten, step, LATE)
+        u, cost = descend(rival, u, whiten, step, LATE)
         order = np.argsort(cost)
         order = order[_which_distinct(u[order], SAME_MODE / 4)]
         u, cost = u[order], cost[order]
@@ -140,7 +140,7 @@ def find_modes(
     # Never wider than the prior: a flat direction has its variance.
     means, factors = [at], [_factors(rival, at, whiten, step, 1.0)]
     for other in rival.error.regimes(rival.residual(at[:1])[0][0]):
-        own, _ = _descend(rival, at[:1], other, step, LATE, secant=True)
+        own, _ = descend(rival, at[:1], other, step, LATE, secant=True)
         means.append(own)
         factors.append(_factors(rival, own, other, step, 1.0))
     wide = np.concatenate(factors) * np.sqrt(search.widened)
@@ -175,7 +175,7 @@ def along_ridges(
     on = modes.u if points is None else np.concatenate([modes.u, points])
     u = np.concatenate([on, modes.proposal.sample(NUM_POINTS, rng)])
     u = np.clip(u, c.low, c.high)
-    u, _ = _descend(rival, u, modes.whiten, step, RETURN, center=u.copy(), secant=True)
+    u, _ = descend(rival, u, modes.whiten, step, RETURN, center=u.copy(), secant=True)
     target = rival.log_prior(u) + rival.log_likelihood(u)
     if not np.isfinite(target.max()):
         return modes.proposal
@@ -226,7 +226,7 @@ def _distinct(u: Array, apart: float) -> Array:
     return u[_which_distinct(u, apart)]
 
 
-def _descend(
+def descend(
     rival: Rival,
     u: Array,
     whiten: Whitener,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
@@ -28,7 +29,7 @@ from sbi_active.criticism.evidence.starts import starts_near_parents
 from sbi_active.criticism.evidence.tempering import temper
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.error_models import ErrorModel
+from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
@@ -60,6 +61,10 @@ BEHIND = 5.0
 #: jumps, would have to do better.
 ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
 NUM_SPREAD = 200
+#: Factors on the declared noise where every model misses by more.
+NUM_FACTORS = 14
+#: Ranges of the action space between two trials whose actions are labels.
+APART = 100.0
 #: Deviations of the prior predictive beyond which a number counts as that far.
 FARTHEST = 1e3
 #: Draws of largest weight, among which the best fit is sought.
@@ -115,9 +120,8 @@ class RivalSet:
             augmented, trials, seed=derive_seed(seed, "trials")
         )
         self.measurements = self.simulator.measurements
-        self.noise = declared_noise(
-            model.noise, self.measurements, seed=derive_seed(seed, "noise")
-        )
+        self._factors: tuple[Array, Array] | None = None
+        self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         reach = FARTHEST * np.hypot(self.spread, self.noise.typical_sd)
@@ -130,6 +134,23 @@ class RivalSet:
         if self.roughness.any():
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
+
+    def noise_of(self, measurements: Measurements) -> NoiseGrid:
+        """Return the errors of some measurements."""
+        seed = derive_seed(self.seed, "noise")
+        noise = declared_noise(self.model.noise, measurements, seed=seed)
+        return noise if self._factors is None else noise.scaled(*self._factors)
+
+    def widen(self, largest: float) -> None:
+        """Let errors be larger than declared, by an unknown factor.
+
+        Args:
+            largest: Of the factor, which is log-uniform from one.
+        """
+        factors = np.geomspace(1.0, max(largest, 2.0), NUM_FACTORS)
+        weights = np.full(NUM_FACTORS, -np.log(NUM_FACTORS))
+        self._factors = factors, weights
+        self.noise = self.noise.scaled(factors, weights)
 
     def rival(self, key: ModelKey) -> Rival:
         """Return the simulator with some effects and an error model."""
@@ -188,9 +209,16 @@ class RivalSet:
     def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.
 
+        Those that are labels are so far from each other that a smooth function of them
+        has another value at each.
+
         Args:
             trials: Further trials.
         """
+        if self.trials.action_is_label:  # which says nothing of how near trials are
+            parts = [self.trials, *([] if trials is None else [trials])]
+            labels = np.concatenate([part.action.numpy() for part in parts])
+            return labels * APART
         action = some = self.trials.action.numpy()
         if self.actions is not None:
             draws = self.actions.sample((256,), seed=0).double().numpy()
@@ -203,7 +231,8 @@ class RivalSet:
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
         """Return the order of trials in the span of the fit; None where it has none.
 
-        Among a few trials it is no structure: any differences of theirs follow it.
+        Among a few trials it is no structure: any differences of theirs follow it. Nor
+        is one that is not that of execution.
 
         Args:
             trials: Further trials.
@@ -212,7 +241,7 @@ class RivalSet:
         if trials is not None:
             index = np.concatenate([own, trials.index.double().numpy()])
         span = np.ptp(own)
-        if span == 0 or len(own) < FEW_TRIALS:
+        if span == 0 or len(own) < FEW_TRIALS or self.trials.order == "unknown":
             return None
         return (index - own.min()) / span
 
@@ -310,12 +339,7 @@ class RivalSet:
     ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
         best = sample.u[np.argsort(sample.weights)[-NUM_TOP:]]
-        joint = rival.coordinates.joint
-        theta_names = self.model.parameter_names
-        if theta_names is None:
-            theta_names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
-        names = [*theta_names, *[n for e in rival.effects for n in e.phi_names]]
-        own = sum(joint.sizes)
+        own = sum(rival.coordinates.joint.sizes)
         residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
         evidence = Evidence(
@@ -325,17 +349,31 @@ class RivalSet:
             effective_sample_size=sample.effective_sample_size,
             engine=engine,
             num_simulations=self.simulator.num_simulations - before,
-            names=(*names,),
+            names=self.names_of(rival),
             draws=rival.coordinates.to_z(u)[:, :own],
             best_chi_square=float(min(square)),
         )
         return Fit(rival, sample, evidence)
 
+    def names_of(self, rival: Rival) -> tuple[str, ...]:
+        """Return what the parameters of a rival and its effects are called."""
+        names = self.model.parameter_names
+        if names is None:
+            names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
+        return (*names, *[n for e in rival.effects for n in e.phi_names])
+
     def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
         """Return mean and deviation of each number before the data, shapes (N,)."""
         m = simulator.measurements
         trials = simulator.trials
-        asked = (trials.action, trials.index, trials.sample_times, m.position)
+        asked = (
+            trials.action,
+            trials.settings(),
+            trials.index,
+            trials.sample_times,
+            trials.input_times,
+            m.position,
+        )
         key = tuple(None if a is None else np.asarray(a).tobytes() for a in asked)
         if key not in self._predictives:
             self._predictives[key] = self._prior_predictive(simulator)

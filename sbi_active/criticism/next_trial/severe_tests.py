@@ -61,24 +61,31 @@ def severe_tests(
     candidates = permitted_candidates(rivals, actions)
     few = min(MAX_TESTS, _affordable(rivals))
     beyond = extrapolated(actions, candidates, limit=few)
+    # Where every model has a residual process, the bare model has one too.
+    free = ModelKey(error=None if tracing.misfit else UNEXPLAINED)
     tested = (
         (_spread_out(candidates, few), True),
         (simulated(rivals, beyond), False),
     )
     return tuple(
-        _most_severe(rivals, tracing.key, some, is_permitted=is_permitted)
+        _most_severe(rivals, tracing.key, free, some, is_permitted=is_permitted)
         for some, is_permitted in tested
         if len(some)
     )
 
 
 def _most_severe(
-    rivals: RivalSet, key: ModelKey, candidates: Tensor, *, is_permitted: bool
+    rivals: RivalSet,
+    key: ModelKey,
+    residual: ModelKey,
+    candidates: Tensor,
+    *,
+    is_permitted: bool,
 ) -> SevereTest:
     trials = following(rivals, candidates)
     options = {"num_draws": NUM_DRAWS, "scored": False}
     verdict = predict(rivals, trials, key=key, **options)
-    free = predict(rivals, trials, key=ModelKey(error=UNEXPLAINED), **options)
+    free = predict(rivals, trials, key=residual, **options)
     difference = _difference(verdict, free, len(candidates))
     best = int(np.argmax(difference))
     return SevereTest(

@@ -12,6 +12,7 @@ from scipy.stats import rankdata
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
+from sbi_active.criticism.report.section import called
 from sbi_active.criticism.report.suspects import of_noise, of_trials
 from sbi_active.criticism.results import (
     NONE,
@@ -92,7 +93,7 @@ def _of_trials(
             f"fewer than {FEW_TRIALS} trials ({num}): several effects may explain as "
             "few"
         )
-    if _aliased(trials):
+    if not trials.action_is_label and _aliased(trials):
         yield (
             "drift aliased with the order of actions: they were executed in sorted "
             "order, so that what grows with time looks like what grows with the action"
@@ -113,7 +114,8 @@ def _of_errors(
         yield (
             "outcomes that disagree: "
             + " and ".join(
-                f"trial{'s' * (len(which) > 1)} {', '.join(map(str, which))} {what}"
+                f"trial{'s' * (len(which) > 1)} "
+                f"{', '.join(called(own.names, i) for i in which)} {what}"
                 for which, what in (
                     (lost, "gave no measurement where the model is sure of one"),
                     (kept, "gave a measurement where the model is sure of none"),
@@ -146,7 +148,7 @@ def _of_errors(
 
 
 def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]:
-    matter = {NONE, tracing.verdict}
+    matter = {NONE, tracing.model}
     matter |= {n for n, p in tracing.probabilities.items() if p > NEGLIGIBLE}
     weak = [
         f"{e.name} ({e.effective_sample_size:.0f} effective samples, {e.engine}, "
@@ -168,17 +170,12 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
     if (
         detection is not None
         and tracing.chosen
+        and tracing.misfit is None
         and detection.refutes(tracing.evidences[tracing.verdict], REFUTED)
     ):
         yield (
             f"{tracing.verdict} explains the most, and not all: the chi-square of the "
             f"trials with it has p < {REFUTED:g}, so that something else is missing too"
-        )
-    if tracing.coarsening < 1:
-        yield (
-            "every model misses the trials by more than the error of measurement: "
-            "between models that are all wrong somewhere evidence counts less, its log "
-            f"times {tracing.coarsening:.2g} in the probabilities"
         )
     check = None if detection is None else detection.null_cross_check
     if detection is not None and check is not None:
@@ -202,8 +199,8 @@ def _of_verdict(
         rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
         if rmse["after"] >= rmse["before"]:
             yield (
-                f"{tracing.verdict} does not lower the error on trials that had no "
-                f"part in it: RMSE {rmse['before']:.3g} before and "
+                f"{ModelKey(tracing.chosen)} does not lower the error on trials that "
+                f"had no part in it: RMSE {rmse['before']:.3g} before and "
                 f"{rmse['after']:.3g} after"
             )
     edge = _at_edge(tracing, effects)
@@ -217,7 +214,7 @@ def _of_verdict(
             "not robust to its prior: effect priors a third or three times as wide "
             "give another verdict"
         )
-    if tracing.verdict == UNEXPLAINED:
+    if tracing.verdict == UNEXPLAINED and not tracing.chosen:
         place = (
             f"beside {ModelKey(tracing.beside)}" if tracing.beside else "in its place"
         )
@@ -236,6 +233,8 @@ def _of_verdict(
 
 def _aliased(trials: Trials) -> bool:
     """Return whether an entry of the action goes with the order of execution."""
+    if trials.order == "unknown":
+        return False
     order = rankdata(trials.index.numpy())
     for value in trials.action.numpy().T:
         ranks = rankdata(value)
@@ -257,7 +256,7 @@ def _neighbors(z: Array) -> tuple[float, int]:
 
 def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[str]:
     """Return effects of the verdict whose phi, given all of them, is at its edge."""
-    evidence = tracing.evidences.get(tracing.verdict)
+    evidence = tracing.evidences.get(tracing.model)
     if evidence is None:
         return []
     return [

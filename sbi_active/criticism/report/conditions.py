@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.headline import number, summary_sentence
+from sbi_active.criticism.report.headline import summary_sentence
+from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.report.section import named_entries, setting
 
 #: Parameters and entries of the action that a sentence names at most.
@@ -75,6 +76,8 @@ def _times(far: float) -> str:
 
 def _tried(report: Contents) -> str:
     """Return which actions were executed."""
+    if report.action_is_label:
+        return "No other inputs were tried than those of these trials."
     action = np.unique(report.residuals.action, axis=0)
     if len(action) == 1:
         only = setting(report.action_labels, action[0])

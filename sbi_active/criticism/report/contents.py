@@ -54,6 +54,7 @@ class Contents:
             are independent given their parameters.
         severe_tests: Where a verdict that names effects would be put to the test most:
             a permitted action, and one beyond.
+        action_is_label: Whether the action is only the trial's number.
     """
 
     residuals: Residuals
@@ -72,6 +73,7 @@ class Contents:
     digest: str = ""
     leave_one_out: tuple[LeaveOneOut, ...] = ()
     severe_tests: tuple[SevereTest, ...] = ()
+    action_is_label: bool = False
 
     @property
     def verdict(self) -> str:
@@ -122,12 +124,12 @@ class Contents:
     def parameters(self) -> pd.DataFrame:
         """Columns parameter, before, before_sd, after, after_sd; phi has no before."""
         evidences = self.tracing.evidences
-        before, after = evidences[NONE], evidences.get(self.verdict)
+        before, after = evidences[NONE], evidences.get(self.tracing.model)
         rows = {
             name: [*_moments(before.draws[:, i]), np.nan, np.nan]
             for i, name in enumerate(before.names)
         }
-        if after is not None and self.verdict != NONE:
+        if after is not None and self.tracing.model != NONE:
             for i, name in enumerate(after.names):
                 row = rows.setdefault(name, [np.nan] * 4)
                 row[2:] = _moments(after.draws[:, i])
@@ -139,7 +141,7 @@ class Contents:
     def combinations(self) -> Combinations:
         """What the model of the verdict knows of parameters together, and what not."""
         evidences = self.tracing.evidences
-        evidence = evidences.get(self.verdict, evidences[NONE])
+        evidence = evidences.get(self.tracing.model, evidences[NONE])
         with forked_generators(0, "report"):
             prior = self.prior.sample(torch.Size([NUM_PRIOR])).double().numpy()
         dim = prior.shape[1]

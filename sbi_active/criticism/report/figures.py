@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
 MAX_ACTION_PANELS = 3
+MOST_NAMED = 16  # trials that have their names at the axis
 LOGARITHMIC_FROM = 12.0  # standard deviations; larger residuals get a symlog axis
 METRICS = {
     "rmse": "RMSE",
@@ -61,8 +62,7 @@ def plot_residuals(
             _scatter(line[i], residuals.action[:, i], each, color)
             line[i].set_xlabel(labels[i])
         _scatter(line[shown], residuals.index, each, color)
-        line[shown].set_xlabel("trial")
-        line[shown].xaxis.get_major_locator().set_params(integer=True)
+        _trial_axis(line[shown], residuals)
         if several:
             _by_entry(line[-1], residuals, color, channel_names)
         for ax in line:
@@ -173,6 +173,18 @@ def _scatter(ax: Axes, place: Array, each: Array, color: str) -> None:
     """Draw all entries of a trial at its place, and their root mean square."""
     many = each.shape[1] > 1
     ax.plot(place, each, ".", ms=3 if many else 7, alpha=0.45 if many else 0.9, c=color)
+
+
+def _trial_axis(ax: Axes, residuals: Residuals) -> None:
+    """Name the trials, or number them where they are many or have no names."""
+    index, names = residuals.index, residuals.names
+    ax.set_xlabel("trial")
+    numbered = all(n == f"{i:.15g}" for n, i in zip(names, index, strict=False))
+    if numbered or len(names) > MOST_NAMED:
+        locator: Any = ax.xaxis.get_major_locator()
+        locator.set_params(integer=True)
+        return
+    ax.set_xticks(index, names, rotation=45, ha="right", fontsize=7)
 
 
 def _residual_axis(ax: Axes, each: Array) -> None:

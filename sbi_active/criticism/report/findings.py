@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.headline import added, probability, with_error
-from sbi_active.criticism.report.section import Section, joined
+from sbi_active.criticism.report.headline import added
+from sbi_active.criticism.report.numbers import number, probability, with_error
+from sbi_active.criticism.report.section import (
+    Section,
+    called,
+    joined,
+    named_entries,
+)
 from sbi_active.criticism.report.suspects import label
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
 
@@ -24,7 +30,7 @@ def effects(report: Contents) -> Section:
     null = tracing.evidences[NONE].log_evidence
     rows, left_out = [], 0
     for name, p in tracing.probabilities.items():
-        if tracing.has_several(name) and p < SHOWN and name != tracing.verdict:
+        if tracing.has_several(name) and p < SHOWN and name != tracing.model:
             left_out += 1
             continue
         inclusion, phi, fit, order = ("",) * any_set, "", ("", ""), -np.inf
@@ -120,6 +126,8 @@ def residuals(report: Contents) -> Section:
         f"{detection.chi_square:.1f} on {detection.degrees_of_freedom:.1f} degrees of "
         f"freedom, p {f'= {p:.2g}' if p >= SMALLEST_P else f'< {SMALLEST_P:g}'}.",
     ]
+    if found := _beside_the_sensor(report):
+        text.insert(0, found)
     if before.times is not None:
         text.append(f"Correlation of neighboring errors {before.correlation:.2f}.")
     return Section(
@@ -129,6 +137,39 @@ def residuals(report: Contents) -> Section:
         rows=tuple(rows),
         figure="residuals",
     )
+
+
+def _beside_the_sensor(report: Contents) -> str:
+    """Return what is left in the unit of x, beside the sensor's error if declared."""
+    declared = getattr(report.simulator.noise, "measurement_sd", None)
+    if declared is None:
+        return ""
+    models = [("the bare model", report.residuals)]
+    if report.residuals_after is not None:
+        models.append((added(report), report.residuals_after))
+    sensors = np.asarray(declared, dtype=float).reshape(-1)
+    several = len(sensors) > 1
+    labels = report.channel_names or ()
+    clauses = []
+    for c, sensor in enumerate(sensors.tolist()):
+        name, unit = "", ""
+        if len(labels) == len(sensors):
+            ((name, unit),) = named_entries([labels[c]])
+        each = []
+        for model, residuals in models:
+            left = residuals.x - residuals.mean
+            left = left[..., c] if several else left
+            size = float(np.sqrt(np.nanmean(left**2)))
+            own = "" if each else f" the sensor's {_measure(sensor, unit)}"
+            each.append(
+                f"{_measure(size, unit)} with {model}, {size / sensor:.2g} times{own}"
+            )
+        clauses.append(f"{name or f'channel {c}'}: " * several + ", ".join(each))
+    return f"What is left, root mean square: {'; '.join(clauses)}."
+
+
+def _measure(value: float, unit: str) -> str:
+    return f"{number(float(f'{value:.2g}'))} {unit}".rstrip()
 
 
 def leave_one_out(report: Contents) -> Section:
@@ -141,7 +182,7 @@ def leave_one_out(report: Contents) -> Section:
             title,
             f"{one.total:.1f}",
             f"{one.pareto_k.max():.2f}",
-            ", ".join(map(str, one.unreliable)) or "none",
+            ", ".join(called(one.names, i) for i in one.unreliable) or "none",
         )
         for title, one in zip(titles, found, strict=False)
     ]

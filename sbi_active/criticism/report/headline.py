@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from sbi_active.criticism.report.contents import Contents
+from sbi_active.criticism.report.numbers import number, stated
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
+from sbi_active.criticism.report.under_misfit import misfit_line, misfit_sentences
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 
 
@@ -14,8 +14,10 @@ def verdict_line(report: Contents) -> str:
     tracing, verdict = report.tracing, report.verdict
     p = tracing.probabilities.get(verdict)
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
+    if tracing.misfit is not None and not tracing.instead_of:
+        line = misfit_line(report, tracing.misfit)
     line += verdict_clause(tracing)
-    if tracing.beside:
+    if tracing.beside and tracing.misfit is None:
         line += f", beside {ModelKey(tracing.beside)}"
     if report.guess is not None:
         line += f", a guess, not declared: {report.guess}"
@@ -31,7 +33,9 @@ def verdict_line(report: Contents) -> str:
 
 def added(report: Contents) -> str:
     """Return what was added to the bare model, in words."""
-    beside = report.tracing.beside
+    tracing, beside = report.tracing, report.tracing.beside
+    if tracing.misfit is not None and tracing.chosen:
+        return tracing.model
     words = {
         NONE: "nothing",
         UNEXPLAINED: f"{ModelKey(beside)} and " * bool(beside) + "a residual process",
@@ -43,6 +47,9 @@ def added(report: Contents) -> str:
 
 def summary_sentence(report: Contents) -> str:
     """Return what was found, in a few sentences."""
+    misfit = report.tracing.misfit
+    if misfit is not None and not report.tracing.instead_of:
+        return misfit_sentences(report, misfit)
     detection, trials = report.detection, f"{report.num_trials} trials"
     against = (
         f"log Bayes factor against it {detection.log_bayes_factor:.1f} nats, at least "
@@ -64,10 +71,10 @@ def summary_sentence(report: Contents) -> str:
             "explains it."
         )
     elif report.verdict == OUTLIER:
-        which = in_words(report.tracing).capitalize()
+        which = in_words(report.tracing)
         found.append(
-            f"{which} does not agree with the others: check it, and correct, withdraw "
-            "or repeat it."
+            f"{which[0].upper()}{which[1:]} does not agree with the others: check it, "
+            "and correct, withdraw or repeat it."
         )
     others = [n for n in report.credible_set if n != report.verdict]
     if others:
@@ -97,40 +104,3 @@ def summary_sentence(report: Contents) -> str:
             )
         found.append(f"{sentence}.")
     return " ".join(found)
-
-
-def stated(value: float) -> str:
-    """Return a probability as an equation."""
-    text = probability(value)
-    return f"P {text}" if text[0] in "<>" else f"P = {text}"
-
-
-def probability(value: float) -> str:
-    """Return a probability in digits that mean something."""
-    if value < 0.005:
-        return "< .01"
-    return "> .99" if value > 0.995 else f"{value:.2f}"
-
-
-def number(value: float) -> str:
-    """Return a number with three digits; nothing for NaN."""
-    if np.isnan(value):
-        return ""
-    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
-
-
-def with_error(mean: float, sd: float) -> str:
-    """Return a mean to the second digit of its deviation; nothing for NaN.
-
-    Example:
-        >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)
-        ('0.35992 +- 0.00071', '1234 +- 57')
-    """
-    if np.isnan(mean):
-        return ""
-    size = abs(mean) + sd
-    if not (sd > 0 and 1e-4 <= size < 1e6):  # powers of ten, or no deviation
-        return f"{mean:.4g} +- {sd:.2g}"
-    exponent = int(f"{sd:.1e}".split("e")[1])  # after rounding to two digits
-    places = max(1 - exponent, 0)
-    return f"{mean:.{places}f} +- {sd:.{places}f}"

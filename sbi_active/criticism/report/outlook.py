@@ -6,8 +6,9 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import METRICS
-from sbi_active.criticism.report.headline import added, number, with_error
-from sbi_active.criticism.report.section import Section, joined, setting
+from sbi_active.criticism.report.headline import added
+from sbi_active.criticism.report.numbers import number, with_error
+from sbi_active.criticism.report.section import Section, called, joined, setting
 from sbi_active.criticism.results import (
     NONE,
     SCATTER,
@@ -46,11 +47,14 @@ def errors(report: Contents) -> Section:
     if evaluation.scheme == "held out":
         text = [f"{num} held-out trials, which had no part in choosing or fitting."]
     else:
-        same = sum(verdict == report.verdict for verdict in evaluation.selected)
+        whole = report.verdict
+        if report.tracing.misfit is not None and report.tracing.chosen:
+            whole = report.tracing.model
+        same = sum(verdict == whole for verdict in evaluation.selected)
         text = [
             f"{num} trials, each predicted by models that were chosen and fitted "
             f"without it ({evaluation.scheme}); {same} of {num} such verdicts are "
-            f"{report.verdict}, that of all trials."
+            f"{whole}, that of all trials."
         ]
     text.append(
         "RMSE and energy score are in units of x: less is better, and their ratio is "
@@ -169,5 +173,6 @@ def _pairs(evaluation: Evaluation) -> list[str]:
             for name in ("rmse", "log predictive density")
         ]
         which = "held-out trial" if evaluation.scheme == "held out" else "trial"
-        found.append(f"{which} {int(trial)}: {', '.join(each)}")
+        name = called(evaluation.names, i) if evaluation.names else int(trial)
+        found.append(f"{which} {name}: {', '.join(each)}")
     return found

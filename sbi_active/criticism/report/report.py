@@ -108,6 +108,7 @@ def build_report(
         exploratory=exploratory,
         num_trials=len(trials.fit),
         action_labels=tuple(labels),
+        action_is_label=trials.action_is_label,
         channel_names=None if channels is None else tuple(channels),
     )
 

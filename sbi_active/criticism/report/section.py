@@ -36,6 +36,11 @@ def joined(names: Sequence[str] | frozenset[str]) -> str:
     return ", ".join(names)
 
 
+def called(names: Sequence[str], position: int) -> str:
+    """Return what a trial is called: its name, or its position without names."""
+    return names[position] if names else str(position)
+
+
 def setting(labels: Sequence[str], action: np.ndarray) -> str:
     """Return an action in words, each entry with its name and unit.
 

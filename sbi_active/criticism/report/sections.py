@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from sbi_active.criticism.report import findings, outlook
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.section import Section
+from sbi_active.criticism.report.under_misfit import admitted_models
 
 
 def sections(report: Contents) -> Iterator[Section]:
     """Yield the parts of a report in order."""
     if report.warnings:
         yield Section("Warnings", items=report.warnings)
+    if report.tracing.misfit is not None:
+        yield admitted_models(report, report.tracing.misfit)
     yield findings.effects(report)
     yield findings.equivalences(report)
     yield findings.residuals(report)
@@ -29,7 +32,9 @@ def _record(report: Contents) -> Section:
     spent = sum(e.num_simulations for e in evidences.values())
     items = [f"evidence cost {spent:,} simulated trials"]
     tempered = [name for name, e in evidences.items() if e.engine == "tempering"]
-    if len(tempered) < len(evidences):
+    if report.tracing.misfit is not None:
+        items.append("evidence by linearized models with a residual process in each")
+    elif len(tempered) < len(evidences):
         items.append("evidence by least squares and importance sampling")
     if tempered:
         which = ", ".join(sorted(tempered))

@@ -25,7 +25,9 @@ def suspects(tracing: Tracing) -> tuple[float, ...]:
 
 def in_words(tracing: Tracing) -> str:
     """Return the trials of which one may have a gross error."""
-    return _trials(suspects(tracing), "or") if tracing.outliers else "one trial"
+    return (
+        _trials(tracing, suspects(tracing), "or") if tracing.outliers else "one trial"
+    )
 
 
 def label(tracing: Tracing, name: str) -> str:
@@ -41,9 +43,9 @@ def verdict_clause(tracing: Tracing) -> str:
     if tracing.verdict == OUTLIER:
         line = f": {in_words(tracing)}"
     if tracing.instead_of:
-        how = f", which {_rests(tracing.needed)}" if tracing.needed else ""
+        how = f", which {_rests(tracing)}" if tracing.needed else ""
         return f"{line}, and not {tracing.instead_of}{how}"
-    return line + (f", {_rests(tracing.needed)}" if tracing.needed else "")
+    return line + (f", {_rests(tracing)}" if tracing.needed else "")
 
 
 def of_trials(tracing: Tracing) -> Iterator[str]:
@@ -61,7 +63,7 @@ def of_trials(tracing: Tracing) -> Iterator[str]:
         yield f"{tracing.instead_of}{stated} is not named, since {why}"
     elif len(tracing.needed) == 1:
         yield (
-            f"{tracing.verdict} {_rests(tracing.needed)}: without it the Bayes factor "
+            f"{tracing.verdict} {_rests(tracing)}: without it the Bayes factor "
             "against the bare model is below 20; repeat its action"
         )
 
@@ -74,7 +76,7 @@ def _why_withdrawn(tracing: Tracing) -> str:
             f"{before:.3g} before and {after:.3g} after"
         )
     return (
-        f"it {_rests(tracing.needed)}, and {in_words(tracing)} may as well have a "
+        f"it {_rests(tracing)}, and {in_words(tracing)} may as well have a "
         "gross error: repeat its action before adding it"
     )
 
@@ -94,14 +96,16 @@ def of_noise(detection: Detection | None) -> Iterator[str]:
     )
 
 
-def _rests(trials: Sequence[float]) -> str:
+def _rests(tracing: Tracing) -> str:
+    trials = tracing.needed
     if len(trials) == 1:
-        return f"rests on trial {trials[0]:g} alone"
-    return f"falls without any one of {_trials(trials, 'and')}"
+        return f"rests on {_trials(tracing, trials, 'and')} alone"
+    return f"falls without any one of {_trials(tracing, trials, 'and')}"
 
 
-def _trials(trials: Sequence[float], last: str) -> str:
-    names = [f"{index:g}" for index in trials]
+def _trials(tracing: Tracing, trials: Sequence[float], last: str) -> str:
+    """Return trials of some indices in words."""
+    names = [tracing.trial_names.get(index, f"{index:g}") for index in trials]
     if len(names) == 1:
         return f"trial {names[0]}"
     if last == "or":

@@ -42,12 +42,14 @@ def declared_noise(
         seed: Of the draws of the posterior.
 
     Raises:
-        ValueError: If a declared standard deviation is zero.
+        ValueError: If a declared standard deviation is zero, or those of several
+            channels are unknown.
     """
     if noise is None:
         one = np.ones(len(measurements))
         return NoiseGrid(_correlated(measurements, one))
     names = noise.parameter_names
+    _require_one_size(noise.posterior)
     if "correlation_time" in names:
         grid = _product(noise.posterior, measurements)
         if grid is not None:
@@ -86,6 +88,22 @@ def declared_noise(
     return NoiseGrid(cells)
 
 
+def _require_one_size(posterior: Distribution | None) -> None:
+    """Raise where several channels have errors of which only the bounds are known."""
+    if not isinstance(posterior, NoisePosterior) or posterior.shared is None:
+        return
+    sd = posterior.sd
+    if not isinstance(sd, SdGrid) or sd.num_channels == 1:
+        return
+    if bool((sd.log_weight == sd.log_weight[:1, :, :1]).all()):
+        raise ValueError(
+            "expected errors of known size in several channels; got bounds of "
+            f"{sd.num_channels}; pass AutocorrelatedNoise(sd=[...], "
+            "correlation_time=...) with one standard deviation a channel, or bring "
+            "the channels to one unit and pass one pair of bounds"
+        )
+
+
 def _product(
     posterior: Distribution | None, measurements: Measurements
 ) -> NoiseGrid | None:
@@ -113,6 +131,22 @@ def _product(
     ]
     scales = (nodes / middle).numpy()
     return NoiseGrid(cells, scales=scales, log_weights=weights[0].numpy())
+
+
+def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:
+    """Return the declared error of the sensor alone, None where there is none.
+
+    Args:
+        noise: The simulator's.
+        measurements: What is measured.
+
+    Returns:
+        A number, or where channels have their own one a measured number, shape (N,).
+    """
+    sd = getattr(noise, "measurement_sd", None)
+    if not isinstance(sd, torch.Tensor):
+        return sd
+    return sd.numpy()[_channel_of(measurements, len(sd))]
 
 
 def scattered(noise: NoiseGrid) -> NoiseGrid:

@@ -12,6 +12,11 @@ from torch import Tensor
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.effects.effect import Context
+from sbi_active.criticism.effects.trial_conditions import (
+    conditions_of_trials,
+    has_own_times,
+)
 from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
@@ -54,9 +59,7 @@ class TrialSimulator:
         self, model: AugmentedSimulator, trials: Trials, *, seed: int = 0
     ) -> None:
         self.model, self.trials, self.seed = model, trials, seed
-        times = model.sample_times
-        if model.takes_times and trials.sample_times is not None:
-            times = None  # it is asked for the trials' own
+        times = model.sample_times if has_own_times(model.base, trials) else None
         self._model_times = None if times is None else times.double().numpy()
         names = () if model.noise is None else model.noise.parameter_names
         self.measurements = Measurements.of(
@@ -66,7 +69,10 @@ class TrialSimulator:
         self.num_simulations, self.failed = 0, False
         self._dtype = torch.float64
         self._known: RowCache[Prediction] = RowCache(KEPT)
-        self._has_repeats = len(torch.unique(trials.action, dim=0)) < len(trials)
+        # A label is part of what the simulator gets, so that no trial repeats another.
+        self._has_repeats = not trials.action_is_label and len(
+            torch.unique(trials.settings(), dim=0)
+        ) < len(trials)
         # The scale of a declared noise is no part of the mean.
         self._of_noise = {
             e.name
@@ -111,7 +117,7 @@ class TrialSimulator:
     ) -> tuple[Array, Array | None, Array]:
         m = self.measurements
         repeats = NUM_REPLICATES if self.is_stochastic else 1
-        size = max(1, int(np.prod(m.shape)) * repeats)
+        size = max(1, (int(np.prod(m.shape)) + self._num_inputs()) * repeats)
         most = max(1, CHUNK // size)
         parts = []
         for start in range(0, len(theta), most):
@@ -122,15 +128,22 @@ class TrialSimulator:
         joined = None if sd[0] is None else np.concatenate(sd)
         return np.concatenate(mean), joined, np.concatenate(valid)
 
+    def _num_inputs(self) -> int:
+        """Return how many numbers all trials' inputs have."""
+        inputs, source = self.trials.inputs, self.model.base.inputs
+        if inputs is None and source is not None:
+            inputs = source.inputs(self.trials.action)
+        return sum(u.numel() for u in (inputs or {}).values())
+
     def noise_scale(self, phi: dict[str, Tensor], num: int) -> Array | None:
         """Return the factor on the noise, shape (n, N); None without such effects."""
         if not any(e.hook == "noise" and e.name in phi for e in self.model.effects):
             return None
-        action, index, times = self._rows(num, 1)
+        action, context = self._rows(num, 1)
         shape = self.measurements.shape
         one = torch.ones(num * shape[0], *shape[1:], dtype=self._dtype)
         scale = self.model.noise_scale(
-            self._tiled(phi, 1), action, one, index=index, times=times
+            self._tiled(phi, 1), action, one, context=context
         )
         flat = scale.double().numpy().reshape(num, -1)
         return flat[:, self.measurements.position]
@@ -140,14 +153,14 @@ class TrialSimulator:
     ) -> tuple[Array, Array | None, Array]:
         n, t = len(theta), len(self.trials)
         self.num_simulations += n * t * repeats
-        action, index, times = self._rows(n, repeats)
+        action, context = self._rows(n, repeats)
         seeds = None
         if self.is_stochastic:
             seeds = row_seeds(self.seed, t * repeats).repeat(n)
         rows = theta.repeat_interleave(t * repeats, 0).to(self._dtype)
         tiled = self._tiled(phi, repeats)
         with forked_generators(derive_seed(self.seed, "replicates")):
-            x = self._simulate(rows, tiled, action, index, times, seeds)
+            x = self._simulate(rows, tiled, action, context, seeds)
         x = x.reshape(n, repeats, t, *x.shape[1:])
         flat = self._at_measured_times(x)  # (n, repeats, t * numbers)
         valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1)
@@ -162,8 +175,7 @@ class TrialSimulator:
         theta: Tensor,
         phi: dict[str, Tensor],
         action: Tensor,
-        index: Tensor,
-        times: Tensor | None,
+        context: Context,
         seeds: Tensor | None,
     ) -> Tensor:
         def run(dtype: torch.dtype) -> Tensor:
@@ -171,8 +183,7 @@ class TrialSimulator:
                 theta.to(dtype),
                 {name: p.to(dtype) for name, p in phi.items()},
                 action.to(dtype),
-                index=index,
-                times=times,
+                context=context,
                 seeds=seeds,
                 merge=self._has_repeats,
             )
@@ -187,15 +198,11 @@ class TrialSimulator:
                 self._dtype = torch.float32
         return run(torch.float32)
 
-    def _rows(self, num: int, repeats: int) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return action, index and times, one row a trial, for all parameters."""
-        tiles = num * repeats
-        action = self.trials.action.to(self._dtype).repeat(tiles, 1)
-        index = self.trials.index.repeat(tiles)
-        times = self.trials.sample_times
-        if times is not None and times.ndim == 2:
-            times = _held(times).repeat(tiles, 1)
-        return action, index, times if self._model_times is None else None
+    def _rows(self, num: int, repeats: int) -> tuple[Tensor, Context]:
+        """Return action and conditions, one row a trial, for all parameters."""
+        rows = torch.arange(len(self.trials)).repeat(num * repeats)
+        context = conditions_of_trials(self.trials, rows, self.model.base)
+        return self.trials.action.to(self._dtype)[rows], context
 
     def _tiled(self, phi: dict[str, Tensor], repeats: int) -> dict[str, Tensor]:
         t = len(self.trials)
@@ -225,13 +232,6 @@ class TrialSimulator:
                 "or give sample_times to both"
             )
         return simulated.reshape(n, repeats, -1)
-
-
-def _held(times: Tensor) -> Tensor:
-    """Return times, shape (t, k), with the last of each row in place of its padding."""
-    last = times.nan_to_num(-torch.inf).amax(-1, keepdim=True)
-    last = last.where(last.isfinite(), torch.zeros_like(last))
-    return times.where(times.isfinite(), last)
 
 
 def _moments(x: Array) -> tuple[Array, Array]:

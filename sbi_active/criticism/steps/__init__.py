@@ -4,7 +4,6 @@ Here live functions of rivals and trials that return a result. Text about result
 in ``report``, proposals of trials in ``next_trial``.
 """
 
-from sbi_active.criticism.steps.coarsening import power
 from sbi_active.criticism.steps.detection import LEVEL, num_determined
 from sbi_active.criticism.steps.influence import (
     is_left_to_chance,
@@ -19,7 +18,6 @@ __all__ = [
     "LeaveOneOut",
     "is_left_to_chance",
     "num_determined",
-    "power",
     "predict",
     "unless_refuted",
     "withdrawn",

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.further_trials import conditions_at, together
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.seeding import derive_seed, forked_generators
@@ -31,6 +32,11 @@ SAME = 1.0
 RELATIVE = 1e-2
 #: Step from the null, in deviations of the prior.
 STEP = 1e-4
+#: Steps at which an effect must leave nothing too, to be none: one that is flat at its
+#: null, such as a dead zone or a lag held over a step, shows there alone.
+FAR = (0.3, 1.0)
+#: Steps of a search for parameters that imitate such an effect.
+NUM_SEARCH = 6
 
 
 def equivalent_effects(
@@ -42,6 +48,10 @@ def equivalent_effects(
     and the parameters make up for all within the span of :math:`\partial f / \partial
     \theta`. Two effects are equivalent if what is left of one, over all permitted
     actions, is a multiple of what is left of the other; with "none" if nothing is left.
+
+    An effect that is flat at its null leaves nothing there and may leave much further
+    off. It is equivalent to "none" only if at .3 and 1 deviations of its prior, too,
+    parameters are found that make up for all of it.
 
     An effect with an infinite null has no derivative there: it is equivalent to "none"
     where its strongest draw shows nothing, and is not compared with others.
@@ -61,7 +71,13 @@ def equivalent_effects(
     local = [bool(e.null_phi(1).isfinite().all()) for e in effects]
     for u in coordinates.sample(NUM_THETA, seed=derive_seed(rivals.seed, "theta")):
         left = _left_over(simulator, coordinates, u, effects, unit, rivals)
-        votes += _alike(left, local)
+        vote = _alike(left, local)
+        for i, effect in enumerate(effects, 1):
+            if local[i - 1] and vote[0, 0, i]:
+                size = left[i - 1][1]
+                near = _Neighborhood(simulator, coordinates, u, unit, rivals)
+                vote[0, 0, i] = vote[0, i, 0] = float(near.hides(effect, size))
+        votes += vote
     same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
     names = [NONE, *[e.name for e in effects]]
     return _groups(names, same)
@@ -103,6 +119,83 @@ def _left_over(
         rest = change - basis @ (basis.T @ change)
         left.append((rest, float(np.linalg.norm(change))))
     return left
+
+
+class _Neighborhood:
+    """Predictions near some parameters u, in noise units."""
+
+    def __init__(
+        self,
+        simulator: TrialSimulator,
+        coordinates: SearchCoordinates,
+        u: Array,
+        unit: Array,
+        rivals: RivalSet,
+    ) -> None:
+        self.simulator, self.coordinates, self.u = simulator, coordinates, u
+        self.unit, self.step = unit, max(rivals.step, STEP)
+        # Where the simulator jumps, a search for parameters finds the jumps.
+        self.num_search = NUM_SEARCH if rivals.is_smooth else 1
+
+    def hides(self, effect: Effect, size: float) -> bool:
+        """Return whether parameters make up for an effect away from its null, too.
+
+        Args:
+            effect: Of which nothing is left near the null.
+            size: Of its change there, for a deviation of the prior.
+        """
+        if self.num_search == 1 and size > 0:  # its direction says enough
+            return True
+        for far in FAR:
+            shift, scale = _small(effect, far)
+            if not np.isfinite(effect.log_prob(shift).numpy()).all():
+                continue
+            moved = self._predict(self.u[None], effect, shift)[0]
+            own = self._predict(self.u[None])[0]
+            both = np.isfinite(moved) & np.isfinite(own)
+            whole = float(np.linalg.norm((moved - own)[both])) / scale
+            rest, is_free = self._rest(moved, both)
+            left = float(np.linalg.norm(rest)) / scale
+            nothing = left**2 < SAME and left < RELATIVE * whole
+            if whole > 0 and is_free and not nothing:
+                return False
+        return True
+
+    def _rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool]:
+        """Return what parameters leave of some predictions, by Gauss-Newton steps.
+
+        And whether they were free: at an edge of the prior, the edge may be what stands
+        against them.
+        """
+        low, high = self.coordinates.low, self.coordinates.high
+        v = self.u
+        rest = (aim - self._predict(v[None])[0])[both]
+        for _ in range(self.num_search):
+            sign = np.where(v + self.step > high, -1.0, 1.0)
+            points = np.concatenate([v[None], v + self.step * np.diag(sign)])
+            mean = self._predict(points)
+            slope = ((mean[1:] - mean[0]) / self.step * sign[:, None]).T[both]
+            slope = np.where(np.isfinite(slope), slope, 0.0)
+            move = np.linalg.lstsq(slope, rest, rcond=1e-9)[0]
+            if self.num_search == 1:  # to first order
+                return rest - slope @ move, True
+            for share in (1.0, 0.5, 0.25, 0.125):
+                to = np.clip(v + share * move, low, high)
+                after = (aim - self._predict(to[None])[0])[both]
+                if np.linalg.norm(after) < np.linalg.norm(rest):
+                    v, rest = to, after
+                    break
+            else:
+                break
+        return rest, bool(((v > low) & (v < high)).all())
+
+    def _predict(
+        self, u: Array, effect: Effect | None = None, shift: Any = None
+    ) -> Array:
+        theta, phi = self.coordinates.split(u)
+        if effect is not None:
+            phi[effect.name] = shift
+        return self.simulator.predict(theta, phi)[0] / self.unit
 
 
 def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:
@@ -162,9 +255,8 @@ def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
 
 def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     """Return the trials at hand and one of every permitted action, in random order."""
-    if isinstance(actions, DiscreteActions) and len(actions) <= MAX_ACTIONS:
-        values = actions.values
-    else:
+    values = actions.listed()
+    if values is None or len(values) > MAX_ACTIONS:
         values = actions.sample((MAX_ACTIONS,), seed=derive_seed(rivals.seed, "every"))
     order = np.random.default_rng(rivals.seed).permutation(len(values))
     own = rivals.trials
@@ -173,11 +265,15 @@ def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
     if times is not None and times.ndim == 2:
         assert first is not None
         times = torch.cat([times, first.expand(len(values), -1)])
-    return Trials(
+    conditions = together(own, conditions_at(rivals.model, own, values[order]))
+    every = Trials(
         torch.cat([own.action, values[order].double()]),
         torch.cat([own.x, template.expand(len(values), *template.shape)]),
         index=torch.cat(
             [own.index, own.index.max() + 1 + torch.arange(len(values)).double()]
         ),
         sample_times=times,
+        **conditions,
     )
+    every.action_is_label = own.action_is_label
+    return every

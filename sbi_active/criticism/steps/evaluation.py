@@ -38,12 +38,13 @@ def evaluate_held_out(
     """
     before, after = _predictions(rivals, tracing, held_out)
     num = len(held_out)
-    return _summary(
+    return summary(
         "held out",
         np.arange(num),
-        _scores(before, held_out),
-        _scores(after, held_out),
+        scores(before, held_out),
+        scores(after, held_out),
         (tracing.verdict,) * num,
+        held_out.names,
     )
 
 
@@ -60,13 +61,14 @@ def evaluate_left_out(trials: Trials, fold: Fold) -> Evaluation:
         rest = [j for j in range(len(trials)) if j != i]
         rivals, tracing = fold(trials.select(rest))
         one = trials.select([int(i)])
-        for scores, prediction in zip(
+        for kept, prediction in zip(
             (before, after), _predictions(rivals, tracing, one), strict=True
         ):
-            scores.append(_scores(prediction, one))
+            kept.append(scores(prediction, one))
         selected.append(tracing.verdict)
-    return _summary(
-        "leave one out", valid, _joined(before), _joined(after), (*selected,)
+    names = tuple(trials.names[i] for i in valid)
+    return summary(
+        "leave one out", valid, joined(before), joined(after), (*selected,), names
     )
 
 
@@ -79,7 +81,7 @@ def _predictions(
     return before, predict(rivals, trials, key=tracing.key)
 
 
-def _scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
+def scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
     """Return one value a trial of each metric, and squares and counts for the RMSE."""
     x = trials.x.numpy().reshape(-1)[prediction.position]
     middle = prediction.mean.mean(0)
@@ -109,17 +111,20 @@ def _scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
     return dict(zip(names, columns, strict=True))
 
 
-def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
+def joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
+    """Return the scores of several predictions, one after the other."""
     return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
 
-def _summary(
+def summary(
     scheme: Any,
     positions: Array,
     before: dict[str, Array],
     after: dict[str, Array],
     selected: tuple[str, ...],
+    names: tuple[str, ...],
 ) -> Evaluation:
+    """Return scores before and after with their contrast, and its interval."""
     rng = np.random.default_rng(0)
     num = len(positions)
     resampled = rng.integers(num, size=(NUM_BOOTSTRAP, num))
@@ -136,15 +141,16 @@ def _summary(
             )
             low, high = np.quantile(many, [0.05, 0.95])
         rows.append((metric, float(first), float(second), float(ratio), low, high))
-    names = ["metric", "before", "after", "ratio", "low", "high"]
+    columns = ["metric", "before", "after", "ratio", "low", "high"]
     keep = ("rmse", "energy score", *DIFFERENCES)
     return Evaluation(
         scheme=scheme,
         trials=positions,
         before={name: before[name] for name in keep},
         after={name: after[name] for name in keep},
-        table=pd.DataFrame(rows, columns=pd.Index(names)),
+        table=pd.DataFrame(rows, columns=pd.Index(columns)),
         selected=selected,
+        names=names,
     )
 
 

@@ -67,6 +67,8 @@ def formula_effects(rivals: RivalSet) -> list[Effect]:
     if rivals.simulator.is_stochastic:
         amplitude = float(np.median(rivals.spread))
     x = trials.x.double().reshape(len(trials.x), -1)
+    if trials.action_is_label:
+        names = []
     of_action = [(name, trials.action[:, [j]], j) for j, name in enumerate(names)]
     found, seen = [], torch.zeros(0, int(x.isfinite().sum()), dtype=torch.float64)
     for name, value, j in [*of_action, ("x", x, None)]:

@@ -98,7 +98,8 @@ def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
 def withdrawn(tracing: Tracing) -> Tracing:
     """Return what was traced with the effects of the verdict not to be added."""
     p = tracing.probabilities
-    by_chance = is_left_to_chance(tracing) or p.get(OUTLIER, 0.0) > p[UNEXPLAINED]
+    outlier, other = p.get(OUTLIER, 0.0), p.get(UNEXPLAINED, 0.0)
+    by_chance = is_left_to_chance(tracing) or outlier > other
     return replace(
         tracing,
         verdict=OUTLIER if by_chance else UNEXPLAINED,

@@ -40,6 +40,7 @@ class LeaveOneOut:
         density: Log predictive density of each trial, shape (t,), nats.
         pareto_k: Shape of the largest weights, (t,).
         num_draws: From the posterior.
+        names: What each trial is called; empty for its position.
 
     References:
         Vehtari, Gelman & Gabry, Statistics and Computing 27 (2017).
@@ -49,6 +50,7 @@ class LeaveOneOut:
     density: Array
     pareto_k: Array
     num_draws: int
+    names: tuple[str, ...] = ()
 
     @property
     def total(self) -> float:
@@ -62,7 +64,7 @@ class LeaveOneOut:
 
     @property
     def unreliable(self) -> tuple[int, ...]:
-        """Trials whose k exceeds the largest that the draws allow."""
+        """Positions of trials whose k exceeds the largest that the draws allow."""
         return (*np.flatnonzero(~(self.pareto_k <= self.largest_k)).tolist(),)
 
 
@@ -93,4 +95,5 @@ def _density(rivals: RivalSet, key: ModelKey) -> LeaveOneOut:
         density=log_sum_exp(log_w + log_p, axis=0),
         pareto_k=k,
         num_draws=NUM_DRAWS,
+        names=rivals.trials.names,
     )

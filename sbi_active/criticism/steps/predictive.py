@@ -12,7 +12,6 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
@@ -98,9 +97,7 @@ def predict(
                 fresh = effect.sample(num_draws * len(target))
                 phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
     mean, unit, probability = simulator.predict(theta, phi)
-    noise = declared_noise(
-        rivals.model.noise, m, seed=derive_seed(rivals.seed, "noise")
-    )
+    noise = rivals.noise_of(m)
     factor = simulator.noise_scale(phi, num_draws)
     factor = np.ones_like(mean) if factor is None else factor
     factor = factor if unit is None else factor * unit

@@ -58,6 +58,7 @@ def find_residuals(
             if rivals.roughness.any()
             else None
         ),
+        names=trials.names,
     )
 
 

@@ -24,7 +24,6 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.coarsening import coarsening
 from sbi_active.criticism.steps.combinations import grow
 from sbi_active.criticism.steps.detection import REFUTED, THRESHOLD, alternatives
 from sbi_active.criticism.steps.equivalence import equivalent_effects
@@ -81,9 +80,7 @@ def trace(
 ) -> Tracing:
     """Return the probabilities of the rivals and the verdict.
 
-    The scales of the effects' priors are unknown. Where every model misses by more than
-    the error of measurement, evidence is coarsened
-    (:mod:`.coarsening`). After an alarm the verdict is first
+    The scales of the effects' priors are unknown. After an alarm the verdict is first
     one of: declared effects, "unexplained", "scatter", each with all of its
     probability; then, of the effects, the most probable. Where known noise refutes
     that (its chi-square has p < .001), the residual process is tried beside it: then
@@ -103,14 +100,13 @@ def trace(
     names = (NONE, *catch_alls, *rivals.effects)
     log_prior = {ModelKey.of(name): prior[name] for name in names}
     log_z = {key: log_evidence(rivals, key)[0] for key in log_prior}
-    share, process = 1.0, ModelKey(error=UNEXPLAINED)
+    process = ModelKey(error=UNEXPLAINED)
     if detection.alarm:
         singles = {n: prior[n] + log_z[ModelKey((n,))] for n in rivals.effects}
         for key, value in grow(rivals, singles, prior).items():
             log_z[key] = log_evidence(rivals, key)[0]
             log_prior[key] = value - log_z[key]
-        share = coarsening(rivals, {k: log_prior[k] + log_z[k] for k in log_z})
-    log_p = {key: log_prior[key] + share * log_z[key] for key in log_z}
+    log_p = {key: log_prior[key] + log_z[key] for key in log_z}
     p = _normalized(log_p)
     verdict = _verdict(p, equivalent, alarm=detection.alarm)
     beside: tuple[str, ...] = ()
@@ -120,7 +116,7 @@ def trace(
         rest = rivals.fit(ModelKey(found, UNEXPLAINED)).evidence.log_evidence
         alone = log_z[process]
         log_z[process] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
-        log_p[process] = log_prior[process] + share * log_z[process]
+        log_p[process] = log_prior[process] + log_z[process]
         p = _normalized(log_p)
         verdict = _verdict(p, equivalent, alarm=detection.alarm)
         if verdict == process and rest > alone:
@@ -139,19 +135,19 @@ def trace(
         chosen=verdict.effects,
         probabilities=probabilities,
         inclusion=inclusion,
-        credible_set=_credible_set(probabilities),
+        credible_set=credible_set(probabilities),
         equivalent=(*equivalent,),
         near=near,
         aliases=aliases,
         estimates=_estimates(rivals, inclusion),
         evidences={str(key): _under_unknown_scale(rivals, key) for key in log_p},
-        robust=_is_robust(
-            rivals, detection, log_prior, log_z, share, equivalent, verdict
-        ),
-        coarsening=share,
+        robust=_is_robust(rivals, detection, log_prior, log_z, equivalent, verdict),
         beside=beside,
         outliers=gross_errors(rivals) if detection.alarm else {},
         needed=needed_trials(rivals, verdict) if verdict.effects else (),
+        trial_names=dict(
+            zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
+        ),
     )
     return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 
@@ -195,7 +191,8 @@ def _verdict(
     return max(likeliest, key=likeliest.__getitem__)
 
 
-def _credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
+def credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
+    """Return the smallest set of names with 90 % of the probability, best first."""
     names, total = [], 0.0
     for name, p in probabilities.items():  # most probable first
         names.append(name)
@@ -234,7 +231,6 @@ def _is_robust(
     detection: Detection,
     log_prior: dict[ModelKey, float],
     log_z: dict[ModelKey, float],
-    share: float,
     equivalent: Sequence[frozenset[str]],
     verdict: ModelKey,
 ) -> bool:
@@ -248,7 +244,7 @@ def _is_robust(
         singles = [scaled[ModelKey.of(k)] + np.log(w) for k, w in weights.items()]
         log_b = log_sum_exp(np.array(singles)) - scaled[ModelKey()]
         alarm = bool(log_b > THRESHOLD) or detection.by_chi_square
-        log_p = {key: log_prior[key] + share * scaled[key] for key in scaled}
+        log_p = {key: log_prior[key] + scaled[key] for key in scaled}
         if _verdict(_normalized(log_p), equivalent, alarm=alarm) != verdict:
             return False
     return True

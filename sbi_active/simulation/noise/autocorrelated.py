@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.arrays import own_tensor
 from sbi_active.simulation.noise.base import ScaleNoise, standard_normals
 from sbi_active.simulation.noise.gaussian import LOG_2PI
 from sbi_active.simulation.noise.posterior import (
     Cells,
-    InverseChiSquare,
     NoisePosterior,
     SdGrid,
+    log_grid_evidence,
     log_student_evidence,
 )
 
@@ -40,8 +42,8 @@ class AutocorrelatedNoise(ScaleNoise):
             it counts samples.
         posterior: Over (sd, correlation_time), event shape (p,).
         measurement_sd: Known standard deviation of the measurement alone, where the
-            rest of an unknown sd is what a simulator gets wrong; None where nothing is
-            known of it.
+            rest of an unknown sd is what a simulator gets wrong, a number or one a
+            channel; None where nothing is known of it.
 
     Raises:
         ValueError: If a parameter is negative or not finite.
@@ -62,25 +64,20 @@ class AutocorrelatedNoise(ScaleNoise):
         correlation_time: float | Tensor,
         *,
         posterior: Distribution | None = None,
-        measurement_sd: float | None = None,
+        measurement_sd: float | Tensor | Sequence[float] | None = None,
     ) -> None:
         super().__init__(
             sd, shared={"correlation_time": correlation_time}, posterior=posterior
         )
-        if measurement_sd is not None and not 0 < measurement_sd < float("inf"):
-            raise ValueError(
-                f"expected measurement_sd > 0; got {measurement_sd}; give the "
-                "sensor's error in the units of x, or None"
-            )
-        self.measurement_sd = measurement_sd
+        self.measurement_sd = _measurement_sd(measurement_sd)
 
     @classmethod
     def unknown(
         cls,
         *,
-        sd: tuple[float, float],
+        sd: tuple[float, float] | Sequence[tuple[float, float]],
         correlation_time: tuple[float, float],
-        measurement_sd: float | None = None,
+        measurement_sd: float | Tensor | Sequence[float] | None = None,
         num_sds: int = 40,
         num_times: int = 12,
     ) -> Self:
@@ -91,12 +88,14 @@ class AutocorrelatedNoise(ScaleNoise):
         nothing better explains it.
 
         Args:
-            sd: Bounds of the standard deviation, in the units of x.
+            sd: Bounds of the standard deviation, in the units of x; or a pair a
+                channel, whose sizes are then unknown one by one. The closed loop takes
+                one pair alone.
             correlation_time: Bounds, s; well below the distance of samples, errors are
                 independent.
-            measurement_sd: Of the sensor alone, where it is known. Errors beyond it are
-                the simulator's, and a trial then counts as one measurement of them
-                (:mod:`.coarsening`).
+            measurement_sd: Of the sensor alone, where it is known, a number or one a
+                channel. Errors beyond it are the simulator's, and a verdict then says
+                what helps to predict and what is probably the cause (:mod:`.misfit`).
             num_sds: Nodes of the grid over standard deviations.
             num_times: The same over correlation times.
 
@@ -109,19 +108,31 @@ class AutocorrelatedNoise(ScaleNoise):
             >>> noise.posterior.sample((3,)).shape
             torch.Size([3, 2])
         """
-        for name, (low, high) in (("sd", sd), ("correlation_time", correlation_time)):
+        several = torch.as_tensor(sd).ndim == 2
+        pairs: Any = [*sd] if several else [sd]
+        for name, (low, high) in (
+            *(("sd", pair) for pair in pairs),
+            ("correlation_time", correlation_time),
+        ):
             if not 0 < low < high:
                 raise ValueError(
                     f"expected bounds 0 < low < high of {name}; got {low:g} and "
                     f"{high:g}; pass the orders of magnitude that are possible"
                 )
-        sds, times = _edges(*sd, num_sds), _edges(*correlation_time, num_times)
+        sds = torch.stack([_edges(low, high, num_sds) for low, high in pairs])
+        times = _edges(*correlation_time, num_times)
         prior = NoisePosterior(
-            SdGrid(sds[None], _uniform(num_sds).expand(num_times, 1, num_sds)),
+            SdGrid(sds, _uniform(num_sds).expand(num_times, len(pairs), num_sds)),
             shared=Cells(times, _uniform(num_times)),
         )
-        middle = [(low * high) ** 0.5 for low, high in (sd, correlation_time)]
-        return cls(*middle, posterior=prior, measurement_sd=measurement_sd)
+        middles = [(low * high) ** 0.5 for low, high in (*pairs, correlation_time)]
+        each = torch.tensor(middles[:-1], dtype=torch.float64)
+        return cls(
+            each if several else middles[0],
+            correlation_time=middles[-1],
+            posterior=prior,
+            measurement_sd=measurement_sd,
+        )
 
     def _check(self, parameters: Tensor) -> None:
         super()._check(parameters)
@@ -170,9 +181,10 @@ class AutocorrelatedNoise(ScaleNoise):
 
     def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
         posterior = self.posterior
-        if not isinstance(posterior, NoisePosterior) or not isinstance(
-            posterior.sd, InverseChiSquare
-        ):
+        if not isinstance(posterior, NoisePosterior):
+            return super()._marginal(residual, times)
+        one = isinstance(posterior.sd, SdGrid) and posterior.sd.num_channels == 1
+        if one:
             return super()._marginal(residual, times)
         assert posterior.shared is not None
         edges, log_weight = posterior.shared.edges, posterior.shared.log_weight
@@ -180,7 +192,10 @@ class AutocorrelatedNoise(ScaleNoise):
         for cell, weight in enumerate(log_weight.tolist()):
             tau = (edges[cell] * edges[cell + 1]).sqrt().expand(len(residual))
             square, log_factor, count = self._summed(residual, tau, times)
-            evidence = log_student_evidence(square, count, posterior.sd, cell=cell)
+            if isinstance(posterior.sd, SdGrid):
+                evidence = log_grid_evidence(square, count, posterior.sd, cell=cell)
+            else:
+                evidence = log_student_evidence(square, count, posterior.sd, cell=cell)
             terms.append((evidence - 0.5 * log_factor).sum(1) + weight)
         return torch.stack(terms).logsumexp(0)
 
@@ -256,6 +271,21 @@ def time_stamps(times: Tensor | None, shape: Sequence[int]) -> Tensor:
             "and drop repeated stamps"
         )
     return times.expand(n, num)
+
+
+def _measurement_sd(
+    value: float | Tensor | Sequence[float] | None,
+) -> float | Tensor | None:
+    """Return a number, or a copy of one a channel, or raise where one is not > 0."""
+    if value is None:
+        return None
+    sds = own_tensor(value, torch.float64, name="measurement_sd")
+    if sds.ndim > 1 or not bool(((sds > 0) & sds.isfinite()).all()):
+        raise ValueError(
+            f"expected measurement_sd > 0; got {value}; give the sensor's error in the "
+            "units of x, one number or one a channel, or None"
+        )
+    return sds if sds.numel() > 1 else float(sds)
 
 
 def _edges(low: float, high: float, num: int) -> Tensor:

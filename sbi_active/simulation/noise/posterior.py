@@ -188,6 +188,28 @@ class NoisePosterior(Distribution):
         )
 
 
+def log_grid_evidence(
+    square: Tensor, count: Tensor, sd: SdGrid, *, cell: int
+) -> Tensor:
+    r"""Sum a Gaussian's standard deviation out over its grid, channel by channel.
+
+    .. math::
+        \log \sum_k P(\sigma_k) \prod_{j=1}^{m} N(e_j; 0, \sigma_k^2)
+
+    Args:
+        square: Sum of squares, shape (n, channels).
+        count: Their number m, alike.
+        sd: The grid.
+        cell: Of the shared parameter.
+
+    Returns:
+        Shape (n, channels), nats.
+    """
+    nodes, weight = sd.nodes.to(square), sd.log_weight[cell].to(square)
+    density = -0.5 * square[..., None] / nodes**2 - count[..., None] * nodes.log()
+    return (density + weight).logsumexp(-1) - 0.5 * count * math.log(2 * math.pi)
+
+
 def log_student_evidence(
     square: Tensor, count: Tensor, sd: InverseChiSquare, *, cell: int
 ) -> Tensor:

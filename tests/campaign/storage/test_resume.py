@@ -1,5 +1,6 @@
 """Campaigns that go on from their directory, as if they had never been left."""
 
+import dataclasses
 import json
 import pickle
 from dataclasses import replace
@@ -193,6 +194,52 @@ def test_another_simulator_is_refused_or_computes_everything_again(tmp_path):
     assert torch.equal(draws(campaign), draws(anew))
     again = Campaign.load(tmp_path / "c", simulator=mended)
     assert torch.equal(draws(again).mean(0), shifted)
+
+
+@pytest.mark.parametrize("told_since", [False, True])
+def test_a_changed_simulator_is_not_forgotten_by_a_kill(tmp_path, told_since):
+    go_on(new(tmp_path / "c"), 2).close()
+
+    def mended(theta, action):
+        return drawn(theta, action) + 0.1
+
+    changed = Campaign.load(tmp_path / "c", simulator=mended, simulator_changed=True)
+    if told_since:
+        changed.attach([1.0], outcome(torch.tensor([1.0]), 2))
+    changed.close()  # as a kill before the next update: nothing was saved
+    assert Campaign.load(tmp_path / "c", simulator=mended).state.is_stale
+    anew = new(simulator=mended)
+    with Campaign.load(tmp_path / "c", simulator=mended) as campaign:
+        campaign.update()
+    for trial in campaign.history:
+        anew.attach(trial.action, trial.x)
+    anew.update()
+    assert torch.equal(draws(campaign), draws(anew))
+    again = Campaign.load(tmp_path / "c", simulator=mended)
+    assert not again.state.is_stale  # the update after the change was saved
+    assert torch.equal(draws(again), draws(anew))
+
+
+def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
+    listed = [0.5, 1.0, 2.0]
+    whole = Campaign(
+        *(drawn, PRIOR, listed),
+        method="nsbi",
+        options=OPTIONS,
+        directory=tmp_path / "c",
+    )
+    go_on(whole, 1).close()
+    fields = {f.name: getattr(OPTIONS, f.name) for f in dataclasses.fields(OPTIONS)}
+    again = Campaign.load(
+        tmp_path / "c", simulator=drawn, options=fields, actions=listed
+    )
+    assert again.state.options == whole.state.options
+    assert again.actions.listed()[:, 0].tolist() == listed
+    assert torch.equal(draws(again), draws(whole))
+    with pytest.raises(TypeError, match="expected options among"):
+        Campaign.load(tmp_path / "c", simulator=drawn, options={"rows": 3})
+    with pytest.raises(TypeError, match="expected an action space or a list"):
+        Campaign.load(tmp_path / "c", simulator=drawn, actions="fast")
 
 
 def price(action):

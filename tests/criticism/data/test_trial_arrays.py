@@ -91,7 +91,7 @@ def test_what_is_no_measurement_is_refused(changes, message):
 
 
 def test_inf_is_not_measured_and_said_so():
-    with pytest.warns(UserWarning, match=r"x is inf in trials \[0\]"):
+    with pytest.warns(UserWarning, match="x is inf in trial 0: taken"):
         trials = Trials(SPEED, [[1.0, float("inf")], [3.0, 4.0]])
     assert trials.mask.tolist() == [[True, False], [True, True]]
 

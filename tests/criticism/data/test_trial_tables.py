@@ -35,6 +35,26 @@ def test_units_of_the_header_are_carried_along():
     assert (named.action_labels, named.channel_labels) == (("v",), ("y [mm]",))
 
 
+def test_trials_are_called_as_in_the_table():
+    assert read([*SAMPLES, "c,0,3,4"]).select([2, 0]).names == ("c", "a")
+    header = "ball,drop,time_s,height_m,area"
+    rows = ["golf,1,0,5,.1", "golf,1,.1,4,.1", "golf,2,0,6,.1"]
+    told = {"trial": ["ball", "drop"], "time": "time_s"}
+    told |= {"x": "height_m", "action": "area"}
+    assert read(rows, header, columns=told).names == ("golf 1", "golf 2")
+    assert read(["1,2", "3,4"], "action_v,x_y").names == ("0", "1")
+
+
+def test_rows_in_no_order_are_declared_and_stay_so():
+    trials = read([*SAMPLES, "c,0,3,4"], order="unknown")
+    assert trials.order == trials.select([2, 0]).order == trials.fit.order == "unknown"
+    frame = pd.DataFrame({"action_v": [1.0, 2.0], "x_y": [3.0, 4.0]})
+    assert Trials.from_dataframe(frame, order="unknown").order == "unknown"
+    assert Trials.from_dataframe(frame).order == "known"
+    with pytest.raises(ValueError, match="expected order 'known' or 'unknown'; got"):
+        read(SAMPLES, order="sorted")
+
+
 @pytest.mark.parametrize(
     "time", ["time_ms", "time[ms]", "time"], ids=["suffix", "bracket", "told"]
 )

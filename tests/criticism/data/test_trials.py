@@ -34,6 +34,46 @@ def test_repeats_are_found_and_follow_a_selection():
     assert trials[[2, 0]].repeat_of.tolist() == [1, -1]
 
 
+def test_names_stay_with_their_trials():
+    trials = Trials(
+        [1.0, 2.0, 3.0],
+        [1.0, 2.0, 3.0],
+        role=["fit", "held out", "fit"],
+        names=["run 7", "run 9", 12],
+    )
+    assert trials.names == ("run 7", "run 9", "12")
+    assert trials.fit.names == ("run 7", "12")
+    assert trials.held_out.names == ("run 9",)
+    assert trials[[2, 0]].select([1, 1]).names == ("run 7", "run 7")
+    assert trials.called([0, 2]) == "trials run 7, 12"
+    unnamed = Trials([1.0, 2.0], [1.0, 2.0], index=[4, 1_234_567.0])
+    assert unnamed.names == ("4", "1234567")
+    assert unnamed[1:].names == ("1234567",)
+
+
+@pytest.mark.parametrize("names", ["ab", ["a"], ["a", "a"], ["a", " "]])
+def test_names_are_one_each(names):
+    with pytest.raises(ValueError, match="expected names of 2 trials, each another"):
+        Trials([1.0, 2.0], [1.0, 2.0], names=names)
+
+
+def test_messages_call_trials_by_their_names():
+    with pytest.warns(UserWarning, match="x is inf in trial late: taken"):
+        Trials([1.0, 2.0], [1.0, np.inf], names=["early", "late"])
+    with pytest.raises(ValueError, match="got NaN in trial late; hold out other"):
+        Trials(
+            *([1.0, 2.0], [1.0, np.nan]),
+            names=["early", "late"],
+            role=["fit", "held out"],
+        )
+    with pytest.raises(ValueError, match="in trial late; sort its samples by time"):
+        Trials(
+            *([1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]]),
+            sample_times=[[0.0, 1.0], [1.0, 0.0]],
+            names=["early", "late"],
+        )
+
+
 def test_measurements_skip_gaps_within_a_trajectory_alone():
     x = torch.tensor([[1.0, torch.nan, 3.0], [4.0, 5.0, 6.0]])
     trials = Trials([0.0, 1.0], x, sample_times=[0.0, 0.5, 2.0])
@@ -63,7 +103,7 @@ def test_measurements_order_channels_before_times():
         (
             ([1.0, 2.0], [1.0, np.nan]),
             {"role": ["fit", "held out"]},
-            r"expected measurements in the held-out trials; got NaN in trials \[1\]",
+            r"expected measurements in the held-out trials; got NaN in trial 1;",
         ),
         (
             ([1.0, 2.0], np.ones((2, 3))),

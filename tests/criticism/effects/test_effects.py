@@ -203,7 +203,7 @@ def test_a_clock_offset_reads_the_trajectory_elsewhere():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hook": "sensor"}, "expected a hook of action, parameter"),
+        ({"hook": "sensor"}, "expected a hook of action, input, parameter"),
         ({"scope": "row"}, "expected scope 'campaign' or 'trial'"),
         ({"null": torch.zeros(3)}, r"expected a null of shape \(1,\)"),
     ],

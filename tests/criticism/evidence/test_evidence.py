@@ -187,10 +187,13 @@ def test_a_curved_ridge_has_the_right_evidence():
 
 
 def test_the_order_of_a_few_trials_is_no_structure():
-    def order(num):
+    def order(num, kind="known"):
         line = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.5))
         prior = BoxUniform(-torch.ones(1), torch.ones(1))
-        return RivalSet(line, prior, Trials(ACTION[:num], X[:num]), []).scaled_order()
+        return RivalSet(
+            line, prior, Trials(ACTION[:num], X[:num], order=kind), []
+        ).scaled_order()
 
     assert order(4) is None
+    assert order(5, "unknown") is None
     np.testing.assert_allclose(order(5), [0, 0.25, 0.5, 0.75, 1])

@@ -1,5 +1,7 @@
 """What the figures of a report draw, number by number."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -67,6 +69,15 @@ def test_the_band_is_two_deviations_and_all_points_are_in_view(size, scale):
         assert low == -high
         largest = np.abs(made.refitted).max()
         assert largest < high < 2 * max(largest, 3.5)
+
+
+def test_trials_have_their_names_at_the_axis():
+    names = tuple(f"drop {letter}" for letter in "abcdefgh")
+    _, trial, _ = plot_residuals(replace(residuals(), names=names)).axes
+    assert tuple(t.get_text() for t in trial.get_xticklabels()) == names
+    numbers = replace(residuals(), names=tuple("01234567"))
+    _, trial, _ = plot_residuals(numbers).axes
+    assert len(trial.get_xticks()) != len(names)
 
 
 def test_labels_are_those_of_actions_and_channels():

@@ -8,6 +8,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
+from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Trials, joint_prior
 from sbi_active.criticism.report import find_warnings, with_error
 from sbi_active.criticism.results import SevereTest
@@ -123,6 +124,62 @@ def test_numbers_have_the_digits_that_their_deviation_leaves():
     assert with_error(3.2e-7, 1e-8) == "3.2e-07 +- 1e-08"
     assert with_error(2.0, 0.0) == "2 +- 0"
     assert with_error(np.nan, np.nan) == ""
+
+
+def test_a_mean_has_six_digits_at_most():
+    assert with_error(159.873313255026034, 2.8e-14) == "159.873 +- 2.8e-14"
+    assert with_error(-0.00123456789, 1e-12) == "-0.00123457 +- 1e-12"
+    assert with_error(0.123456, 0.0000071) == "0.123456 +- 7.1e-06"
+    assert with_error(123456.4, 0.3) == "123456 +- 0.3"
+    assert with_error(0.0, 1e-3) == "0.0000 +- 0.0010"
+
+
+def test_residuals_stand_beside_the_sensor_s_error_in_the_unit_of_x():
+    noise = AutocorrelatedNoise(0.1, 1.0, measurement_sd=0.06)
+    model = SimulatorModel(lambda theta, action: theta, noise=noise)
+    before, after = residuals(size=2.0), residuals(size=0.5)
+    rms = [float(np.sqrt(((r.x - r.mean) ** 2).mean())) for r in (before, after)]
+    x, times = torch.randn(8, 6), torch.arange(6.0)
+    action, labels = trials().action, ["voltage [V]"]
+    named = Trials(action, x, sample_times=times, channel_labels=labels)
+    text = flat(
+        report(
+            trials=named,
+            simulator=model,
+            residuals=before,
+            residuals_after=after,
+        )
+    )
+    assert (
+        f"What is left, root mean square: {rms[0]:.2g} V with the bare model, "
+        f"{rms[0] / 0.06:.2g} times the sensor's 0.06 V, {rms[1]:.2g} V with drag, "
+        f"{rms[1] / 0.06:.2g} times."
+    ) in text
+    assert "What is left" not in flat(report())
+
+
+def test_residuals_of_channels_have_their_own_units():
+    noise = AutocorrelatedNoise(0.1, 1.0, measurement_sd=[0.1, 20.0])
+    model = SimulatorModel(lambda theta, action: theta, noise=noise)
+    made = residuals((10, 2), times=np.linspace(0, 1, 10))
+    scaled = replace(made, x=made.x * [1, 100], mean=made.mean * [1, 100])
+    rms = np.sqrt(((scaled.x - scaled.mean) ** 2).mean((0, 1)))
+    x, labels = torch.randn(8, 10, 2), ["angle [rad]", "force [N]"]
+    named = Trials(trials().action, x, channel_labels=labels)
+    text = flat(
+        report(
+            trials=named,
+            simulator=model,
+            residuals=scaled,
+            residuals_after=None,
+            tracing=tracing("none"),
+        )
+    )
+    assert (
+        f"root mean square: angle: {rms[0]:.2g} rad with the bare model, "
+        f"{rms[0] / 0.1:.2g} times the sensor's 0.1 rad; force: {rms[1]:.2g} N with "
+        f"the bare model, {rms[1] / 20:.2g} times the sensor's 20 N."
+    ) in text
 
 
 def test_tables_stand_in_columns():

@@ -12,6 +12,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Report, Trials, close_loop
+from sbi_active.criticism.data.trials import Order
 
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
@@ -62,6 +63,14 @@ def bias(sd: float = 1.0) -> Effect:
 
 
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
+DRIFT = Effect(
+    "drift",
+    hook="observation",
+    prior=normal(0.1),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi * context.index[:, None],
+    needs_order=True,
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,7 @@ class World:
     scatter: float = 1.0
     num: int = 10
     in_order: bool = False
+    order: Order = "known"
     repeats: int = 0
     effects: tuple[Effect, ...] = (bias(), CUBIC)
     designed: bool = False
@@ -91,7 +101,7 @@ class World:
         return close_loop(
             SimulatorModel(self.fn, noise=declared),
             PRIOR,
-            Trials(action, x),
+            Trials(action, x, order=self.order),
             effects=self.effects,
             evaluate=False,
             designed=self.designed,
@@ -177,6 +187,10 @@ CASES: dict[str, tuple[Callable[[], Report], Callable[[], Report]]] = {
     "drift aliased with the order of actions": (
         replace(usual, in_order=True).report,
         usual.report,
+    ),
+    "the order of the trials is unknown": (
+        replace(usual, order="unknown", effects=(bias(), DRIFT)).report,
+        replace(usual, effects=(bias(), DRIFT)).report,
     ),
     "phi at its prior's edge (bias)": (
         replace(
@@ -273,6 +287,15 @@ def test_the_usual_case_has_no_warnings():
     report = the_usual_report()
     assert report.verdict == "bias"
     assert report.warnings == ()
+
+
+def test_trials_of_unknown_order_drift_nowhere():
+    sorted_records = replace(usual, in_order=True, effects=(bias(), DRIFT, CUBIC))
+    report = replace(sorted_records, order="unknown").report()
+    assert not any("drift aliased" in w for w in report.warnings)
+    assert {"bias", "cubic"} <= {*report.probabilities}
+    assert "drift" not in report.probabilities
+    assert "drift" in sorted_records.report().probabilities
 
 
 def test_the_verdict_line_says_where_it_is_not_robust():

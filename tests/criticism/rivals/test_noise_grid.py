@@ -19,6 +19,7 @@ from sbi_active.criticism.rivals.noise_grid import (
     INDEPENDENT,
     NUM_DRAWS,
     declared_noise,
+    measurement_sds,
     scattered,
 )
 
@@ -133,6 +134,33 @@ def test_unknown_size_and_correlation_are_summed_on_their_grid():
     each = [correlated(m, sd, tau) for sd in sds for tau in times]
     expected = np.logaddexp.reduce(each) - np.log(len(each))
     assert grid.log_likelihood(m.x[None])[0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_errors_that_are_known_by_channel_have_their_units_along_a_trajectory():
+    gen = torch.Generator().manual_seed(0)
+    unit = torch.tensor([1.0, 500.0]).double()
+    x = torch.randn(2, 5, 2, generator=gen).double() * unit
+    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
+    noise = AutocorrelatedNoise(0.7 * unit, 0.4, measurement_sd=0.1 * unit)
+    expected = 0.0
+    cov = 0.49 * np.exp(-np.abs(TIMES[:, None] - TIMES) / 0.4)
+    for series in (x / unit).permute(0, 2, 1).reshape(4, 5):
+        expected += multivariate_normal(np.zeros(5), cov).logpdf(series)
+    expected -= 10 * np.log(unit).sum()
+    got = declared_noise(noise, m).log_likelihood(m.x[None])[0]
+    assert got == pytest.approx(float(expected), rel=1e-9)
+    np.testing.assert_allclose(measurement_sds(noise, m), 0.1 * unit.numpy()[m.channel])
+    assert measurement_sds(GaussianNoise(1.0), m) is None
+    assert measurement_sds(AutocorrelatedNoise(1.0, 0.4, measurement_sd=0.2), m) == 0.2
+
+
+def test_sizes_that_are_unknown_by_channel_are_refused():
+    m = Measurements.of(Trials([0.0], torch.zeros(1, 5, 2), sample_times=TIMES))
+    noise = AutocorrelatedNoise.unknown(
+        sd=[(0.1, 3.0), (1.0, 30.0)], correlation_time=(0.05, 2.0)
+    )
+    with pytest.raises(ValueError, match="got bounds of 2; pass AutocorrelatedNoise"):
+        declared_noise(noise, m)
 
 
 def test_scatter_is_a_half_normal_inflation():

@@ -1,3 +1,5 @@
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -224,6 +226,52 @@ def test_any_posterior_is_averaged_over_fixed_draws(kind):
 def test_errors(make, text):
     with pytest.raises(ValueError, match=text):
         make()
+
+
+def test_sizes_that_are_unknown_by_channel_are_summed_channel_by_channel():
+    bounds = [(0.1, 1.0), (20.0, 400.0)]
+    noise = AutocorrelatedNoise.unknown(
+        sd=bounds, correlation_time=(0.05, 2.0), num_sds=7, num_times=3
+    )
+    assert noise.parameter_names == ("sd_1", "sd_2", "correlation_time")
+    gen = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 5, 2, generator=gen).double() * torch.tensor([0.4, 90.0])
+    x[1, 2, 1] = torch.nan
+    nodes = [
+        low * (high / low) ** ((np.arange(num) + 0.5) / num)
+        for (low, high), num in zip([*bounds, (0.05, 2.0)], (7, 7, 3), strict=True)
+    ]
+    for row in x:
+        terms = []
+        for tau in nodes[2]:
+            each = []
+            for c in range(2):
+                y = row[:, c].numpy()
+                seen = ~np.isnan(y)
+                laws = [
+                    stats.multivariate_normal(
+                        np.zeros(seen.sum()), covariance(TIMES[seen], tau, sd)
+                    )
+                    for sd in nodes[c]
+                ]
+                each.append(np.logaddexp.reduce([law.logpdf(y[seen]) for law in laws]))
+            terms.append(sum(each) - 2 * np.log(7) - np.log(3))
+        expected = np.logaddexp.reduce(terms)
+        got = noise.log_prob(row[None], torch.zeros(5, 2), times=TIMES)
+        assert got.item() == pytest.approx(expected, rel=1e-9)
+    draws = noise.posterior.sample((200,))
+    for column, (low, high) in zip(draws.T, bounds, strict=False):
+        assert low <= column.min() < 2 * low < high / 2 < column.max() <= high
+
+
+def test_the_sensor_s_error_is_one_number_or_one_a_channel():
+    make = functools.partial(AutocorrelatedNoise, SD, 0.7)
+    assert make(measurement_sd=0.1).measurement_sd == 0.1
+    assert make(measurement_sd=[0.1, 3.0]).measurement_sd.tolist() == [0.1, 3.0]
+    assert make(measurement_sd=torch.tensor([0.5])).measurement_sd == 0.5
+    for wrong in ([0.1, 0.0], [0.1, np.inf], -1.0):
+        with pytest.raises(ValueError, match="expected measurement_sd > 0; got"):
+            make(measurement_sd=wrong)
 
 
 def test_repr_names_the_parameters():

@@ -1,0 +1,308 @@
+"""Inputs over time, as recorders give them, on one uniform grid for all trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.criticism.data.arrays import padded
+
+Array = NDArray[Any]
+Hold = Literal["previous", "linear"]
+
+#: Median steps from which a step is a gap.
+GAP = 5.0
+#: Share of a trial's inputs by which its x may be measured before or after them.
+FAR = 0.1
+#: Relative difference of steps that are the same.
+SAME = 1e-6
+#: Share of a step by which a time may be off and count as that of a grid point.
+ON_TIME = 1e-3
+#: Grid points per sample of the longest trial, at most: beyond, clocks disagree.
+MOST = 20
+
+
+def inputs_of(
+    inputs: Any,
+    times: Any,
+    x: Tensor,
+    x_times: Tensor | None,
+    *,
+    hold: Hold = "previous",
+) -> tuple[dict[str, Tensor] | None, Tensor | None]:
+    """Return the inputs of trials by name, shape (t, m), and their grid, shape (m,).
+
+    Args:
+        inputs: As in :func:`named_series`; None for none.
+        times: As in :func:`on_one_grid`; None takes those of x where there are as many.
+        x: What was measured, shape (t, k, ...).
+        x_times: Its times, shape (k,) or (t, k).
+        hold: As in :func:`on_one_grid`.
+
+    Raises:
+        ValueError: As those raise, and :func:`require_covered`.
+    """
+    if inputs is None:
+        if times is not None:
+            raise ValueError("expected inputs with input_times; got none; pass inputs=")
+        return None, None
+    series = named_series(inputs, len(x))
+    length = next(iter(series.values())).shape[1]
+    if times is None:
+        if x_times is None or x_times.shape[-1] != length:
+            raise ValueError(
+                f"expected input_times, the time of each of {length} values of the "
+                "inputs; got none; pass them, in seconds from the origin of "
+                "sample_times"
+            )
+        times = x_times
+    grid = on_one_grid(series, times, hold=hold)
+    if x_times is not None:
+        has_x = x.isfinite().reshape(*x.shape[:2], -1).any(-1)
+        stamps = x_times.expand(has_x.shape).where(has_x, torch.nan)
+        require_covered(stamps, series, times)
+    return grid
+
+
+def named_series(inputs: Any, num: int) -> dict[str, Tensor]:
+    r"""Return inputs by name, each of shape (num, m), shorter ones padded with NaN.
+
+    Args:
+        inputs: {name: series}, each of shape (num, m), (m,) for one that all trials
+            share, or a list of num arrays; without a name (num, m), (m,), (num, m, c)
+            or a list, called "input", or "input 1" to "input c".
+        num: Number of trials.
+
+    Raises:
+        ValueError: If shapes disagree or a number is infinite.
+    """
+    if isinstance(inputs, Mapping):
+        if not inputs or not all(isinstance(name, str) for name in inputs):
+            raise ValueError(
+                f"expected inputs as {{name: series}}; got {[*inputs]}; name each input"
+            )
+        return {name: _series(name, value, num) for name, value in inputs.items()}
+    value = padded(inputs)
+    if value.ndim == 3 and value.shape[-1] > 1:
+        return {
+            f"input {j + 1}": _series(f"input {j + 1}", part, num)
+            for j, part in enumerate(value.unbind(-1))
+        }
+    return {"input": _series("input", value[..., 0] if value.ndim == 3 else value, num)}
+
+
+def on_one_grid(
+    series: Mapping[str, Tensor],
+    times: Any,
+    *,
+    hold: Hold = "previous",
+    names: Sequence[str] | None = None,
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Return series on one uniform grid, and the grid.
+
+    Its step is the smallest median step of a trial, and it reaches from the earliest to
+    the latest time. What is on one uniform grid already stays as it is. Beyond a
+    trial's end its last value is held, before its begin its first.
+
+    Args:
+        series: By name, shape (t, m), NaN after the last value of a trial.
+        times: Of the values, shape (m,), (t, m), or a list of t.
+        hold: "previous" holds each value until the next one, as a command is held;
+            "linear" draws lines between them.
+        names: What messages call the trials; None counts from 0.
+
+    Raises:
+        ValueError: If times and values differ in number, a value is missing, times do
+            not increase, or leave a gap.
+    """
+    if hold not in get_args(Hold):
+        raise ValueError(
+            f"expected input_hold 'previous' or 'linear'; got {hold!r}; choose one"
+        )
+    num = len(next(iter(series.values())))
+    stamps = padded(times)
+    if stamps.ndim == 1:
+        stamps = stamps.expand(num, -1)
+    for name, value in series.items():
+        if value.shape != stamps.shape:
+            raise ValueError(
+                f"expected input_times of shape ({value.shape[1]},) or "
+                f"{tuple(value.shape)} for input {name!r}; got "
+                f"{tuple(padded(times).shape)}; give one time a value"
+            )
+    trials = [str(i) for i in range(num)] if names is None else names
+    lengths = _lengths(series, stamps, trials)
+    grid = _grid(stamps, lengths)
+    if grid is None:
+        return {name: value.clone() for name, value in series.items()}, stamps[
+            0
+        ].clone()
+    found = {
+        name: torch.stack(
+            [
+                torch.from_numpy(_at(grid, t[:k].numpy(), u[:k].numpy(), hold))
+                for t, u, k in zip(stamps, value, lengths[name], strict=True)
+            ]
+        )
+        for name, value in series.items()
+    }
+    return found, torch.from_numpy(grid)
+
+
+def held_at(
+    series: Mapping[str, Tensor], own: Tensor, times: Tensor
+) -> dict[str, Tensor]:
+    """Return series, each held until its next value, at the times of another grid.
+
+    Args:
+        series: By name, shape (t, m).
+        own: Their grid, shape (m,).
+        times: The other, shape (n,).
+    """
+    slack = ON_TIME * (own[1] - own[0])
+    place = torch.searchsorted(own, times + slack, right=True) - 1
+    place = place.clamp(0, len(own) - 1)
+    return {name: value[:, place] for name, value in series.items()}
+
+
+def require_covered(
+    x_times: Tensor,
+    series: Mapping[str, Tensor],
+    times: Any,
+    names: Sequence[str] | None = None,
+) -> None:
+    """Raise where x was measured long before or after the inputs of its trial.
+
+    Args:
+        x_times: Of what was measured, shape (t, k), NaN for none.
+        series: As in :func:`on_one_grid`.
+        times: As there.
+        names: As there.
+    """
+    stamps = padded(times)
+    stamps = stamps.expand(len(x_times), -1) if stamps.ndim == 1 else stamps
+    for i, own in enumerate(x_times):
+        known = stamps[i][stamps[i].isfinite()]
+        first, last = float(known.min()), float(known.max())
+        step = float(known.diff().median()) if len(known) > 1 else 0.0
+        slack = max(GAP * step, FAR * (last - first))
+        own = own[own.isfinite()]
+        far = own[(own < first - slack) | (own > last + slack)]
+        if len(far):
+            which = str(i) if names is None else names[i]
+            raise ValueError(
+                f"expected x of trial {which} measured within the time of its inputs "
+                f"{', '.join(series)}, {first:g} to {last:g}; got x at {far[0]:g}; "
+                "give both in one unit and from one origin, or leave out the samples "
+                "beyond"
+            )
+
+
+def _series(name: str, value: Any, num: int) -> Tensor:
+    found = padded(value)
+    if found.ndim == 3 and found.shape[-1] == 1:
+        found = found[..., 0]
+    if found.ndim == 1 and len(found) > 1:
+        found = found.expand(num, -1).clone()
+    if found.ndim != 2 or len(found) != num or found.shape[1] < 2:
+        raise ValueError(
+            f"expected input {name!r} of shape ({num}, m), one series of two or more "
+            f"values a trial, (m,) for one that all share, or a list of {num}; got "
+            f"{tuple(found.shape)}; pass what does not vary in time as the action"
+        )
+    if bool(found.isinf().any()):
+        i, k = found.isinf().nonzero()[0].tolist()
+        raise ValueError(
+            f"expected finite values of input {name!r}; got inf in trial {i}, value "
+            f"{k}; correct it"
+        )
+    return found
+
+
+def _lengths(
+    series: Mapping[str, Tensor], stamps: Tensor, trials: Sequence[str]
+) -> dict[str, list[int]]:
+    """Return how many values each trial has, or raise where they are no series."""
+    found: dict[str, list[int]] = {name: [] for name in series}
+    for i, own in enumerate(stamps):
+        in_trial = f"trial {trials[i]}"
+        known = own.isfinite()
+        length = int(known.sum())
+        if not bool(known[:length].all()):
+            k = int((~known).nonzero()[0])
+            raise ValueError(
+                f"expected finite input_times; got {float(own[k])} in {in_trial}, "
+                f"value {k}; give the time of each value"
+            )
+        steps = own[:length].diff()
+        if bool((steps <= 0).any()):
+            k = int((steps <= 0).nonzero()[0])
+            raise ValueError(
+                f"expected input_times that increase; got {float(own[k + 1]):g} after "
+                f"{float(own[k]):g} in {in_trial}, value {k + 1}; sort the values by "
+                "time, and give each trial its own times"
+            )
+        middle = float(steps.median()) if len(steps) else 0.0
+        if bool((steps > GAP * middle).any()):
+            k = int((steps > GAP * middle).nonzero()[0])
+            raise ValueError(
+                f"expected inputs without gaps; got none from {float(own[k]):g} to "
+                f"{float(own[k + 1]):g} in {in_trial}, where the median step is "
+                f"{middle:g}; fill in what was commanded there, or split the trial"
+            )
+        for name, value in series.items():
+            has = value[i].isfinite()
+            last = int(has.nonzero().max()) + 1 if bool(has.any()) else 0
+            if last < 2 or not bool(has[:last].all()):
+                k = 0 if last < 2 else int((~has[:last]).nonzero()[0])
+                raise ValueError(
+                    f"expected a value of input {name!r} at each time; got NaN in "
+                    f"{in_trial}, value {k}; fill it in, or leave the trial out"
+                )
+            if last > length:
+                raise ValueError(
+                    f"expected as many input_times as values; got {length} for {last} "
+                    f"of input {name!r} in {in_trial}; give one time a value"
+                )
+            found[name].append(last)
+    return found
+
+
+def _grid(stamps: Tensor, lengths: Mapping[str, list[int]]) -> Array | None:
+    """Return the grid, None where all are on one that is uniform already."""
+    first = stamps[0]
+    whole = all(k == stamps.shape[1] for each in lengths.values() for k in each)
+    if whole and bool((stamps == first).all()):
+        steps = first.diff()
+        if bool(((steps - steps.mean()).abs() <= SAME * steps.mean()).all()):
+            return None
+    known = [own[own.isfinite()].numpy() for own in stamps]
+    step = min(float(np.median(np.diff(own))) for own in known)
+    low, high = min(own[0] for own in known), max(own[-1] for own in known)
+    num = round((high - low) / step)
+    longest = max(len(own) for own in known)
+    if num > MOST * longest:
+        raise ValueError(
+            f"expected trials whose inputs are at similar times; got {low:g} to "
+            f"{high:g}, {num} steps of {step:g} for at most {longest} values a trial; "
+            "give each trial's times, those of x too, from its own begin, and all in "
+            "one unit"
+        )
+    # Where the last time is between two steps, the grid goes up to the next.
+    num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
+    return low + step * np.arange(num + 1)
+
+
+def _at(grid: Array, times: Array, values: Array, hold: Hold) -> Array:
+    """Return a series at the grid's times."""
+    if hold == "linear":
+        return np.interp(grid, times, values)
+    # A time that rounding puts just after a grid point is that point's.
+    slack = ON_TIME * (grid[1] - grid[0])
+    place = np.searchsorted(times, grid + slack, side="right") - 1
+    return values[np.clip(place, 0, len(values) - 1)]

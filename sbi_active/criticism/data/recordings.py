@@ -1,0 +1,129 @@
+"""A folder of recordings as one table: a file a trial, or tables of several trials."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from sbi_active.criticism.data.table import TrialTable, read_table
+from sbi_active.criticism.data.table_columns import TIME, TRIAL
+from sbi_active.criticism.data.table_rows import read_csv
+
+#: The one table of a folder, where there is such; others are then not trials.
+TABLE = "trials.csv"
+
+Told = Mapping[str, str | Sequence[str]]
+
+
+def read_trials(
+    path: str | Path,
+    *,
+    columns: Told | None = None,
+    units: Mapping[str, str] | None = None,
+    inputs: str | Path | pd.DataFrame | None = None,
+) -> TrialTable:
+    """Read trials from a CSV file, or from the recordings in a folder.
+
+    A folder's trials are those of its ``trials.csv``, or else of all its files
+    ``*.csv``, by name with numbers in their order. A file with times and without a
+    column "trial" is one trial, called as the file; trials in another file with times
+    have its name in front; where a row is a trial, rows go on from file to file.
+
+    Args:
+        path: Of the file or folder.
+        columns: As in :func:`.find_columns`.
+        units: As there.
+        inputs: As :func:`.read_table` takes them.
+
+    Raises:
+        ValueError: As :func:`.read_table` raises; if there is no file in the folder, or
+            files have different columns.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return read_table(path, columns=columns, units=units, inputs=inputs)
+    paths = find_recordings(path)
+    if paths[0].name == TABLE:
+        return read_table(paths[0], columns=columns, units=units, inputs=inputs)
+    frames, told = [], columns
+    for file in paths:
+        frame = read_csv(file)
+        _require_same_columns(frame, file, frames, paths[0])
+        frame, told = _named(frame, file.stem, columns)
+        if inputs is None:  # by itself, so that what is wrong is said with the file
+            read_table(frame, columns=told, units=units, source=str(file))
+        frames.append(frame)
+    joined = pd.concat(frames, ignore_index=True)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".* hold no number")  # said before
+        return read_table(
+            joined, columns=told, units=units, inputs=inputs, source=str(path)
+        )
+
+
+def find_recordings(folder: Path) -> list[Path]:
+    """Return the tables of a folder.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if (folder / TABLE).is_file():
+        return [folder / TABLE]
+    found = sorted(folder.glob("*.csv"), key=lambda path: _natural(path.name))
+    if not found:
+        raise ValueError(
+            f"expected recordings in {folder}; got no {TABLE} and no other *.csv; "
+            "write one table of all trials, or one a trial"
+        )
+    return found
+
+
+def _require_same_columns(
+    frame: pd.DataFrame, file: Path, frames: Sequence[pd.DataFrame], first: Path
+) -> None:
+    if not frames:
+        return
+    header = [name for name in frames[0].columns if name != TRIAL]
+    own = [name for name in frame.columns if name != TRIAL]
+    if sorted(own) != sorted(header):
+        raise ValueError(
+            f"expected the same columns in each recording; got {', '.join(header)} in "
+            f"{first} and {', '.join(own)} in {file}; rename or convert them, or write "
+            f"one table {TABLE} of all trials"
+        )
+
+
+def _named(
+    frame: pd.DataFrame, file: str, columns: Told | None
+) -> tuple[pd.DataFrame, Told | None]:
+    """Return the table of a file with the file in its trials' names.
+
+    And which columns are what, where that was told.
+    """
+    if columns is None:
+        bare = [re.sub(r"\s*\[.*\]\s*$", "", name) for name in frame.columns]
+        is_long = any(re.fullmatch(rf"{TIME}(_[a-z]+)?", name) for name in bare)
+        parts = [TRIAL] if TRIAL in bare else []
+    else:
+        is_long = TIME in columns
+        told = columns.get(TRIAL, ())
+        parts = [told] if isinstance(told, str) else [*told]
+        parts = [name for name in parts if name in frame.columns]
+    if not is_long:
+        return frame, columns
+    words = [frame[name].astype(str).str.strip() for name in parts]
+    name = pd.Series(file, index=frame.index)
+    for word in words:
+        name = name + " " + word
+    frame = frame.drop(columns=parts).assign(**{TRIAL: name})
+    return frame, None if columns is None else {**columns, TRIAL: TRIAL}
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return a key by which run_2 comes before run_10."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]

@@ -1,0 +1,137 @@
+"""Inputs over time in a table: beside x in its rows, or in a table of their own."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.input_series import FAR, GAP
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputRows:
+    """The rows of a table that hold inputs.
+
+    Attributes:
+        names: Of the inputs, each with its label.
+        values: Shape (n, c), NaN where a cell is empty.
+        time: In s, shape (n,).
+        members: Rows of each trial.
+        trials: Their names; one empty name where all share the series.
+        place: Returns what a message calls a row.
+        source: What it calls the table.
+    """
+
+    names: dict[str, str]
+    values: Array
+    time: Array
+    members: Sequence[Array]
+    trials: Sequence[str]
+    place: Callable[[Any], str]
+    source: str
+
+    def arguments(self) -> dict[str, Any]:
+        """Return them as arguments of ``Trials``.
+
+        Raises:
+            ValueError: If a row has some inputs and not all, a trial has fewer than two
+                rows of inputs, or its inputs have a gap.
+        """
+        has = np.isfinite(self.values)
+        for i in np.flatnonzero(has.any(1) & ~has.all(1)):
+            missing = [*self.names][int(np.flatnonzero(~has[i])[0])]
+            raise ValueError(
+                f"expected all inputs in a row, or none; got an empty cell of input "
+                f"{missing}, {self.place(i)} of {self.source}; fill it in"
+            )
+        whole: Array = np.asarray(has.all(1))
+        rows = [at[whole[at]] for at in self.members]
+        for name, at in zip(self.trials, rows, strict=True):
+            self._require_dense(name, at)
+        return {
+            "inputs": {
+                name: [self.values[at, j] for at in rows]
+                for j, name in enumerate(self.names)
+            },
+            "input_times": [self.time[at] for at in rows],
+            "input_labels": [*self.names.values()],
+        }
+
+    def note_empty(self, measured: Array) -> None:
+        """Warn of rows with a measurement in which no input stands.
+
+        Args:
+            measured: Which rows have one, shape (n,), bool.
+        """
+        lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
+        if len(lost):
+            warnings.warn(
+                f"{len(lost)} rows of {self.source} have a measurement and no input, "
+                f"the first in {self.place(lost[0])}; there the input before holds",
+                stacklevel=6,
+            )
+
+    def of(self, trials: Sequence[str]) -> InputRows:
+        """Return the rows of some trials, in their order.
+
+        Raises:
+            ValueError: If one of them has none.
+        """
+        place = {name: i for i, name in enumerate(self.trials)}
+        if [*place] == [""]:
+            place = dict.fromkeys(trials, 0)
+        for name in trials:
+            if name not in place:
+                raise ValueError(
+                    f"expected inputs of each trial; got none of trial {name} in "
+                    f"{self.source}, whose trials are {', '.join(self.trials)}; add "
+                    "its rows, or leave the trial out"
+                )
+        members = [self.members[place[name]] for name in trials]
+        return replace(self, members=members, trials=[*trials])
+
+    def require_covered(self, row: Array, time: Array, place: Any, source: str) -> None:
+        """Raise where x was measured long before or after the inputs of its trial.
+
+        Args:
+            row: Number of the trial in each row of x, shape (k,).
+            time: Of x in s, shape (k,).
+            place: Returns what a message calls a row of x.
+            source: What it calls the table of x.
+        """
+        for t, at in enumerate(self.members):
+            own = self.time[at]
+            first, last = own.min(), own.max()
+            slack = max(GAP * float(np.median(np.diff(own))), FAR * (last - first))
+            far = (time < first - slack) | (time > last + slack)
+            for i in np.flatnonzero((row == t) & far):
+                raise ValueError(
+                    f"expected x within the time of its inputs, {first:g} to {last:g} "
+                    f"s in {self.source}; got x at {time[i]:g} s in {place(i)} of "
+                    f"{source}; give both times from one origin, with their units as "
+                    "in time_ms, or remove what is beyond"
+                )
+
+    def _require_dense(self, name: str, at: Array) -> None:
+        in_trial = f" of trial {name}" if name else ""
+        if len(at) < 2:
+            raise ValueError(
+                f"expected two or more rows of inputs{in_trial}; got {len(at)} in "
+                f"{self.source}; give what does not vary in time as action_*"
+            )
+        steps = np.diff(self.time[at])
+        for k in np.flatnonzero(steps > GAP * np.median(steps)):
+            raise ValueError(
+                f"expected inputs without gaps; got none from {self.time[at[k]]:g} to "
+                f"{self.time[at[k + 1]]:g} s between {self.place(at[k])} and "
+                f"{self.place(at[k + 1])} of {self.source}, where the median step is "
+                f"{np.median(steps):g} s; fill in what was commanded there, or split "
+                "the trial"
+            )

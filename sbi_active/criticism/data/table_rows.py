@@ -1,0 +1,211 @@
+"""The cells of a table, by trial, and what messages call their places."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.table_columns import PREFIXES, Columns
+from sbi_active.criticism.data.table_inputs import InputRows
+
+Array = NDArray[Any]
+
+EMPTY = ("", "nan", "none", "na", "<na>")
+
+
+def read_frame(table: str | Path | pd.DataFrame, name: str) -> tuple[pd.DataFrame, str]:
+    """Return a table with clean names of its columns, and what messages call it."""
+    is_frame = isinstance(table, pd.DataFrame)
+    frame = table if is_frame else read_csv(Path(table))
+    frame = frame.set_axis([str(c).strip() for c in frame.columns], axis=1)
+    return frame, name if is_frame else str(table)
+
+
+class Rows:
+    """The rows of a table; where a row is a trial, each is a trial of one sample.
+
+    Args:
+        frame: The table.
+        columns: What its columns are.
+        source: What messages call it.
+
+    Attributes:
+        code: Number of each row's trial, shape (n,).
+        names: Of the trials.
+        members: Rows of each trial.
+        first: The first row of each.
+    """
+
+    def __init__(self, frame: pd.DataFrame, columns: Columns, source: str) -> None:
+        self.frame, self.columns, self.source = frame, columns, source
+        parts = [self.words(column) for column in columns.trial]
+        for column, part in zip(columns.trial, parts, strict=True):
+            for i in np.flatnonzero(part == ""):
+                raise ValueError(
+                    f"expected the name of a trial in column {column}, row {i + 1}; "
+                    f"got an empty cell in {source}; fill it in"
+                )
+        labels = [" ".join(words) for words in zip(*parts, strict=True)]
+        if not columns.trial:
+            is_row = columns.time is None  # else all rows are one series
+            labels = [str(i + 1) if is_row else "" for i in range(len(frame))]
+        self.code, names = pd.factorize(np.array(labels, dtype=object))
+        self.names: list[str] = [*names]
+        num = len(names)
+        self.members = [np.flatnonzero(self.code == t) for t in range(num)]
+        self.first = np.array([at[0] for at in self.members])
+
+    def time(self) -> Array:
+        """Return the time of each row in s, in order within a trial; 0 without one."""
+        if self.columns.time is None:
+            return np.zeros(len(self.frame))
+        time = self.numbers(self.columns.time) * self.columns.seconds
+        self._require_order(time, self.columns.time)
+        return time
+
+    def inputs(self, time: Array) -> InputRows:
+        """Return the rows of inputs.
+
+        Args:
+            time: Of each row.
+        """
+        columns = self.columns
+        return InputRows(
+            names={columns.short(c): columns.label(c) for c in columns.input},
+            values=np.stack([self.numbers(c, empty=True) for c in columns.input], 1),
+            time=time,
+            members=self.members,
+            trials=self.names,
+            place=self.place,
+            source=self.source,
+        )
+
+    def place(self, i: Any) -> str:
+        """Return what a message calls a row."""
+        trial = f" (trial {self.names[self.code[i]]})" if self.columns.trial else ""
+        return f"row {i + 1}{trial}"
+
+    def words(self, column: str) -> Array:
+        """Return a column as text, shape (n,), "" where it is empty."""
+        cells = self.frame[column]
+        if pd.api.types.is_float_dtype(cells):  # 1.0 and 1 name one trial
+            text = [f"{value:g}" for value in cells]
+        else:
+            text = [str(value).strip() for value in cells]
+        words = ["" if word.lower() in EMPTY else word for word in text]
+        return np.array(words, dtype=object)
+
+    def numbers(self, column: str, *, empty: bool = False) -> Array:
+        """Return a column as numbers, shape (n,), NaN where cells may be empty."""
+        cells = self.frame[column]
+        text = cells.map(lambda cell: str(cell).strip())
+        blank = text.str.lower().isin(EMPTY).to_numpy()
+        is_number = pd.api.types.is_numeric_dtype(cells)
+        parsed: Any = pd.to_numeric(cells if is_number else text, errors="coerce")
+        values = parsed.to_numpy(dtype=float, na_value=np.nan)
+        leave = "leave what was not measured empty"
+        for i in np.flatnonzero(np.isnan(values) & ~blank):
+            raise ValueError(
+                f"expected a number in column {column}, {self.place(i)}; got "
+                f"{text.iloc[i]!r} in {self.source}; "
+                + (_remedy(column, text.iloc[i]) or leave)
+            )
+        for i in np.flatnonzero(np.isinf(values) if empty else ~np.isfinite(values)):
+            raise ValueError(
+                f"expected a finite number in column {column}, {self.place(i)}; got "
+                f"{text.iloc[i] or 'an empty cell'} in {self.source}; "
+                + (leave if empty else "fill it in")
+            )
+        return values
+
+    def constant(self, column: str, values: Array | None = None) -> Array:
+        """Return what each trial has in a column, which must not vary within it."""
+        values = self.numbers(column) if values is None else values
+        own = values[self.first]
+        for i in np.flatnonzero(values != own[self.code]):
+            one = self.first[self.code[i]]
+            raise ValueError(
+                f"expected one value of {column} in each trial; got {values[one]} in "
+                f"row {one + 1} and {values[i]} in {self.place(i)} of {self.source}; "
+                f"{_if_it_varies(column)}"
+            )
+        return own
+
+    def _require_order(self, time: Array, column: str) -> None:
+        """Raise where a sample is there twice, or time runs backward in a trial."""
+        for at, name in zip(self.members, self.names, strict=True):
+            order = at[np.argsort(time[at], kind="stable")]
+            for k in np.flatnonzero(np.diff(time[order]) == 0):
+                both = f", both of trial {name}" if name else ""
+                one, two = sorted(order[k : k + 2] + 1)
+                raise ValueError(
+                    f"expected each sample once; got {column} = {time[order[k]]:g} s "
+                    f"in rows {one} and {two} of {self.source}{both}; "
+                    "remove one, or give each trial its own name"
+                )
+            for k in np.flatnonzero(np.diff(time[at]) < 0):
+                raise ValueError(
+                    "expected times that increase within a trial; got "
+                    f"{time[at[k + 1]]:g} s in {self.place(at[k + 1])} after "
+                    f"{time[at[k]]:g} s in row {at[k] + 1} of {self.source}; sort "
+                    "its rows, or give each trial its own name"
+                )
+
+
+def _if_it_varies(column: str) -> str:
+    """Return what to do about a column that varies within a trial."""
+    if column.startswith(PREFIXES["action"]):
+        name = PREFIXES["input"] + column.removeprefix(PREFIXES["action"])
+        return (
+            f"call it {name} if it is commanded over time, or give each trial its name"
+        )
+    if column.startswith(PREFIXES["start"]):
+        return "give its value at the start in each row, or call it x_*"
+    return (
+        "give each trial its own name, x_* to what is measured over time, and input_* "
+        "to what is commanded"
+    )
+
+
+def _remedy(column: str, text: str) -> str:
+    """Return what to do about a cell that is no number; "" where it says nothing."""
+    if re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?\s*[^\d\s,;].*", text):
+        name = f"{column.split('[')[0]}[unit]"
+        return f"write the unit once, in the header as {name}, with all numbers in it"
+    return "write decimals with a point" if re.fullmatch(r"[-+]?\d+,\d+", text) else ""
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """Return a CSV file as text, its first row as the names of the columns."""
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"expected a CSV file; got none at {path}; check the path"
+        )
+    try:
+        table = pd.read_csv(
+            path,
+            header=None,
+            dtype=str,
+            keep_default_na=False,
+            comment="#",
+            encoding="utf-8-sig",
+        )
+    except pd.errors.EmptyDataError:
+        table = pd.DataFrame([[""]])
+    except pd.errors.ParserError as error:
+        raise ValueError(
+            f"expected a CSV file with as many cells in each row as in the first; got "
+            f"{error} in {path}; check the commas"
+        ) from error
+    header = [str(c).strip() for c in table.iloc[0]]
+    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+        raise ValueError(
+            f"expected cells separated by commas; got {header[0]!r} in {path}; save "
+            "the table with commas"
+        )
+    return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)

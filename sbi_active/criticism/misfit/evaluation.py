@@ -1,0 +1,88 @@
+"""The error before and after on each left-out trial, the choice repeated without it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.misfit.processes import Posterior
+from sbi_active.criticism.misfit.verdict import Misfit
+from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
+from sbi_active.criticism.rivals.error_models import LOG_2PI
+from sbi_active.criticism.steps.evaluation import joined, scores, summary
+from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction
+from sbi_active.seeding import derive_seed
+
+Array = NDArray[Any]
+
+
+def evaluate_linear(misfit: Misfit, trials: Trials) -> Evaluation | None:
+    """Return the error on each trial of models chosen and fitted without it.
+
+    The linearizations are those of all trials; evidence, left-out errors, the choice
+    and the refits are made again without each. None where parts of trials are left out.
+
+    Args:
+        misfit: The models.
+        trials: That were fitted.
+    """
+    errors = misfit.search.errors
+    if not errors.is_by_trial:
+        return None
+    before, after, selected = [], [], []
+    places = np.unique(misfit.rivals.measurements.trial)
+    for fold, place in enumerate(places):
+        one = trials.select([int(place)])
+        key = misfit.selected_without(fold)
+        for kept, model in ((before, ModelKey()), (after, key)):
+            kept.append(scores(_prediction(misfit, model, fold, int(place)), one))
+        selected.append(str(key) if key.effects else UNEXPLAINED)
+    names = tuple(trials.names[int(i)] for i in places)
+    return summary(
+        "leave one out", places, joined(before), joined(after), (*selected,), names
+    )
+
+
+def _prediction(misfit: Misfit, key: ModelKey, fold: int, place: int) -> Prediction:
+    """Return what a model that was fitted without a trial predicts of it."""
+    search, m = misfit.search, misfit.rivals.measurements
+    candidate, errors = search.found[key], search.errors
+    use = np.arange(errors.num_folds) != fold
+    posterior = errors.posterior(candidate.model, candidate.grams, use)
+    seed = derive_seed(misfit.rivals.seed, "left out", str(key), fold)
+    rng = np.random.default_rng(seed)
+    at = np.flatnonzero(errors.fold == fold)
+    rows, unit = candidate.model.rows[at], search.unit[at]
+    values, vectors = np.linalg.eigh(posterior.cov)
+    root = vectors * np.sqrt(np.clip(values, 0, None))
+    u = posterior.mean + rng.normal(size=(NUM_DRAWS, len(root))) @ root.T
+    u = np.clip(u, candidate.model.low, candidate.model.high)
+    residual = rows[:, 0] - u @ rows[:, 1:].T
+    factor = _factor(m.time[at], m.channel[at], posterior)
+    error = rng.normal(size=residual.shape) @ factor.T
+    white = np.linalg.solve(factor, residual.T)
+    density = -0.5 * (white**2).sum(0) - np.log(np.diag(factor) * unit).sum()
+    mean = m.x[at] - unit * residual
+    size = int(np.prod(m.shape[1:]))
+    valid = np.ones((NUM_DRAWS, 1))
+    return Prediction(
+        mean,
+        np.broadcast_to(unit * np.sqrt((factor**2).sum(1)), mean.shape),
+        mean + unit * error,
+        (density - 0.5 * len(at) * LOG_2PI)[:, None],
+        np.zeros(len(at), dtype=np.int64),
+        m.position[at] - place * size,
+        valid > 0,
+        valid,
+    )
+
+
+def _factor(time: Array, channel: Array, posterior: Posterior) -> Array:
+    """Return a Cholesky factor of the sensor's error and the process beside it."""
+    apart = np.abs(time[:, None] - time) / posterior.time_scale
+    process = np.exp(-apart) * (channel[:, None] == channel)
+    cov = np.eye(len(time)) + posterior.size**2 * process
+    return np.linalg.cholesky(cov)

@@ -1,0 +1,122 @@
+r"""Intervals of parameters where every model is wrong.
+
+A posterior given one error model is too narrow: it takes what the simulator gets wrong
+for independent from trial to trial. The center is that of generalized least squares
+with a residual process of which a part is shared by the trials, and the deviation
+
+.. math::
+    s^2 = \max(s_{GLS}, s_J)^2 + (\hat u_{LSQ} - \hat u_{GLS})^2
+
+with the jackknife's over trials, :math:`s_J`: what weighting the same residuals
+differently moves a parameter by is an error of it too.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.misfit.left_out import leave_out
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.misfit.processes import WIDTHS, Errors, Posterior, integrated
+from sbi_active.inference.sampling.weights import log_sum_exp
+
+Array = NDArray[Any]
+
+#: Shares of the process that trials have in common, and the length over which they do,
+#: in deviations of the action.
+SHARES, LENGTHS = (0.5, 0.9), (0.7, 1e3)
+#: Every so many of the sizes of the process.
+THINNED = 2
+
+
+def intervals(
+    model: LinearModel, posterior: Posterior, errors: Errors, action: Array
+) -> tuple[Array, Array]:
+    """Return the mean and covariance of a model's coordinates, (d,) and (d, d).
+
+    Args:
+        model: Linear.
+        posterior: Given a process that is independent in each trial.
+        errors: Shared by all models.
+        action: Of each trial, shape (t, action_dim).
+    """
+    found = shared_process(model, errors, action)
+    mean, cov = (posterior.mean, posterior.cov) if found is None else found
+    left = leave_out(model, errors)
+    own = np.sqrt(np.maximum(np.diag(cov), 1e-300))
+    sd = np.hypot(np.maximum(own, left.jackknife()), left.fit - mean)
+    sd = np.minimum(sd, model.widened(WIDTHS[-1]))  # no wider than before the trials
+    return mean, cov * np.outer(sd / own, sd / own)
+
+
+def shared_process(
+    model: LinearModel, errors: Errors, action: Array
+) -> tuple[Array, Array] | None:
+    r"""Return the posterior moments given a process that trials may share.
+
+    .. math::
+        C = \sigma^2 (I + s^2 A \otimes K), \qquad
+        A_{ij} = c\, e^{-|\Delta\xi|^2 / 2 \ell^2} + (1 - c) \delta_{ij}
+
+    summed over c, the length, s, the kernel and its time scale.
+
+    Args:
+        model: Linear.
+        errors: Shared by all models.
+        action: Of each trial, shape (t, action_dim).
+
+    Returns:
+        Shapes (d,) and (d, d); None where trials are not sampled at the same times.
+    """
+    patterns = errors.patterns
+    if not errors.is_by_trial or len(patterns) != 1:
+        return None
+    places, folds, bases = patterns[0]
+    num = errors.num_folds
+    order = np.argsort(folds, kind="stable")  # by trial, then channel
+    channels = len(folds) // num
+    if len(folds) != channels * num:
+        return None
+    rows = model.rows.copy()
+    rows[:, 0] -= rows[:, 1:] @ model.center
+    blocks = rows[places[order]].reshape(num, channels, places.shape[1], -1)
+    means, covs, logs = [], [], []
+    sizes = errors.sizes[::THINNED]
+    for values, vectors in bases:
+        along = np.einsum("nm,tcnk->tcmk", vectors, blocks)
+        for weights, basis in _between(action, num):
+            turned = np.einsum("tu,tcmk->ucmk", basis, along)
+            flat = turned.reshape(-1, turned.shape[-1])
+            product = (flat[:, :, None] * flat[:, None, :]).reshape(len(flat), -1)
+            variance = np.repeat(np.outer(weights, values), channels, 0)
+            variance = variance.reshape(num, channels, -1).ravel()
+            v = 1 + sizes[:, None] ** 2 * variance
+            gram = ((1 / v) @ product).reshape(len(sizes), flat.shape[1], -1)
+            log_z, mean, cov = integrated(gram, model, 1.0)
+            logs.append(log_z - 0.5 * np.log(v).sum(1))
+            means.append(mean)
+            covs.append(cov)
+    log_p, mean = np.concatenate(logs), np.concatenate(means)
+    p = np.exp(log_p - log_sum_exp(log_p))
+    center = p @ mean
+    off = mean - center
+    cov = np.einsum("h,hij->ij", p, np.concatenate(covs)) + (p[:, None] * off).T @ off
+    return center + model.center, cov
+
+
+def _between(action: Array, num: int) -> list[tuple[Array, Array]]:
+    """Return eigenvalues and vectors of what trials share, for each hypothesis."""
+    spread = action.std(0)
+    some = spread > 0
+    scaled = action[:, some] / spread[some]
+    square = ((scaled[:, None] - scaled) ** 2).sum(-1)
+    found = [(np.ones(num), np.eye(num))]
+    for share in SHARES:
+        for length in LENGTHS if some.any() else LENGTHS[-1:]:
+            kernel = share * np.exp(-0.5 * square / length**2)
+            values, vectors = np.linalg.eigh(kernel + (1 - share) * np.eye(num))
+            found.append((np.clip(values, 0, None), vectors))
+    return found

@@ -1,0 +1,93 @@
+"""Errors on trials that a model was not fitted to, and its intervals.
+
+By linear algebra: a model is refitted without each part of the trials by least squares,
+from its linearization at the best fit to all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.misfit.processes import Errors
+
+Array = NDArray[Any]
+
+#: Factor on the scale of effects' priors in refits, which are to follow the trials.
+WIDTH = 3.0
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Refits of a linear model without each part of the trials.
+
+    Attributes:
+        square: Mean squared error of each part, in sensor variances, shape (f,); NaN
+            for parts that do not count.
+        error: Of each number by the fit without its part, sensor deviations, (N,).
+        refits: Coordinates without each part, shape (f, d).
+        fit: With all of them, shape (d,).
+    """
+
+    square: Array
+    error: Array
+    refits: Array
+    fit: Array
+
+    @property
+    def mean_square(self) -> float:
+        """Over the parts that count, in sensor variances."""
+        return float(np.nanmean(self.square))
+
+    def jackknife(self) -> Array:
+        """Return standard deviations of the coordinates, shape (d,).
+
+        References:
+            Efron & Stein, Annals of Statistics 9 (1981).
+        """
+        own = self.refits[np.isfinite(self.square)]
+        n = len(own)
+        return np.sqrt((n - 1) / n * ((own - own.mean(0)) ** 2).sum(0))
+
+
+def leave_out(
+    model: LinearModel, errors: Errors, folds: NDArray[np.bool_] | None = None
+) -> LeftOut:
+    """Return a model's errors on each part of the trials that it was not fitted to.
+
+    Args:
+        model: Linear.
+        errors: Which says what the parts are.
+        folds: Parts that count, shape (f,); None takes all.
+    """
+    f = errors.num_folds
+    use = np.ones(f, bool) if folds is None else folds
+    rows = model.rows.copy()
+    rows[:, 0] -= rows[:, 1:] @ model.center
+    scaled = rows / max(model.rms, 1.0)
+    gram = np.stack([_gram(scaled[errors.fold == j]) for j in range(f)])
+    gram[~use] = 0.0
+    total = gram.sum(0)
+    prior = np.diag(1 / model.widened(WIDTH) ** 2)
+    without = total - gram
+    refits = np.linalg.solve(without[:, 1:, 1:] + prior, without[:, 1:, :1])[..., 0]
+    fit = np.linalg.solve(total[1:, 1:] + prior, total[1:, 0])
+    low, high = model.low - model.center, model.high - model.center
+    refits, fit = np.clip(refits, low, high), np.clip(fit, low, high)
+    error = rows[:, 0] - (rows[:, 1:] * refits[errors.fold]).sum(1)
+    count = np.bincount(errors.fold, minlength=f)
+    square = np.bincount(errors.fold, error**2, f) / count
+    return LeftOut(
+        np.where(use, square, np.nan),
+        error,
+        refits + model.center,
+        fit + model.center,
+    )
+
+
+def _gram(rows: Array) -> Array:
+    return rows.T @ rows

@@ -1,0 +1,124 @@
+"""A rival linearized at its best fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.rival import Rival
+
+Array = NDArray[Any]
+
+#: Precision of the Gaussian that stands for a prior between two bounds: wide enough
+#: to leave parameters alone that the trials determine.
+FLAT = 0.3
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    r"""A rival near its best fit, :math:`r(u) = r(\hat u) + J (u - \hat u)`.
+
+    Attributes:
+        key: Of the rival.
+        u: Where it is linearized, shape (d,).
+        residual: There, in standard deviations of the sensor, shape (N,).
+        jacobian: Its derivatives, shape (N, d).
+        center: Of the prior, shape (d,).
+        sd: Of the prior, shape (d,).
+        scaled: Coordinates of effects whose prior has an unknown scale, bool, (d,).
+        low: Bounds, shape (d,).
+        high: Bounds, shape (d,).
+        own: Coordinates of theta and phi; those of the trials' nuisances follow.
+    """
+
+    key: ModelKey
+    u: Array
+    residual: Array
+    jacobian: Array
+    center: Array
+    sd: Array
+    scaled: NDArray[np.bool_]
+    low: Array
+    high: Array
+    own: int
+
+    @property
+    def rows(self) -> Array:
+        """Residual at u = 0 and minus its derivatives, shape (N, 1 + d)."""
+        at_zero = self.residual - self.jacobian @ self.u
+        return np.concatenate([at_zero[:, None], -self.jacobian], 1)
+
+    @property
+    def rms(self) -> float:
+        """Of the residual, in standard deviations of the sensor."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    def widened(self, width: float) -> Array:
+        """Return the prior's deviations with effects on another scale, shape (d,)."""
+        return np.where(self.scaled, width * self.sd, self.sd)
+
+
+def linearize(rival: Rival, u: Array, unit: Array, step: float) -> LinearModel:
+    """Return a rival linearized at one point.
+
+    Args:
+        rival: Of effects that change the prediction.
+        u: Where, shape (d,).
+        unit: Standard deviation of the sensor, shape (N,).
+        step: Of finite differences.
+    """
+    r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
+    return with_prior(rival, u, r[0], jacobian[0])
+
+
+def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> LinearModel:
+    """Return a linearized rival with the Gaussian that stands for its prior."""
+    c = rival.coordinates
+    bounded = np.isfinite(c.low) & np.isfinite(c.high)
+    scaled = np.zeros(rival.dim, dtype=bool)
+    precision = np.where(c.precision > 0, c.precision, FLAT)
+    names = {e.name for e in rival.effects}
+    for name, place in rival.columns().items():
+        if name in names:
+            scaled[place] = ~bounded[place]
+            # Between bounds a phi is as likely anywhere: its own variance is one.
+            precision[place] = np.where(bounded[place], 1.0, precision[place])
+    return LinearModel(
+        key=rival.key,
+        u=u,
+        residual=residual,
+        jacobian=jacobian,
+        center=c.center,
+        sd=1 / np.sqrt(precision),
+        scaled=scaled,
+        low=c.low,
+        high=c.high,
+        own=sum(c.joint.sizes),
+    )
+
+
+def enlarged(
+    model: LinearModel, rival: Rival, changes: Sequence[tuple[Array, Array]]
+) -> LinearModel:
+    """Return a model with further effects, at the point where they vanish.
+
+    Args:
+        model: Without them.
+        rival: With them, in the order of ``changes`` among its coordinates.
+        changes: Of each effect of the rival that the model lacks, the place of its phi
+            among the rival's coordinates with its value there, shape (2, k), and the
+            derivative of the residual, shape (N, k).
+    """
+    new = {int(j) for place, _ in changes for j in place[0]}
+    old = [j for j in range(rival.dim) if j not in new]
+    u, jacobian = np.empty(rival.dim), np.empty((len(model.residual), rival.dim))
+    u[old], jacobian[:, old] = model.u, model.jacobian
+    for place, columns in changes:
+        at = place[0].astype(int)
+        u[at], jacobian[:, at] = place[1], columns
+    return with_prior(rival, u, model.residual, jacobian)

@@ -1,0 +1,295 @@
+r"""The errors that all models share: the sensor's alone, or beside a residual process.
+
+.. math::
+    C = \sigma^2 (I + s^2 K), \qquad
+    K(d) = e^{-d / \tau} \ \text{or}\
+    \bigl(1 + \tfrac{\sqrt3 d}{\tau}\bigr) e^{-\sqrt3 d / \tau},
+
+in each trial and channel, with :math:`\sigma` of the sensor. The size s (from .3 up)
+and the time scale :math:`\tau` (from a sample to most of a trial) are log-uniform and
+summed out, in *every* model: what a simulator gets wrong along a trajectory is no
+evidence for whichever model is a little less wrong. Models are linear here
+(:mod:`.linear`), so that all of it is algebra of Gram matrices.
+
+References:
+    Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
+from sbi_active.inference.sampling.weights import log_sum_exp
+
+Array = NDArray[Any]
+
+#: Factors on the scale of an effect's prior, equally likely.
+WIDTHS = (1 / 3, 1.0, 3.0)
+#: Sizes of the process in sensor deviations, a factor apart, and its time scales: from
+#: this share of a sample to this share of a trial, about a factor apart.
+SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
+SAMPLE, TRIAL, APART = 0.8, 0.8, 2.1
+#: Trials below which parts of them are left out in their place, and how many parts.
+FEWEST, NUM_FOLDS = 6, 8
+
+
+def _ornstein_uhlenbeck(d: Array) -> Array:
+    return np.exp(-d)
+
+
+def _matern(d: Array) -> Array:
+    return (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d)
+
+
+KERNELS: tuple[Callable[[Array], Array], ...] = (_ornstein_uhlenbeck, _matern)
+
+
+@dataclass(frozen=True)
+class Grams:
+    """Gram matrices of a model's rows in the metric of each error, part by part.
+
+    Attributes:
+        gram: Shape (h, f, 1 + d, 1 + d).
+        log_det: Of each error's covariance, shape (h, f).
+        count: Numbers in each part, shape (f,).
+    """
+
+    gram: Array
+    log_det: Array
+    count: Array
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The evidence of a linear model, and its posterior.
+
+    Attributes:
+        log_sensor: With the sensor's error alone, nats.
+        log_process: With a residual process beside it, nats.
+        mean: Of u given the process, shape (d,).
+        cov: Of u given the process, shape (d, d).
+        size: s, posterior mean.
+        time_scale: tau, posterior median.
+    """
+
+    log_sensor: float
+    log_process: float
+    mean: Array
+    cov: Array
+    size: float
+    time_scale: float
+
+    @property
+    def log_evidence(self) -> float:
+        """Both errors equally likely, nats."""
+        return float(np.logaddexp(self.log_sensor, self.log_process) - np.log(2))
+
+
+class Errors:
+    """The grid of errors over some measurements.
+
+    Args:
+        measurements: With a time axis.
+        unit: Standard deviation of the sensor, shape (N,).
+        cells: The sensor's error, with what is unknown of its correlation.
+        largest: Root mean square of the residual of a model that misses, in sensor
+            deviations: the process may be twice as large.
+
+    Attributes:
+        fold: Part that each number belongs to, shape (N,): trials, or with fewer than
+            six the parts of trials, which are then left out in their place.
+        num_folds: f.
+        is_by_trial: Whether the parts are trials.
+    """
+
+    def __init__(
+        self,
+        measurements: Measurements,
+        unit: Array,
+        cells: list[NoiseCell],
+        *,
+        largest: float,
+    ) -> None:
+        m = self.measurements = measurements
+        self.unit = unit
+        self.fold, self.is_by_trial = _folds(m)
+        self.num_folds = int(self.fold.max()) + 1
+        top = max(LARGEST, 2 * largest)
+        num = 1 + round(np.log(top / SMALLEST) / np.log(FACTOR))
+        self.sizes = np.geomspace(SMALLEST, top, num)
+        span = np.median([np.ptp(m.time[at]) for at in self._blocks()])
+        span = max(float(span), m.step)
+        low, high = SAMPLE * m.step, max(TRIAL * span, 2 * SAMPLE * m.step)
+        num = 2 + round(np.log(high / low) / np.log(APART))
+        self.times = np.geomspace(low, high, num)
+        self._cells = [_in_units(cell, unit) for cell in cells]
+        total = log_sum_exp(np.array([c.log_weight for c in self._cells]))
+        self._log_cells = np.array([c.log_weight for c in self._cells]) - total
+        self.patterns = self._by_pattern()
+
+    @property
+    def num_processes(self) -> int:
+        """Errors with a process: kernels, time scales and sizes."""
+        return len(KERNELS) * len(self.times) * len(self.sizes)
+
+    def grams(self, rows: Array) -> Grams:
+        """Return the Gram matrices of rows (N, k), the sensor's errors first."""
+        k, f = rows.shape[1], self.num_folds
+        num = len(self._cells) + self.num_processes
+        gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
+        for i, cell in enumerate(self._cells):
+            white = cell.whiten(rows.T).T
+            scale = np.log(cell.sd) + 0.5 * np.log1p(-(cell.rho**2))
+            log_det[i] = 2 * np.bincount(self.fold, scale, f)
+            for j in range(f):
+                own = white[self.fold == j]
+                gram[i, j] = own.T @ own
+        for places, folds, bases in self.patterns:
+            blocks = rows[places]  # (b, n, k)
+            at = len(self._cells)
+            for values, vectors in bases:
+                y = np.einsum("nm,bnk->bmk", vectors, blocks)
+                product = (y[..., :, None] * y[..., None, :]).reshape(*y.shape[:2], -1)
+                v = 1 + self.sizes[:, None] ** 2 * values  # (s, m)
+                weighted = np.einsum("sm,bmq->sbq", 1 / v, product)
+                logs = np.log(v).sum(1)
+                for b, fold in enumerate(folds):
+                    own = slice(at, at + len(self.sizes))
+                    gram[own, fold] += weighted[:, b].reshape(-1, k, k)
+                    log_det[own, fold] += logs
+                at += len(self.sizes)
+        return Grams(gram, log_det, np.bincount(self.fold, minlength=f))
+
+    def posterior(
+        self,
+        model: LinearModel,
+        grams: Grams,
+        folds: Array | None = None,
+        *,
+        factor: float = 1.0,
+    ) -> Posterior:
+        """Return the evidence and the posterior of a model.
+
+        Args:
+            model: Linear, with its prior.
+            grams: Of its rows.
+            folds: Parts that count, bool, shape (f,); None takes all.
+            factor: On the scales of the effects' priors.
+        """
+        use = np.ones(self.num_folds, bool) if folds is None else folds
+        gram, log_det = grams.gram[:, use].sum(1), grams.log_det[:, use].sum(1)
+        shift = np.eye(gram.shape[1])
+        shift[1:, 0] = -model.center
+        gram = shift.T @ gram @ shift
+        found = [integrated(gram, model, factor * width) for width in WIDTHS]
+        log_z = np.stack([f[0] for f in found], 1)  # (h, widths)
+        const = grams.count[use].sum() * LOG_2PI
+        log_z = log_z - 0.5 * (log_det[:, None] + const) - np.log(len(WIDTHS))
+        n = len(self._cells)
+        sensor = log_sum_exp((log_z[:n] + self._log_cells[:, None]).ravel())
+        log_p = (log_z[n:] - np.log(self.num_processes)).ravel()
+        process = log_sum_exp(log_p)
+        p = np.exp(log_p - process)
+        means = np.stack([f[1] for f in found], 1)[n:].reshape(len(p), -1)
+        covs = np.stack([f[2] for f in found], 1)[n:]
+        covs = covs.reshape(len(p), *covs.shape[2:])
+        mean = p @ means
+        off = means - mean
+        cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
+        by_process = p.reshape(len(KERNELS), len(self.times), len(self.sizes), -1)
+        sizes, times = by_process.sum((0, 1, 3)), by_process.sum((0, 2, 3))
+        middle = int(np.searchsorted(np.cumsum(times), 0.5))
+        return Posterior(
+            float(sensor),
+            float(process),
+            mean + model.center,
+            cov,
+            float(sizes @ self.sizes),
+            float(self.times[min(middle, len(self.times) - 1)]),
+        )
+
+    def _blocks(self) -> list[NDArray[np.intp]]:
+        """Return the numbers of each part and channel, in the order of time."""
+        m = self.measurements
+        code = self.fold * (int(m.channel.max()) + 1) + m.channel
+        return [np.flatnonzero(code == c) for c in np.unique(code)]
+
+    def _by_pattern(self) -> list[tuple[Array, Array, list[tuple[Array, Array]]]]:
+        """Return blocks of equal time stamps with the eigenbases of their kernels."""
+        m, same = self.measurements, {}
+        for at in self._blocks():
+            stamps = np.round((m.time[at] - m.time[at[0]]) / m.step, 6)
+            same.setdefault(stamps.tobytes(), []).append(at)
+        found = []
+        for blocks in same.values():
+            places = np.stack(blocks)
+            time = m.time[places[0]]
+            apart = np.abs(time[:, None] - time)
+            bases = []
+            for kernel in KERNELS:
+                for tau in self.times:
+                    values, vectors = np.linalg.eigh(kernel(apart / tau))
+                    bases.append((np.clip(values, 0, None), vectors))
+            found.append((places, self.fold[places[:, 0]], bases))
+        return found
+
+
+def integrated(
+    gram: Array, model: LinearModel, width: float
+) -> tuple[Array, Array, Array]:
+    """Return evidences less their constants, and posterior moments of u - center."""
+    sd = model.widened(width)
+    g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
+    precision = sd[:, None] * g * sd + np.eye(len(sd))
+    cov = np.linalg.inv(precision)
+    mean = np.einsum("hij,hj->hi", cov, sd * b)
+    log_z = -0.5 * (rr - (sd * b * mean).sum(1))
+    log_z = log_z - 0.5 * np.linalg.slogdet(precision)[1]
+    mean, cov = sd * mean, sd[:, None] * cov * sd
+    low, high = model.low - model.center, model.high - model.center
+    some = np.isfinite(low) | np.isfinite(high)
+    if some.any():
+        own = np.sqrt(np.einsum("hii->hi", cov))[:, some]
+        inside = _log_inside(mean[:, some], own, low[some], high[some])
+        before = _log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
+        log_z = log_z + inside.sum(1) - before.sum()
+    return log_z, mean, cov
+
+
+def _log_inside(mean: Array, sd: Array, low: Array, high: Array) -> Array:
+    """Return the log probability of a normal variable between bounds."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    # In the lower tail, where the logarithm of a small share is exact.
+    with np.errstate(invalid="ignore"):
+        flip = a + b > 0
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
+
+
+def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:
+    return NoiseCell(cell.log_weight, cell.sd / unit, cell.rho, cell.df)
+
+
+def _folds(m: Measurements) -> tuple[NDArray[np.int64], bool]:
+    """Return the part of each number, and whether parts are trials."""
+    trials, code = np.unique(m.trial, return_inverse=True)
+    if len(trials) >= FEWEST:
+        return code.astype(np.int64), True
+    each = -(-NUM_FOLDS // len(trials))
+    fold = np.empty(len(m), dtype=np.int64)
+    for t in range(len(trials)):
+        at = code == t
+        time = m.time[at]
+        edges = np.quantile(time, np.linspace(0, 1, each + 1)[1:-1])
+        fold[at] = t * each + np.searchsorted(edges, time, side="left")
+    return np.unique(fold, return_inverse=True)[1].astype(np.int64), False

@@ -1,0 +1,228 @@
+"""The verdict of linear models as the closed loop's results, with posterior draws."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.evidence.importance import ImportanceSample
+from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
+from sbi_active.criticism.misfit.left_out import leave_out
+from sbi_active.criticism.misfit.processes import Errors
+from sbi_active.criticism.misfit.verdict import Misfit
+from sbi_active.criticism.results import (
+    UNEXPLAINED,
+    Detection,
+    Estimate,
+    Evidence,
+    ModelKey,
+    Tracing,
+)
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
+from sbi_active.criticism.steps.tracing import credible_set
+from sbi_active.criticism.under_misfit import Misfit as Found
+from sbi_active.criticism.under_misfit import ModelError
+from sbi_active.seeding import derive_seed
+
+Array = NDArray[Any]
+
+#: Probability from which an admitted model is recorded with its errors and draws, and
+#: how many are at most.
+SHOWN, MOST_SHOWN = 0.01, 8
+#: Root mean square difference of two effects' fits, in sensor deviations, below which
+#: they are nearly the same.
+CLOSE = 1.0
+
+
+def detected(misfit: Misfit) -> Detection:
+    """Return that the bare model misses the trials, by the evidence of the verdict."""
+    bare = misfit.search.found[ModelKey()]
+    square = float((bare.model.residual**2).sum())
+    freedom = float(max(len(bare.model.residual) - len(bare.model.u), 1))
+    log_b = misfit.log_bayes_factor
+    return Detection(
+        log_bayes_factor=log_b,
+        standard_error=0.0,
+        lower=log_b,
+        threshold=THRESHOLD,
+        chi_square=square,
+        degrees_of_freedom=freedom,
+        p_value=float(chi2.sf(square, freedom)),
+        level=LEVEL,
+        null_log_evidence=bare.posterior.log_sensor,
+        null_cross_check=None,
+    )
+
+
+def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
+    """Return the verdict, and record the models behind it with posterior draws.
+
+    Args:
+        misfit: The models and what helps.
+        held_out: Trials on which the recorded models are scored; None for none.
+    """
+    rivals, search, choice = misfit.rivals, misfit.search, misfit.choice
+    if getattr(rivals.model.noise, "measurement_sd", None) is None:
+        rivals.widen(2 * search.found[ModelKey()].model.rms)
+    singles = [ModelKey((name,)) for name in search.names]
+    shown = [k for k, p in choice.probabilities.items() if p >= SHOWN][:MOST_SHOWN]
+    tabled = [*dict.fromkeys([*shown, choice.key, ModelKey()])]
+    evidences = {}
+    for key in dict.fromkeys([*tabled, *singles]):
+        evidences[str(key)] = _record(misfit, key)
+    models = [_scored(misfit, key, held_out) for key in tabled]
+    found = _found(misfit, tuple(models))
+    named = found.named
+    probabilities = {str(k): choice.probabilities.get(k, 0.0) for k in tabled}
+    probabilities |= {
+        n: choice.probabilities.get(ModelKey((n,)), 0.0) for n in search.names
+    }
+    ordered = dict(sorted(probabilities.items(), key=lambda item: -item[1]))
+    return Tracing(
+        verdict=str(ModelKey(named)) if named else UNEXPLAINED,
+        chosen=choice.key.effects,
+        probabilities=ordered,
+        inclusion={n: choice.inclusion.get(n, 0.0) for n in rivals.effects},
+        credible_set=credible_set(ordered),
+        equivalent=(*misfit.equivalent,),
+        near=(),
+        aliases=_aliases(misfit),
+        estimates=_estimates(misfit, evidences),
+        evidences=evidences,
+        robust=misfit.is_robust(),
+        beside=tuple(n for n in choice.key.effects if n not in named),
+        misfit=found,
+    )
+
+
+def _record(misfit: Misfit, key: ModelKey) -> Evidence:
+    """Return a model's record, and keep its draws as its posterior sample."""
+    rivals = misfit.rivals
+    if key in rivals.fits:
+        return rivals.fits[key].evidence
+    before = rivals.simulator.num_simulations if key.effects else 0
+    model, mean, cov = misfit.posterior(key)
+    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(key)))
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.clip(values, 0, None))
+    u = mean + rng.normal(size=(NUM_DRAWS, len(mean))) @ root.T
+    u = np.clip(u, model.low, model.high)
+    log_z = misfit.search.found[key].posterior.log_process
+    equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
+    sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS))
+    rival = rivals.rival(key)
+    evidence = Evidence(
+        key=key,
+        log_evidence=log_z,
+        standard_error=0.0,
+        effective_sample_size=float(NUM_DRAWS),
+        engine="linear",
+        num_simulations=rivals.simulator.num_simulations - before,
+        names=rivals.names_of(rival),
+        draws=rival.coordinates.to_z(u)[:, : model.own],
+        best_chi_square=float((misfit.model(key).residual ** 2).sum()),
+    )
+    rivals.fits[key] = Fit(rival, sample, evidence)
+    return evidence
+
+
+def _found(misfit: Misfit, models: tuple[ModelError, ...]) -> Found:
+    choice, search = misfit.choice, misfit.search
+    m = search.rivals.measurements
+    last = search.found[choice.key]
+    return Found(
+        models=models,
+        helps=choice.key.effects,
+        cause=choice.cause,
+        better=choice.better,
+        remains=choice.remains,
+        sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
+        passes=misfit.passes(choice.key),
+        size=last.posterior.size,
+        time_scale=last.posterior.time_scale,
+        left_out="trials" if search.errors.is_by_trial else "parts of trials",
+    )
+
+
+def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelError:
+    """Return a model's errors on trials that it was not fitted to."""
+    search, rivals = misfit.search, misfit.rivals
+    errors: Errors = search.errors
+    left, bare = (leave_out(search.found[k].model, errors) for k in (key, ModelKey()))
+    excess = max(left.mean_square - 1, 0.0) / max(bare.mean_square - 1, 1e-2)
+    m = rivals.measurements
+    own = _by_channel((left.error * search.unit) ** 2, m.channel)
+    return ModelError(
+        name=str(key),
+        probability=misfit.choice.probabilities.get(key, 0.0),
+        left_out=np.sqrt(own),
+        held_out=None if held_out is None else _held_out(misfit, key, held_out),
+        remains=float(min(excess, 1.0)),
+    )
+
+
+def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials) -> Array:
+    """Return the root mean square error on held-out trials by channel, (c,)."""
+    rivals = misfit.rivals
+    simulator = TrialSimulator(
+        rivals.simulator.model, held_out, seed=derive_seed(rivals.seed, "predicted")
+    )
+    m = simulator.measurements
+    fit = rivals.fit(key)
+    u = fit.sample.u.mean(0, keepdims=True)
+    theta, phi = fit.rival.coordinates.split(u)
+    for effect in rivals.nuisances:
+        middle = effect.sample(NUM_DRAWS).double().mean(0)
+        phi[effect.name] = middle.expand(1, len(held_out), -1)
+    mean = simulator.predict(theta, phi)[0][0]
+    return np.sqrt(_by_channel((m.x - mean) ** 2, m.channel))
+
+
+def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
+    return np.bincount(channel, square) / np.maximum(np.bincount(channel), 1)
+
+
+def _estimates(misfit: Misfit, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
+    bare = evidences[str(ModelKey())].log_evidence
+    found = []
+    for name in misfit.search.names:
+        effect, evidence = misfit.rivals.effects[name], evidences[name]
+        phi = evidence.draws[:, -effect.phi_dim :]
+        found.append(
+            Estimate(
+                name=name,
+                family=str(effect.family),
+                units=effect.units,
+                describe=effect.describe or "",
+                probability=misfit.choice.inclusion[name],
+                log_bayes_factor=evidence.log_evidence - bare,
+                mean=phi.mean(0),
+                sd=phi.std(0),
+                effective_sample_size=evidence.effective_sample_size,
+                engine=evidence.engine,
+            )
+        )
+    return (*sorted(found, key=lambda e: -e.probability),)
+
+
+def _aliases(misfit: Misfit) -> tuple[frozenset[str], ...]:
+    """Return pairs of effects that fit the trials nearly alike and about as well."""
+    found = misfit.search.found
+    log_z = {
+        n: found[ModelKey((n,))].posterior.log_process for n in misfit.search.names
+    }
+    best = max(log_z.values(), default=-np.inf)
+    likely = [n for n, value in log_z.items() if value > best - THRESHOLD]
+    pairs = []
+    for i, a in enumerate(likely):
+        for b in likely[i + 1 :]:
+            one, two = (misfit.model(ModelKey((n,))).residual for n in (a, b))
+            if np.mean((one - two) ** 2) < CLOSE**2:
+                pairs.append(frozenset({a, b}))
+    return (*pairs,)

@@ -1,0 +1,165 @@
+r"""What helps, and what is the cause, when every model is wrong.
+
+1. Models are *admitted* whose error on left-out trials is within a tenth of the
+   smallest; the most probable of them by the shared evidence is the top.
+2. An effect of the top *helps* if it is more likely there than not, and predicts a
+   left-out trial better with a probability of .9; others are dropped.
+3. The probability that it is the *cause* is its inclusion probability times
+   :math:`.85 (1 - u)`, with u the share of the excess error that remains,
+
+.. math::
+    u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
+
+from mean squared errors M on left-out trials in sensor variances: of the model, of the
+model without the effect and of the bare one. Where the model's chi-square passes
+against the sensor nothing remains, and it is the inclusion probability itself. The
+thresholds and the .85 are empirical: evidence alone, or prediction alone, names a
+stand-in as surely as a cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from sbi_active.criticism.results import ModelKey
+from sbi_active.inference.sampling.weights import log_sum_exp
+
+Array = NDArray[Any]
+
+ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
+INCLUDED, BETTER = 0.5, 0.9
+CERTAIN = 0.85  # probability of a cause that leaves nothing
+PASSES = 0.01  # tail probability of a chi-square against the sensor
+SMALLEST_EXCESS = 1e-2
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What the rule knows of a model.
+
+    Attributes:
+        log_p: Unnormalized log posterior probability.
+        square: Mean squared error on each left-out part, in sensor variances, (f,).
+        passes: Whether its chi-square passes against the sensor.
+    """
+
+    log_p: float
+    square: Array
+    passes: bool
+
+    @property
+    def error(self) -> float:
+        """Mean squared error on left-out parts, in sensor variances."""
+        return float(np.nanmean(self.square))
+
+    @property
+    def excess(self) -> float:
+        """Beyond the sensor's."""
+        return max(self.error - 1, SMALLEST_EXCESS)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the rule says.
+
+    Attributes:
+        key: The model whose effects all help; the bare one where none does.
+        probabilities: Of the admitted models, most probable first.
+        inclusion: Probability of each effect among them.
+        cause: Probability of each effect that helps of being the cause.
+        better: Probability that a left-out trial is predicted better with it.
+        remains: u, by effect that helps.
+    """
+
+    key: ModelKey
+    probabilities: dict[ModelKey, float]
+    inclusion: dict[str, float]
+    cause: dict[str, float]
+    better: dict[str, float]
+    remains: dict[str, float]
+
+
+def choose(
+    models: Mapping[ModelKey, Scored],
+    names: Sequence[str],
+    equivalent: Sequence[frozenset[str]] = (),
+) -> Choice:
+    """Return what helps, and the probability that it is the cause.
+
+    Args:
+        models: Fitted ones; with a set of effects, the sets with one effect less.
+        names: Of all effects.
+        equivalent: Groups of them that nothing separates, which share their mass.
+    """
+    keys = admitted(models)
+    log_p = np.array([models[key].log_p for key in keys])
+    p = np.exp(log_p - log_sum_exp(log_p))
+    order = np.argsort(-p, kind="stable")
+    probabilities = {keys[i]: float(p[i]) for i in order}
+    alike = {n: next((g for g in equivalent if n in g), frozenset({n})) for n in names}
+    inclusion = {
+        n: sum(v for k, v in probabilities.items() if n in k.effects) for n in names
+    }
+    pooled = {
+        n: sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
+        for n in names
+    }
+    key = next(iter(probabilities))
+    better: dict[str, float] = {}
+    while key.effects:
+        better = {
+            n: predicts_better(models[key].square, models[_without(key, n)].square)
+            for n in key.effects
+        }
+        worst = min(better, key=lambda n: (pooled[n] >= INCLUDED, better[n]))
+        if pooled[worst] >= INCLUDED and better[worst] >= BETTER:
+            break
+        key = _without(key, worst)
+    own, bare = models[key], models[ModelKey()]
+    remains, cause = {}, {}
+    for n in key.effects:
+        other = models[_without(key, n)]
+        u = max(own.excess / other.excess, own.excess / bare.excess)
+        remains[n] = float(np.clip(u, 0.0, 1.0))
+        share = 1.0 if own.passes else CERTAIN * (1 - remains[n])
+        cause[n] = inclusion[n] * share
+    return Choice(
+        key,
+        probabilities,
+        inclusion,
+        cause,
+        {n: better[n] for n in key.effects},
+        remains,
+    )
+
+
+def admitted(models: Mapping[ModelKey, Scored]) -> list[ModelKey]:
+    """Return the models that predict left-out trials about as well as the best."""
+    least = min(scored.error for scored in models.values())
+    return [key for key, m in models.items() if m.error <= ADMITTED**2 * least]
+
+
+def predicts_better(one: Array, other: Array) -> float:
+    """Return the probability that a model has the smaller error on a new trial.
+
+    By Student's t over the trials' log ratios of mean squared errors.
+
+    Args:
+        one: Mean squared errors of the model on left-out trials, shape (f,).
+        other: Those of the other.
+    """
+    some = np.isfinite(one) & np.isfinite(other)
+    ratio = np.log(one[some]) - np.log(other[some])
+    n = len(ratio)
+    error = ratio.std(ddof=1) / np.sqrt(n) + 1e-9
+    return float(stats.t.cdf(-ratio.mean() / error, n - 1))
+
+
+def _without(key: ModelKey, name: str) -> ModelKey:
+    return ModelKey(tuple(n for n in key.effects if n != name))

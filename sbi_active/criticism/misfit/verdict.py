@@ -1,0 +1,226 @@
+"""Whether every model misses the trials by more than the sensor's error, and then what.
+
+Where one fits to the sensor's error, evidence on the simulator itself decides, and
+nothing of this is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.intervals import intervals
+from sbi_active.criticism.misfit.left_out import leave_out
+from sbi_active.criticism.misfit.linear import LinearModel, linearize
+from sbi_active.criticism.misfit.processes import Posterior
+from sbi_active.criticism.misfit.rule import PASSES, Choice, Scored, admitted, choose
+from sbi_active.criticism.misfit.search import Candidate, Search, parts
+from sbi_active.criticism.misfit.sensor import sensor_error
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.tracing import log_priors
+from sbi_active.inference.sampling.weights import log_sum_exp
+
+Array = NDArray[Any]
+
+#: Trials with the largest error, each of which alone may be what no model fits.
+NUM_SUSPECTS = 3
+#: Times that a model is linearized again where its posterior is.
+AGAIN = 2
+#: Factors on the scale of the effects' priors under which a verdict should stand.
+RESCALED = (1 / 3, 3.0)
+
+
+@dataclass
+class Misfit:
+    """The models of trials that none of them explains to the sensor's error.
+
+    Attributes:
+        search: Its models.
+        rivals: They are made of.
+        equivalent: Groups of effects that nothing separates.
+        choice: What helps.
+        log_bayes_factor: Of anything with a residual process against the bare model
+            with the sensor's error alone, nats.
+    """
+
+    search: Search
+    rivals: RivalSet
+    equivalent: Sequence[frozenset[str]]
+    choice: Choice
+    log_bayes_factor: float
+
+    def model(self, key: ModelKey) -> LinearModel:
+        """Return a fitted model."""
+        return self.search.found[key].model
+
+    def passes(self, key: ModelKey) -> bool:
+        """Return whether a model's chi-square passes against the sensor."""
+        return passes(self.model(key))
+
+    def posterior(self, key: ModelKey) -> tuple[LinearModel, Array, Array]:
+        """Return a model linearized at its posterior, with mean and covariance."""
+        errors, rival = self.search.errors, self.rivals.rival(key)
+        found = self.search.found[key]
+        model, posterior = found.model, found.posterior
+        action = self.rivals.trials.action.numpy()
+        action = action[np.unique(self.rivals.measurements.trial)]
+        mean, cov = intervals(model, posterior, errors, action)
+        for _ in range(AGAIN):
+            u = np.clip(mean, model.low, model.high)
+            new = linearize(rival, u, self.search.unit, self.rivals.step)
+            if not new.rms < 2 * model.rms:
+                break
+            model = new
+            posterior = errors.posterior(model, errors.grams(model.rows))
+            mean, cov = intervals(model, posterior, errors, action)
+        return model, np.clip(mean, model.low, model.high), cov
+
+    def selected_without(self, fold: int) -> ModelKey:
+        """Return the model that is chosen without one part of the trials."""
+        errors = self.search.errors
+        use = np.ones(errors.num_folds, bool)
+        use[fold] = False
+
+        def score(c: Candidate) -> Scored:
+            posterior = errors.posterior(c.model, c.grams, use)
+            square = leave_out(c.model, errors, use).square
+            return Scored(c.log_prior + posterior.log_process, square, passes(c.model))
+
+        return settled(self.search, score, self.equivalent).key
+
+    def is_robust(self) -> bool:
+        """Return whether effect priors of another scale leave what helps."""
+        errors = self.search.errors
+        for factor in RESCALED:
+
+            def score(c: Candidate, factor: float = factor) -> Scored:
+                posterior = errors.posterior(c.model, c.grams, factor=factor)
+                square = leave_out(c.model, errors).square
+                return Scored(
+                    c.log_prior + posterior.log_process, square, passes(c.model)
+                )
+
+            if settled(self.search, score, self.equivalent).key != self.choice.key:
+                return False
+        return True
+
+
+def passes(model: LinearModel) -> bool:
+    """Return whether the chi-square of a linear model passes against the sensor."""
+    square = float((model.residual**2).sum())
+    freedom = max(len(model.residual) - len(model.u), 1)
+    return bool(chi2.sf(square, freedom) > PASSES)
+
+
+def find_misfit(
+    rivals: RivalSet,
+    equivalent: Sequence[frozenset[str]] = (),
+    *,
+    is_known: bool = False,
+) -> Misfit | None:
+    """Return the models and what helps; None where one fits to the sensor's error.
+
+    So it is where no model gains a Bayes factor of 20 by a residual process, or where
+    one trial alone asks for it, which may have a gross error.
+
+    Args:
+        rivals: The models, whose noise is the sensor's.
+        equivalent: Groups of effects that no permitted action separates.
+        is_known: No model fits: what remains was found to be no error of a sensor.
+    """
+    sensor = sensor_error(rivals)
+    if sensor is None:
+        return None
+    unit, cells = sensor
+    prior = log_priors([*rivals.effects.values()], ())
+    search = Search(rivals, unit, prior, cells)
+    search.fit_singles()
+    if not is_known and not _misses(search):
+        return None
+    search.fit_larger()
+    if not is_known and (not _misses(search) or _is_one_trial(search)):
+        return None
+
+    def score(c: Candidate) -> Scored:
+        square = leave_out(c.model, search.errors).square
+        return Scored(c.log_p, square, passes(c.model))
+
+    choice = settled(search, score, equivalent)
+    log_p = [c.log_p for c in search.found.values()]
+    sensor_alone = search.found[ModelKey()].posterior.log_sensor
+    log_b = log_sum_exp(np.array(log_p)) - sensor_alone
+    return Misfit(search, rivals, equivalent, choice, float(log_b))
+
+
+def settled(
+    search: Search,
+    score: Callable[[Candidate], Scored],
+    equivalent: Sequence[frozenset[str]],
+) -> Choice:
+    """Return what helps, once every part of the top model is fitted.
+
+    Args:
+        search: The models so far.
+        score: What the rule is to know of one.
+        equivalent: Groups of effects that nothing separates.
+    """
+    scored: dict[ModelKey, Scored] = {}
+    while True:
+        for key, candidate in search.found.items():
+            if key not in scored:
+                scored[key] = score(candidate)
+        top = max(admitted(scored), key=lambda key: scored[key].log_p)
+        missing = _missing(search, [top])
+        if not missing:
+            return choose(scored, search.names, equivalent)
+        for key in missing:
+            search.fit_set(key)
+
+
+def _missing(search: Search, keys: list[ModelKey]) -> list[ModelKey]:
+    """Return the subsets of some sets that were not fitted, smaller ones first."""
+    wanted: list[ModelKey] = []
+    todo = [*keys]
+    while todo:
+        for part in parts(todo.pop()):
+            if part not in wanted:
+                wanted.append(part)
+                todo.append(part)
+    missing = [k for k in wanted if k not in search.found]
+    return sorted(missing, key=lambda k: len(k.effects))
+
+
+def _misses(search: Search, use: NDArray[np.bool_] | None = None) -> bool:
+    """Return whether even the best model gains by a residual process."""
+    best_sensor = best_process = -np.inf
+    for c in search.found.values():
+        p: Posterior = c.posterior
+        if use is not None:
+            p = search.errors.posterior(c.model, c.grams, use)
+        best_sensor = max(best_sensor, c.log_prior + p.log_sensor)
+        best_process = max(best_process, c.log_prior + p.log_process)
+    return best_process - best_sensor > THRESHOLD
+
+
+def _is_one_trial(search: Search) -> bool:
+    """Return whether the models fit all trials but one."""
+    errors = search.errors
+    if not errors.is_by_trial:
+        return False
+    best = max(
+        search.found.values(), key=lambda c: c.log_prior + c.posterior.log_sensor
+    )
+    square = np.bincount(errors.fold, best.model.residual**2, errors.num_folds)
+    for fold in np.argsort(-square)[:NUM_SUSPECTS]:
+        use = np.ones(errors.num_folds, bool)
+        use[fold] = False
+        if not _misses(search, use):
+            return True
+    return False

@@ -1,0 +1,148 @@
+"""What a report says where every model misses by more than the sensor's error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sbi_active.criticism.report.contents import Contents
+from sbi_active.criticism.report.numbers import number, probability, stated
+from sbi_active.criticism.report.section import Section, joined, named_entries
+from sbi_active.criticism.results import Array, ModelKey
+from sbi_active.criticism.under_misfit import Misfit
+
+
+def misfit_line(report: Contents, misfit: Misfit) -> str:
+    """Return the verdict in one line: what is named, what helps, or nothing."""
+    named = misfit.named
+    if not misfit.helps:
+        return (
+            "Verdict: unexplained: the model misses the trials, and no declared effect "
+            "helps"
+        )
+    if not named:
+        return (
+            f"Verdict: unexplained: {ModelKey(misfit.helps)} predicts better, and is "
+            "not named as the cause"
+        )
+    causes = joined([f"{n} ({stated(misfit.cause[n])})" for n in named])
+    line = f"Verdict: {report.verdict}, probably the cause"
+    line += f" ({stated(misfit.cause[named[0]])})" if len(named) == 1 else f": {causes}"
+    rest = [n for n in misfit.helps if n not in named]
+    return line + (f"; {joined(rest)} helps to predict" if rest else "")
+
+
+def misfit_sentences(report: Contents, misfit: Misfit) -> str:
+    """Return what was found, what remains of the error, and what to make of it."""
+    begin = f"The bare model misses the {report.num_trials} trials by more than the "
+    begin += f"sensor's error of {_size(report, misfit.sensor)}"
+    if not misfit.helps:
+        own = misfit.of("none")
+        return (
+            f"{begin}: {_size(report, own.left_out)} on left-out {misfit.left_out}. "
+            "No declared effect helps to predict them."
+        )
+    bare, model = misfit.of("none"), misfit.of(str(ModelKey(misfit.helps)))
+    change = f"{_change(report, bare.left_out, model.left_out)}"
+    remains = f"{100 * model.remains:.0f} % of the excess"
+    found = [f"{begin}."]
+    named = [*misfit.named]
+    if named:
+        found += [
+            f"{n[0].upper()}{n[1:]}: probably the cause ({_share(misfit, n)})."
+            for n in named
+        ]
+    verb = "Adding" if not named else "With"
+    found.append(
+        f"{verb} {ModelKey(misfit.helps)} the error on left-out {misfit.left_out} goes "
+        f"from {change}; {remains} over the sensor's remains."
+    )
+    rest = [n for n in misfit.helps if n not in named]
+    if rest:
+        shares = ", ".join(f"{n} {_share(misfit, n)}" for n in rest)
+        found.append(
+            f"Probability of being the cause: {shares}; else something undeclared. Use "
+            "it to predict inside the tried range, and do not read phi as physics."
+        )
+    if model.held_out is not None and bare.held_out is not None:
+        change = _change(report, bare.held_out, model.held_out)
+        found.append(f"On held-out trials: {change}.")
+    return " ".join(found)
+
+
+def admitted_models(report: Contents, misfit: Misfit) -> Section:
+    """Return the error of every admitted model on trials it was not fitted to."""
+    has_held = any(m.held_out is not None for m in misfit.models)
+    header = ["model", "P", f"left-out {misfit.left_out}", "excess that remains"]
+    header += ["held-out trials"] * has_held
+    rows = []
+    for m in misfit.models:
+        cells = [
+            m.name,
+            probability(m.probability) if m.probability > 0 else "not admitted",
+            _size(report, m.left_out),
+            f"{100 * m.remains:.0f} %",
+        ]
+        held = [] if m.held_out is None else [_size(report, m.held_out)]
+        rows.append((*cells, *held))
+    text = [
+        "Every model carries a residual process of unknown size and time scale, so "
+        "that P is one evidence for alarm and verdict. Admitted are the models whose "
+        "error on left-out "
+        f"{misfit.left_out} is within a tenth of the smallest; P is among them. Errors "
+        "are root mean squares of models fitted without what they predict. The "
+        f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
+        "beyond it, as a share of the bare model's.",
+        f"Beside the verdict's model the process has {misfit.size:.2g} times the "
+        f"sensor's standard deviation and a time scale of {number(misfit.time_scale)}.",
+    ]
+    items = [
+        f"{n}: probability of the cause {_share(misfit, n)}, of a better prediction of "
+        f"a new trial {probability(misfit.better[n])}; {100 * misfit.remains[n]:.0f} % "
+        "of the excess without it remains"
+        for n in misfit.helps
+    ]
+    return Section(
+        "Models that predict",
+        tuple(text),
+        items=tuple(items),
+        header=tuple(header),
+        rows=tuple(rows),
+    )
+
+
+def _share(misfit: Misfit, name: str) -> str:
+    return probability(misfit.cause[name])
+
+
+def _change(report: Contents, before: Array, after: Array) -> str:
+    """Return two errors by channel, as in "154 to 52.1 N"."""
+    parts = [
+        f"{name}{number(float(a))} to {number(float(b))}{unit}"
+        for (name, unit), a, b in zip(
+            _channels(report, len(before)), before, after, strict=True
+        )
+    ]
+    return joined(parts)
+
+
+def _size(report: Contents, values: Array) -> str:
+    """Return errors by channel with their units."""
+    channels = _channels(report, len(values))
+    return joined(
+        [
+            f"{name}{number(float(v))}{unit}"
+            for (name, unit), v in zip(channels, values, strict=True)
+        ]
+    )
+
+
+def _channels(report: Contents, num: int) -> Sequence[tuple[str, str]]:
+    """Return the name of each channel, where there are several, and its unit."""
+    labels = report.channel_names or ()
+    if len(labels) != num:
+        labels = [f"channel {i + 1}" for i in range(num)]
+    pairs = named_entries(tuple(labels))
+    return [
+        (f"{name} " if num > 1 else "", f" {unit}" if unit else "")
+        for name, unit in pairs
+    ]

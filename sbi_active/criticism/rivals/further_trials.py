@@ -1,0 +1,139 @@
+"""Trials that were not executed: what a model would be asked at other actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.criticism.data.arrays import rows_at
+from sbi_active.criticism.data.input_series import held_at
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.simulation import SimulatorModel
+
+#: Relative and absolute difference of actions that are the same in single precision.
+RTOL, ATOL = 1e-5, 1e-7
+
+
+def with_known_inputs(
+    model: SimulatorModel, trials: Trials, actions: ActionSpace
+) -> ActionSpace:
+    """Return the permitted actions that could be simulated.
+
+    Where inputs over time were recorded, and the model knows of no signals, what would
+    be played at another action is not known: those are left that some trial has, with
+    its inputs.
+
+    Args:
+        model: The simulator.
+        trials: Measured ones.
+        actions: The permitted ones.
+    """
+    if trials.inputs is None or model.inputs is not None:
+        return actions
+    recorded = trials.action.unique(dim=0)
+    kept = recorded[actions.contains(recorded.float())]
+    return DiscreteActions(
+        kept if len(kept) else recorded, names=actions.names, units=actions.units
+    )
+
+
+def are_known(model: SimulatorModel, trials: Trials, action: Tensor) -> Tensor:
+    """Return at which actions, shape (a, action_dim), trials can be simulated, (a,)."""
+    if trials.inputs is None or model.inputs is not None:
+        return torch.ones(len(action), dtype=torch.bool)
+    return _same(trials, action).any(1)
+
+
+def conditions_at(
+    model: SimulatorModel, trials: Trials, action: Tensor
+) -> dict[str, Any]:
+    """Return how trials at some actions would be run, as arguments of ``Trials``.
+
+    Inputs and start state are those of the first trial of the action; at an action that
+    none has, inputs are the model's signals and the start is the mean of those
+    measured.
+
+    Args:
+        model: The simulator.
+        trials: Measured ones.
+        action: Shape (a, action_dim).
+
+    Raises:
+        ValueError: If inputs were recorded, and none at some of these actions.
+    """
+    if trials.inputs is None and trials.start is None:
+        return {}
+    same = _same(trials, action)
+    found = same.any(1)
+    first = same.int().argmax(1)
+    inputs = rows_at(trials.inputs, first)
+    if inputs is not None and model.inputs is not None:
+        inputs = _signals(model, trials, action, inputs, found)
+    elif inputs is not None and not bool(found.all()):
+        i = int((~found).nonzero()[0])
+        raise ValueError(
+            "expected actions whose inputs were recorded; got "
+            f"{action[i].tolist()}; permit actions of the trials alone"
+        )
+    return {
+        "inputs": inputs,
+        "input_times": trials.input_times,
+        "start": _starts(trials.start, first, found),
+    }
+
+
+def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
+    """Return how trials were run, with further ones behind them.
+
+    Args:
+        trials: Measured ones.
+        further: From :func:`conditions_at`.
+    """
+    own = {"inputs": trials.inputs, "start": trials.start}
+    joined = {key: _joined(own[key], further[key]) for key in own if key in further}
+    return {**further, **joined}
+
+
+def _signals(
+    model: SimulatorModel,
+    trials: Trials,
+    action: Tensor,
+    recorded: dict[str, Tensor],
+    found: Tensor,
+) -> dict[str, Tensor]:
+    """Return recorded inputs where there are some, and signals on their grid."""
+    assert model.inputs is not None
+    assert trials.input_times is not None
+    signals = model.inputs.inputs(action.double())
+    if {*signals} != {*recorded}:
+        raise ValueError(
+            f"expected trials with the inputs of the model's signals, "
+            f"{', '.join(signals)}; got {', '.join(recorded)}; name them alike"
+        )
+    played = held_at(signals, model.inputs.input_times, trials.input_times)
+    known = found[:, None]
+    return {name: recorded[name].where(known, played[name]) for name in recorded}
+
+
+def _same(trials: Trials, action: Tensor) -> Tensor:
+    """Return which trials have which actions, shape (a, t)."""
+    own, asked = trials.action.double(), action.double()
+    return torch.isclose(asked[:, None], own[None], rtol=RTOL, atol=ATOL).all(-1)
+
+
+def _starts(start: Any, first: Tensor, found: Tensor) -> Any:
+    if isinstance(start, dict):
+        return {name: _starts(part, first, found) for name, part in start.items()}
+    if start is None:
+        return None
+    known = found.reshape(-1, *[1] * (start.ndim - 1))
+    return start[first].where(known, start.mean(0))
+
+
+def _joined(own: Any, further: Any) -> Any:
+    if isinstance(own, dict):
+        return {name: torch.cat([own[name], further[name]]) for name in own}
+    return None if own is None else torch.cat([own, further])

@@ -1,0 +1,143 @@
+"""How a trial was run, beyond its action: keyword arguments of a simulator's function.
+
+A function ``fn(theta, action)`` may take any of ``times``, shape (n, k), at which x is
+measured; ``inputs``, {name: (n, m)}, over time; ``input_times``, (m,), their uniform
+grid; and ``start``, the measured start states, (n, d) or {name: (n,)}.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.actions.signals import SignalActions
+
+#: Names of these arguments.
+CONDITIONS = ("times", "inputs", "input_times", "start")
+#: What gives each of them.
+SOURCES = {
+    "times": "SimulatorModel(sample_times=...) or Trials(sample_times=...)",
+    "inputs": "Trials(inputs=...)",
+    "input_times": "Trials(inputs=..., input_times=...)",
+    "start": "Trials(start=...)",
+}
+
+
+def conditions_of(
+    fn: Callable[..., Any], keywords: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return which of them a function takes, and which it cannot do without.
+
+    A ``functools.partial`` that binds one has decided it.
+
+    Args:
+        fn: The function.
+        keywords: Names of its keyword arguments.
+    """
+    bound = getattr(inspect.unwrap(fn), "keywords", {})
+    takes = tuple(c for c in CONDITIONS if c in keywords and c not in bound)
+    if not takes:
+        return (), ()
+    parameters = inspect.signature(fn).parameters
+    none = inspect.Parameter.empty
+    return takes, tuple(c for c in takes if parameters[c].default is none)
+
+
+def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> None:
+    """Raise where a function lacks what it cannot do without."""
+    for name in needed:
+        if name not in given:
+            raise ValueError(
+                f"expected {name} for a simulator whose function requires it; got "
+                f"none; pass {SOURCES[name]}, or give the argument a default"
+            )
+
+
+def require_taken(inputs: SignalActions | None, conditions: tuple[str, ...]) -> None:
+    """Raise where signals are given that a function does not take."""
+    if inputs is not None and "inputs" not in conditions:
+        raise ValueError(
+            "expected a function that takes the signals of its actions; got one "
+            "without an argument 'inputs'; write fn(theta, action, *, inputs)"
+        )
+
+
+def played(space: SignalActions, action: Tensor, dtype: torch.dtype) -> dict[str, Any]:
+    """Return the signals of actions as inputs and input_times.
+
+    Args:
+        space: Of the actions.
+        action: Shape (n, action_dim); equal ones are generated once.
+        dtype: Of the series.
+    """
+    each, place = torch.unique(action, dim=0, return_inverse=True)
+    return {
+        "inputs": {
+            name: series[place].to(dtype) for name, series in space.inputs(each).items()
+        },
+        "input_times": space.input_times.to(dtype),
+    }
+
+
+def require_rows_each(name: str, value: Any, num: int) -> None:
+    """Raise where a keyword argument is neither a number nor one a row."""
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            require_rows_each(f"{name}[{key!r}]", part, num)
+    elif name != "input_times" and np.ndim(value) and len(value) != num:
+        raise ValueError(
+            f"expected {name} as a number or one a row, shape ({num}, ...); got "
+            f"{tuple(np.shape(value))}; repeat it for each row"
+        )
+
+
+def at_rows(keywords: Mapping[str, Any], at: Any) -> dict[str, Any]:
+    """Return keyword arguments of some rows; numbers belong to all."""
+    return {
+        name: value if name == "input_times" else _part(value, at)
+        for name, value in keywords.items()
+    }
+
+
+def _part(value: Any, at: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _part(part, at) for key, part in value.items()}
+    return value[at] if np.ndim(value) else value
+
+
+def typed(value: Any, dtype: torch.dtype) -> Any:
+    """Return tensors in a type, those of a dict too; None stays None."""
+    if isinstance(value, Mapping):
+        return {name: typed(part, dtype) for name, part in value.items()}
+    return None if value is None else value.to(dtype)
+
+
+def as_arrays(value: Any) -> Any:
+    """Return keyword arguments with float64 arrays in place of tensors and numbers."""
+    if isinstance(value, Mapping):
+        return {name: as_arrays(part) for name, part in value.items()}
+    return np.asarray(value, dtype=np.float64)
+
+
+def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
+    """Return the keyword arguments of a row, from those of all, as copies of its own.
+
+    Args:
+        arrays: From :func:`as_arrays`.
+        i: Of the row.
+    """
+    return {
+        name: value.copy() if name == "input_times" else _row(value, i)
+        for name, value in arrays.items()
+    }
+
+
+def _row(value: Any, i: int) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _row(part, i) for key, part in value.items()}
+    return value[i].copy() if value.ndim else float(value)

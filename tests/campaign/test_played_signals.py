@@ -1,0 +1,100 @@
+"""A campaign whose actions are signals that a motor plays."""
+
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import Campaign, GaussianNoise, SimulatorModel
+from sbi_active.actions import SignalActions
+from sbi_active.actions.waveforms import step
+from sbi_active.criticism import Criticism, Trials, generic_effects
+
+GRID = torch.linspace(0, 1, 51)
+TIMES = torch.linspace(0.1, 1.0, 10)
+SPACE = SignalActions(
+    step("voltage", begin=0.1),
+    [0.2, 0.05],
+    [2.0, 0.8],
+    input_times=GRID,
+    units=["V", "s"],
+    duration=0.7,
+)
+PRIOR = BoxUniform(torch.tensor([1.0, 0.05]), torch.tensor([5.0, 0.5]))
+TRUTH = torch.tensor([[3.0, 0.2]])
+
+
+def speed(theta, action, *, inputs, times):
+    """A first-order motor, tau w' = k u - w, on the grid of its voltage."""
+    gain, tau = theta.unbind(1)
+    keep = torch.exp(-0.02 / tau)
+    w, found = torch.zeros_like(gain), []
+    for u in inputs["voltage"].unbind(1):
+        found.append(w)
+        w = keep * w + (1 - keep) * gain * u
+    series = torch.stack(found, 1)
+    return series.gather(1, (times / 0.02).round().long())
+
+
+MODEL = SimulatorModel(
+    speed,
+    noise=GaussianNoise(0.02),
+    parameter_names=["gain", "tau"],
+    sample_times=TIMES,
+    inputs=SPACE,
+)
+
+
+def motor(action, seed, *, dead=0.0):
+    """The real one, which plays what it is given."""
+    u = SPACE.inputs(action)["voltage"][None]
+    u = u.sign() * (u.abs() - dead).clamp(min=0)
+    x = speed(TRUTH, None, inputs={"voltage": u}, times=TIMES[None])[0]
+    gen = torch.Generator().manual_seed(seed)
+    return x + 0.02 * torch.randn(x.shape, generator=gen)
+
+
+def test_a_campaign_asks_for_signals_and_learns():
+    campaign = Campaign(MODEL, PRIOR, SPACE, seed=0)
+    for k in range(3):
+        trial = campaign.ask()
+        assert bool(SPACE.contains(trial.action))
+        assert SPACE.inputs(trial.action)["voltage"].shape == (51,)
+        campaign.tell(motor(trial.action, k))
+    campaign.update()
+    mean, sd = campaign.belief.mean, campaign.belief.stddev
+    assert bool(((mean - TRUTH[0]).abs() < 4 * sd + 0.01).all())
+    assert bool((sd < torch.tensor([0.1, 0.02])).all())
+    assert campaign.health == "ok"
+
+
+def test_a_dead_zone_of_the_motor_is_found():
+    action = SPACE.sample((8,), seed=1)
+    x = torch.stack([motor(a, k, dead=0.15) for k, a in enumerate(action)])
+    effects = generic_effects(MODEL, SPACE, prior=PRIOR)
+    names = {e.name for e in effects}
+    assert {"input offset", "input lag", "sensor delay"} <= names
+    assert not [e for e in effects if e.hook == "action"]
+    loop = Criticism(MODEL, PRIOR, Trials(action, x), effects=effects, actions=SPACE)
+    # Of one sign, a dead zone is an offset while the voltage is on, and none else.
+    assert loop.detect().alarm
+    chosen = loop.next_action()
+    assert chosen.action is None or bool(SPACE.contains(torch.tensor(chosen.action)))
+
+
+def test_recorded_inputs_take_the_place_of_the_signals():
+    action = SPACE.sample((6,), seed=1)
+    commanded = SPACE.inputs(action)["voltage"]
+    measured = 0.8 * commanded  # by a voltmeter
+    keywords = {"sample_times": TIMES, "input_times": GRID}
+    x = speed(
+        TRUTH.expand(6, -1),
+        None,
+        inputs={"voltage": measured},
+        times=TIMES.expand(6, -1),
+    )
+    trials = Trials(action, x, inputs={"voltage": measured}, **keywords)
+    loop = Criticism(MODEL, PRIOR, trials, actions=SPACE)
+    assert loop.trace().verdict == "none"
+    posterior = loop.rivals.fit().evidence.draws
+    assert abs(posterior[:, 0].mean() - 3.0) < 0.05
+    assert loop.actions is SPACE
+    assert loop.equivalent() == ()

@@ -1,0 +1,170 @@
+"""Inputs over time: names, one grid for all trials, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from sbi_active.criticism import Trials
+
+X = torch.zeros(2, 3)
+TIMES = torch.tensor([0.0, 0.5, 1.0])
+FINE = torch.linspace(0, 1, 11)
+
+
+def trials(inputs, input_times=FINE, **keywords):
+    keywords = {"sample_times": TIMES, **keywords}
+    return Trials(None, X, inputs=inputs, input_times=input_times, **keywords)
+
+
+def test_what_is_on_a_uniform_grid_stays():
+    voltage = torch.randn(2, 11).double()
+    found = trials({"voltage": voltage, "load": torch.arange(11.0)})
+    assert found.inputs is not None
+    assert found.input_times is not None
+    assert torch.equal(found.inputs["voltage"], voltage)
+    assert torch.equal(found.inputs["load"], torch.arange(11.0).double().expand(2, -1))
+    assert torch.equal(found.input_times, FINE.double())
+
+
+def test_without_actions_the_action_is_a_label():
+    found = trials({"voltage": torch.zeros(2, 11)})
+    assert found.action_is_label
+    assert found.action[:, 0].tolist() == [0, 1]
+    assert found.action_labels == ("trial",)
+    some = found.select([1])
+    assert some.action_is_label
+    assert some.action.tolist() == [[1.0]]
+    own = Trials(torch.ones(2), X, inputs=torch.zeros(2, 11), input_times=FINE)
+    assert not own.action_is_label
+
+
+def test_arrays_without_a_name():
+    one = trials(torch.zeros(2, 11)).inputs
+    assert one is not None
+    assert [*one] == ["input"]
+    two = trials(torch.zeros(2, 11, 2)).inputs
+    assert two is not None
+    assert [*two] == ["input 1", "input 2"]
+    assert two["input 2"].shape == (2, 11)
+
+
+def test_values_are_held_on_the_finest_grid():
+    found = trials(
+        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
+        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
+    )
+    assert found.inputs is not None
+    assert found.input_times is not None
+    assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1.0, 1.25]
+    assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
+
+
+def test_values_are_drawn_as_lines_where_asked():
+    found = trials(
+        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
+        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
+        input_hold="linear",
+    )
+    assert found.inputs is not None
+    expected = [[1, 1.5, 2, 2.5, 3, 3], [5, 5, 6, 7, 8, 9]]
+    assert torch.allclose(found.inputs["input"], torch.tensor(expected).double())
+
+
+def test_jitter_does_not_move_values():
+    """A value whose stamp is late by less than a thousandth step is on time."""
+    steps = np.arange(11) * 0.1
+    late = steps + 1e-6 * np.array([0, 1, -1, 1, 0, -1, 1, 0, 0, 1, 0])
+    found = trials(torch.arange(11.0).expand(2, -1), np.stack([steps, late]))
+    assert found.inputs is not None
+    assert found.inputs["input"].tolist() == [[*range(11)]] * 2
+
+
+def test_a_selection_is_not_resampled_again():
+    found = trials(
+        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
+        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
+        role=["fit", "held out"],
+        start=torch.tensor([[1.0, 2.0], [3.0, 4.0]]),
+    )
+    assert found.held_out is not None
+    assert found.held_out.inputs is not None
+    assert found.inputs is not None
+    assert torch.equal(found.held_out.inputs["input"], found.inputs["input"][1:])
+    assert found.held_out.input_times is not None
+    assert torch.equal(found.held_out.input_times, found.input_times)
+    assert found.held_out.start.tolist() == [[3.0, 4.0]]
+
+
+def test_times_of_x_are_those_of_as_many_inputs():
+    found = trials(torch.zeros(2, 3), None)
+    assert found.input_times is not None
+    assert found.input_times.tolist() == TIMES.tolist()
+
+
+def test_equal_inputs_make_repeats():
+    same = trials(torch.zeros(2, 11))
+    assert same.repeat_of.tolist() == [-1, 0]
+    assert trials(torch.randn(2, 11)).repeat_of.tolist() == [-1, -1]
+    other = Trials(torch.ones(2), X, inputs=torch.randn(2, 11), input_times=FINE)
+    assert other.repeat_of.tolist() == [-1, -1]
+
+
+def test_start_states_by_name_and_by_row():
+    named = trials(torch.zeros(2, 11), start={"angle": [0.1, 0.2]})
+    assert named.start["angle"].tolist() == [0.1, 0.2]
+    assert named.select([1]).start["angle"].tolist() == [0.2]
+    assert trials(torch.zeros(2, 11), start=[0.1, 0.2]).start.shape == (2, 1)
+
+
+NAN = torch.zeros(2, 11).index_put(
+    (torch.tensor(1), torch.tensor(4)), torch.tensor(torch.nan)
+)
+BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"inputs": NAN}, "of input 'input' .* NaN in trial 1, value 4; fill it in"),
+        ({"inputs": {"u": torch.zeros(3, 11)}}, "input 'u' of shape .2, m."),
+        ({"inputs": torch.zeros(2, 11), "input_times": BACK}, "increase.* trial 0"),
+        (
+            {
+                "inputs": torch.zeros(2, 4),
+                "input_times": [[0, 0.1, 0.2, 1.0], [0.0, 0.1, 0.2, 0.3]],
+            },
+            "without gaps; got none from 0.2 to 1 in trial 0",
+        ),
+        ({"inputs": torch.zeros(2, 11), "input_times": None}, "expected input_times"),
+        ({"inputs": None, "input_times": FINE, "action": [1.0, 2.0]}, "got none; pass"),
+        ({"inputs": None}, "expected actions, or inputs"),
+        (
+            {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
+            "x of trial 0 measured within the time of its inputs input, 0 to 0.001",
+        ),
+        (
+            {
+                "inputs": torch.zeros(2, 11),
+                "input_times": torch.stack([FINE, 5000 + FINE]),
+                "sample_times": torch.stack([TIMES, 5000 + TIMES]),
+            },
+            "similar times; .* from its own begin",
+        ),
+        ({"inputs": torch.zeros(2, 11), "input_hold": "cubic"}, "'previous' or"),
+        ({"inputs": torch.zeros(2, 11), "start": [1.0]}, "start states of shape"),
+        (
+            {"inputs": torch.zeros(2, 11), "start": {"w": [1.0, torch.nan]}},
+            "'w' without a number in trials .1.",
+        ),
+        ({"inputs": torch.zeros(2, 11), "input_labels": ["a", "b"]}, "input_labels"),
+    ],
+)
+def test_bad_inputs(arguments, message):
+    keywords = {
+        "action": None,
+        "input_times": FINE,
+        "sample_times": TIMES,
+        **arguments,
+    }
+    with pytest.raises(ValueError, match=message):
+        Trials(x=X, **keywords)

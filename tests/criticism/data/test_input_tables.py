@@ -1,0 +1,175 @@
+"""Inputs over time and start states from tables."""
+
+import pandas as pd
+import pytest
+import torch
+
+from sbi_active.criticism import Trials
+
+LONG = "trial,time_ms,input_voltage[V],x_speed[rad/s],start_angle[rad]"
+SAMPLES = ["a,0,1,0.1,.5", "a,100,2,0.2,.5", "b,0,3,0.3,.7", "b,100,4,0.4,.7"]
+OTHER = ["a,0,1", "a,10,2", "a,20,3", "b,0,4", "b,10,5", "b,20,6", "c,0,0", "c,10,0"]
+X = ["a,0,0.1", "a,0.02,0.2", "b,0.01,0.3"]
+
+
+def write(name, rows, header):
+    with open(name, "w") as file:
+        file.write("\n".join([header, *rows]) + "\n")
+
+
+def read(rows, header=LONG, **options):
+    write("trials.csv", rows, header)
+    return Trials.from_csv("trials.csv", **options)
+
+
+def beside(inputs=OTHER, header="trial,time_ms,input_u[V]", x=X, **options):
+    write("inputs.csv", inputs, header)
+    return read(x, "trial,time,x_y", inputs="inputs.csv", **options)
+
+
+def test_inputs_stand_beside_x():
+    trials = read(SAMPLES)
+    assert trials.action_is_label
+    assert trials.inputs is not None
+    assert trials.inputs["voltage"].tolist() == [[1, 2], [3, 4]]
+    assert trials.input_labels == ("voltage [V]",)
+    assert trials.input_times is not None
+    assert trials.input_times.tolist() == [0, 0.1]
+    assert isinstance(trials.start, dict)
+    assert trials.start["angle"].tolist() == [0.5, 0.7]
+
+
+def test_rows_of_inputs_alone_are_no_samples(recwarn):
+    rows = ["a,0,1,0.1", "a,10,2,", "a,20,3,0.2", "a,30,4,"]
+    more = ["b,0,1,0.3", "b,10,2,", "b,20,3,0.4", "b,30,4,"]
+    trials = read([*rows, *more], "trial,time_ms,input_u,x_y")
+    assert trials.x.tolist() == [[0.1, 0.2], [0.3, 0.4]]
+    assert trials.sample_times.tolist() == [[0, 0.02]] * 2
+    assert trials.inputs is not None
+    assert trials.inputs["u"].tolist() == [[1, 2, 3, 4]] * 2
+    assert not [w for w in recwarn if "no number" in str(w.message)]
+
+
+def test_rows_of_x_alone_hold_the_input():
+    rows = ["a,0,1,0.1", "a,10,2,0.3", "a,15,,0.2", "a,20,4,0.5"]
+    with pytest.warns(UserWarning, match="1 rows of trials.csv .* no input.* row 3"):
+        trials = read([*rows, "b,0,0,1", "b,10,1,2"], "trial,time_ms,input_u,x_y")
+    assert trials.inputs is not None
+    assert trials.inputs["u"].tolist() == [[1, 2, 4], [0, 1, 1]]
+    assert trials.x.shape == (2, 4)
+
+
+def test_inputs_come_from_another_file_on_their_own_grid():
+    trials = beside()
+    assert trials.inputs is not None
+    assert trials.inputs["u"].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert trials.sample_times[0].tolist() == [0, 0.02]
+    frames = [pd.read_csv(name) for name in ("trials.csv", "inputs.csv")]
+    again = Trials.from_dataframe(frames[0], inputs=frames[1])
+    assert again.inputs is not None
+    assert torch.equal(again.inputs["u"], trials.inputs["u"])
+    lines = beside(["a,0,1", "a,10,2", "b,0,1", "b,5,2", "b,10,4"], input_hold="linear")
+    assert lines.inputs is not None
+    assert lines.inputs["u"][0].tolist() == [1, 1.5, 2]
+
+
+def test_trials_may_share_the_series_of_another_file():
+    trials = beside(["0,1", "10,2", "20,3"], "time_ms,input_u")
+    assert trials.inputs is not None
+    assert trials.inputs["u"].tolist() == [[1, 2, 3]] * 2
+
+
+def test_columns_of_another_file_may_have_names_of_their_own():
+    write("inputs.csv", OTHER, "run,t_ms,volt")
+    write("trials.csv", X, "run,t,speed")
+    told = {"trial": "run", "time": "t", "x": "speed", "input": "volt"}
+    with pytest.raises(ValueError, match="expected a column time for time"):
+        Trials.from_csv("trials.csv", columns=told, inputs="inputs.csv")
+    write("inputs.csv", OTHER, "run,t,volt")
+    write("trials.csv", [r.replace("0.0", "") for r in X], "run,t,speed")
+    units = {"t": "ms", "volt": "V"}
+    trials = Trials.from_csv(
+        "trials.csv", columns=told, inputs="inputs.csv", units=units
+    )
+    assert trials.input_labels == ("volt [V]",)
+    assert trials.input_times is not None
+    assert trials.input_times.tolist() == [0, 0.01, 0.02]
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        (
+            ["a,0,1,5", "a,1,2,5"],
+            "trial,time,action_u,x_y",
+            "got 1.0 in row 1 and 2.0 in row 2 .* call it input_u if it is commanded",
+        ),
+        (["1,2"], "input_u,x_y", "columns trial and time with inputs over time"),
+        (
+            ["a,0,1,,5", "a,1,2,3,5", "a,2,3,4,5"],
+            "trial,time,input_u,input_v,x_y",
+            "all inputs in a row.* input v, row 1 .trial a.",
+        ),
+        (
+            ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
+            "trial,time,input_u,x_y",
+            "none from 2 to 9 s between row 3 .trial a. and row 4 .* fill in",
+        ),
+        (
+            ["a,0,1,5", "b,0,1,5", "b,1,1,5"],
+            "trial,time,input_u,x_y",
+            "two or more rows of inputs of trial a; got 1 .* as action_",
+        ),
+        (
+            ["a,0,1,5,0", "a,1,1,5,1"],
+            "trial,time,input_u,x_y,start_w",
+            "one value of start_w in each trial; .* value at the start in each row",
+        ),
+        (
+            ["a,0,1 V,5", "a,1,1,5"],
+            "trial,time,input_u,x_y",
+            "a number in column input_u, row 1 .trial a.; got '1 V'",
+        ),
+    ],
+)
+def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
+    with pytest.raises(ValueError, match=message):
+        read(rows, header)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"inputs": OTHER[:3]},
+            "none of trial b in inputs.csv, whose trials are a; add",
+        ),
+        (
+            {"header": "trial,time,input_u"},  # ms taken for s
+            None,
+        ),
+        (
+            {"inputs": ["a,0,1", "a,1,2", "b,0,1", "b,1,2"]},
+            "x within the time of its inputs, 0 to 0.001 s in inputs.csv; got x at "
+            "0.02 s in row 2 .trial a. of trials.csv",
+        ),
+        (
+            {"header": "trial,time,input_u,x_z", "inputs": ["a,0,1,1"]},
+            "got x_z in inputs",
+        ),
+        ({"header": "trial,time,u"}, "in a table of inputs; got trial, time, u"),
+        ({"inputs": ["a,0,1", "a,0,2"]}, "each sample once; .* rows 1 and 2 of inputs"),
+    ],
+)
+def test_another_table_that_is_not_understood(arguments, message):
+    if message is None:
+        assert beside(**arguments).input_times[-1] == 20
+        return
+    with pytest.raises(ValueError, match=message):
+        beside(**arguments)
+
+
+def test_inputs_stand_in_one_table():
+    write("inputs.csv", OTHER, "trial,time_ms,input_u")
+    with pytest.raises(ValueError, match="inputs in one table; got input_voltage"):
+        read(SAMPLES, inputs="inputs.csv")

@@ -1,0 +1,82 @@
+"""Trials from a folder of recordings."""
+
+from pathlib import Path
+
+import pytest
+
+from sbi_active.criticism import Trials
+
+HEADER = "time_ms,action_speed[m/s],x_height[m]"
+
+
+def write(name, *rows, header=HEADER):
+    Path("runs").mkdir(exist_ok=True)
+    (Path("runs") / name).write_text("\n".join([header, *rows]) + "\n")
+
+
+def test_a_file_a_trial():
+    write("run_10.csv", "0,2,5.2", "100,2,5.1", "300,2,4.0")
+    write("run_2.csv", "0,1,5.0", "100,1,4.9")
+    trials = Trials.from_csv("runs", order="unknown")
+    assert trials.names == ("run_2", "run_10")
+    assert trials.action.tolist() == [[1], [2]]
+    assert trials.sample_times[1].tolist() == pytest.approx([0, 0.1, 0.3])
+    assert trials.x[0].nan_to_num(-1).tolist() == [5.0, 4.9, -1]
+    assert trials.channel_labels == ("height [m]",)
+    assert trials.order == "unknown"
+
+
+def test_columns_of_other_names():
+    write("a.csv", "0,1,5", "1,1,6", header="t,u,h")
+    write("b.csv", "0,2,5", "1,2,7", header="t,u,h")
+    told = {"time": "t", "action": "u", "x": "h"}
+    trials = Trials.from_csv("runs", columns=told, units={"h": "m"})
+    assert trials.names == ("a", "b")
+    assert trials.channel_labels == ("h [m]",)
+
+
+def test_files_of_several_trials_have_the_file_in_the_name():
+    header = f"trial,{HEADER}"
+    write("monday.csv", "1,0,1,5", "1,100,1,4", "2,0,2,5", header=header)
+    write("tuesday.csv", "1,0,1,5.5", "1,100,1,4", header=header)
+    trials = Trials.from_csv("runs")
+    assert trials.names == ("monday 1", "monday 2", "tuesday 1")
+
+
+def test_files_where_a_row_is_a_trial_go_on_from_each_other():
+    write("a.csv", "1,2", "2,3", header="action_v,x_y")
+    write("b.csv", "4,5", header="action_v,x_y")
+    trials = Trials.from_csv("runs")
+    assert trials.action[:, 0].tolist() == [1, 2, 4]
+    assert trials.names == ("0", "1", "2")
+
+
+def test_one_table_goes_before_others():
+    write("trials.csv", "1,2", "2,3", header="action_v,x_y")
+    write("notes.csv", "whatever", header="text")
+    assert len(Trials.from_csv("runs")) == 2
+
+
+def test_what_is_wrong_is_said_with_its_file_and_row():
+    write("a.csv", "0,1,5", "100,1,6")
+    write("b.csv", "0,1,5.5", "100,1,5 m")
+    with pytest.raises(ValueError, match=r"column x_height\[m\], row 2 .*runs/b.csv"):
+        Trials.from_csv("runs")
+    write("b.csv", "0,1,5.5", "100,1,", header=HEADER)
+    with pytest.warns(UserWarning, match="hold no number") as noted:
+        Trials.from_csv("runs")
+    (one,) = [str(note.message) for note in noted]
+    assert "1 of 2 cells of column x_height[m] in runs/b.csv hold no number" in one
+
+
+def test_recordings_with_other_columns_or_the_same_numbers_are_refused():
+    write("a.csv", "0,1,5", "100,1,6")
+    write("b.csv", "0,1,5", header="time_s,action_speed[m/s],x_height[m]")
+    with pytest.raises(ValueError, match=r"same columns .* time_s.* in runs/b\.csv"):
+        Trials.from_csv("runs")
+    write("b.csv", "0,1,5", "100,1,6")
+    with pytest.raises(ValueError, match="same numbers in trials a and b of runs"):
+        Trials.from_csv("runs")
+    Path("empty").mkdir()
+    with pytest.raises(ValueError, match="expected recordings in empty; got no"):
+        Trials.from_csv("empty")

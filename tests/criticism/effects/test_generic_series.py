@@ -1,0 +1,117 @@
+"""Generic effects of recordings: which there are, and that a loop finds them."""
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Trials, generic_effects
+from sbi_active.criticism.effects.series import delayed_input, played
+from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
+
+ACTUATOR = {
+    "input gain",
+    "input offset",
+    "input saturation",
+    "dead zone",
+    "input delay",
+    "input lag",
+    "backlash",
+}
+SENSOR = {
+    "bias",
+    "sensor gain",
+    "drift",
+    "sensor saturation",
+    "drift in time",
+    "sensor delay",
+    "sensor lag",
+    "sensor quantum",
+}
+
+
+def test_a_recording_has_an_actuator_and_a_sensor():
+    effects = generic_effects(MODEL, measured(0, {}), prior=PRIOR)
+    assert {e.name for e in effects} == ACTUATOR | SENSOR
+    assert {e.name for e in effects if e.hook == "input"} == ACTUATOR
+    assert not [e for e in effects if e.hook == "action"]
+
+
+def test_several_inputs_give_their_names():
+    trials = Trials(
+        torch.tensor([1.0, 2.0]),
+        torch.zeros(2, 3),
+        sample_times=[0.0, 1.0, 2.0],
+        inputs={"voltage": torch.randn(2, 21), "flow": torch.rand(2, 21)},
+        input_times=torch.linspace(0, 2, 21),
+        input_labels=["voltage [V]", "flow"],
+        action_labels=["mass [kg]"],
+    )
+    model = SimulatorModel(
+        lambda theta, action, *, inputs: theta * inputs["flow"][:, :3], noise=0.1
+    )
+    effects = {e.name: e for e in generic_effects(model, trials)}
+    assert {"voltage gain", "flow gain", "voltage dead zone"} <= {*effects}
+    assert "flow dead zone" not in effects  # it has one sign
+    assert effects["voltage offset"].units == "V"
+    assert effects["action offset"].units == "kg"
+
+
+def distorted(change):
+    """Trials of a motor whose voltage is changed before it acts."""
+    trials = measured(0, {}, held_out=0)
+    assert trials.inputs is not None
+    real = {"voltage": change(trials.inputs["voltage"])}
+    rows = len(trials)
+    assert trials.sample_times is not None
+    x = speed(
+        torch.tensor([[3.0, 0.3]]).double().expand(rows, -1),
+        trials.action,
+        inputs=real,
+        times=trials.sample_times.expand(rows, -1),
+        input_times=GRID,
+        start=trials.start,
+    )
+    gen = torch.Generator().manual_seed(5)
+    x = x + NOISE * torch.randn(x.shape, generator=gen).double()
+    return Trials(
+        None,
+        x,
+        sample_times=trials.sample_times,
+        inputs=trials.inputs,
+        input_times=GRID,
+        start=trials.start,
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (
+            "input delay",
+            lambda u: delayed_input(u, torch.full((len(u), 1), 0.07), 0.02),
+        ),
+        ("backlash", lambda u: played(u, torch.full((len(u), 1), 0.5).double())),
+        ("input offset", lambda u: u + 0.15),
+    ],
+)
+def test_what_an_actuator_does_is_found(name, change):
+    trials = distorted(change)
+    effects = generic_effects(MODEL, trials, prior=PRIOR)
+    loop = Criticism(MODEL, PRIOR, trials, effects=effects)
+    named = {
+        part for group in loop.trace().equivalent if name in group for part in group
+    }
+    assert loop.trace().verdict == name or loop.trace().verdict in named
+    assert not any({"none", "input lag"} <= group for group in loop.trace().equivalent)
+    assert not any({"none", name} <= group for group in loop.trace().equivalent)
+
+
+def test_a_required_time_of_the_trials_is_enough():
+    model = SimulatorModel(
+        lambda theta, action, *, times: theta * times, noise=GaussianNoise(0.1)
+    )
+    times, prior = torch.linspace(0, 1, 5), BoxUniform(torch.zeros(1), torch.ones(1))
+    trials = Trials(torch.ones(3), torch.zeros(3, 5), sample_times=times)
+    names = {e.name for e in generic_effects(model, trials, prior=prior)}
+    assert {"action gain", "sensor lag", "drift in time"} <= names

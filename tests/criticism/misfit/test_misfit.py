@@ -1,0 +1,197 @@
+"""The closed loop where every model misses by more than the sensor's error."""
+
+import pytest
+import torch
+
+from sbi_active import SimulatorModel
+from sbi_active.criticism import Criticism, Trials, close_loop
+from sbi_active.criticism.misfit import find_misfit
+from sbi_active.criticism.results import ModelKey
+from sbi_active.simulation import AutocorrelatedNoise
+from tests.criticism.misfit.oscillator import (
+    ACTION,
+    EFFECTS,
+    MODEL,
+    PRIOR,
+    SENSOR,
+    trials,
+)
+
+HIDDEN, LAG = 0.6, 0.3
+
+
+def loop(own, effects=EFFECTS, model=MODEL, **options):
+    return Criticism(model, PRIOR, own, effects=effects, seed=0, **options)
+
+
+@pytest.fixture(scope="module")
+def named():
+    """Trials with lag, beside a force that nobody declared."""
+    return loop(trials(lag=LAG, hidden=HIDDEN))
+
+
+def test_the_cause_is_named_beside_what_nobody_declared(named):
+    tracing = named.trace()
+    assert tracing.verdict == "lag"
+    assert tracing.misfit.cause["lag"] > 0.5
+    assert tracing.misfit.better["lag"] > 0.9
+    bare, own = tracing.misfit.of("none"), tracing.misfit.of(tracing.model)
+    assert own.left_out[0] < 0.5 * bare.left_out[0]
+    assert own.remains < 0.5
+    assert own.left_out[0] > 1.5 * SENSOR  # the hidden force is there
+    assert not tracing.misfit.passes
+
+
+def test_alarm_and_verdict_rest_on_one_evidence(named):
+    detection, tracing = named.detect(), named.trace()
+    assert detection.alarm
+    none, lag = tracing.evidences["none"], tracing.evidences["lag"]
+    assert detection.log_bayes_factor > lag.log_evidence - none.log_evidence
+
+
+def test_the_report_says_what_remains(named):
+    report = named.report()
+    text = " ".join(str(report).split())
+    assert text.startswith("Verdict: lag, probably the cause (P = 0.")
+    assert "Lag: probably the cause (0." in text
+    assert "% of the excess over the sensor's remains" in text
+    assert "Models that predict" in text
+    assert report.parameters.set_index("parameter").loc["lag", "after"] > 0.05
+    assert report.evaluation.scheme == "leave one out"
+    rmse = report.before_after.set_index("metric").loc["RMSE".lower()]
+    assert rmse["ratio"] < 0.6
+
+
+def test_a_misfit_that_passes_for_the_sensor_is_known_once_nothing_explains_it(
+    monkeypatch,
+):
+    """As correlated errors do, until a process that follows the action is tried."""
+
+    def late(rivals, equivalent, *, is_known=False):
+        return find_misfit(rivals, equivalent, is_known=True) if is_known else None
+
+    monkeypatch.setattr("sbi_active.criticism.criticism.find_misfit", late)
+    found = loop(trials(lag=0.12, hidden=0.15))
+    assert found.misfit() is None
+    assert found.trace().verdict == "lag"
+    assert found.trace().misfit is not None
+    assert found.rivals.fit(ModelKey(("lag",))).evidence.engine == "linear"
+
+
+def test_without_the_effect_in_the_library_nothing_takes_its_place(named):
+    found = loop(trials(lag=LAG, hidden=HIDDEN), EFFECTS[:2]).trace()
+    assert found.verdict == "unexplained"
+    assert found.misfit.named == ()
+
+
+def test_misfit_alone_names_nothing():
+    found = loop(trials(hidden=3 * HIDDEN), EFFECTS[2:])
+    report = found.report(evaluate=False)
+    assert found.trace().verdict == "unexplained"
+    assert "The bare model misses the 8 trials" in " ".join(str(report).split())
+
+
+@pytest.mark.parametrize("effects", [{}, {"friction": 0.2}])
+def test_a_model_that_fits_to_the_sensor_needs_none_of_it(effects):
+    found = loop(trials(**effects))
+    assert found.misfit() is None
+    assert found.trace().verdict == (" + ".join(effects) or "none")
+
+
+def test_one_trial_with_a_gross_error_is_no_misfit():
+    own = trials()
+    own.x[3] += 20 * SENSOR
+    found = loop(own)
+    assert found.misfit() is None
+    assert found.trace().verdict == "outlier"
+
+
+def test_effects_that_are_weak_alone_are_found_together():
+    own = trials(lag=0.1, bias=0.03, hidden=HIDDEN)
+    found = loop(own).trace()
+    assert {"lag", "bias"} <= {*found.chosen}
+
+
+def test_the_order_of_effects_and_trials_does_not_matter():
+    own = trials(lag=LAG, hidden=HIDDEN)
+    turned = loop(own.select([*range(7, -1, -1)]), EFFECTS[::-1]).trace()
+    same = loop(own).trace()
+    assert {*turned.chosen} == {*same.chosen}
+    for name, cause in same.misfit.cause.items():
+        assert turned.misfit.cause[name] == pytest.approx(cause, abs=0.05)
+
+
+def test_held_out_trials_are_scored_for_every_admitted_model():
+    action = torch.cat([ACTION, torch.tensor([[0.8], [1.7]], dtype=torch.float64)])
+    every = trials(action=action, lag=LAG, hidden=HIDDEN)
+    own = Trials(
+        every.action,
+        every.x,
+        sample_times=every.sample_times,
+        role=["fit"] * 8 + ["held out"] * 2,
+    )
+    report = close_loop(MODEL, PRIOR, own, effects=EFFECTS, seed=0)
+    bare = report.tracing.misfit.of("none").held_out
+    after = report.tracing.misfit.of(report.tracing.model).held_out
+    assert after[0] < 0.6 * bare[0]
+    assert "On held-out trials" in str(report)
+    # The mean of the draws' predictions, and the prediction at their mean.
+    rmse = report.evaluation.table.set_index("metric").loc["rmse"]
+    assert rmse["before"] == pytest.approx(bare[0], rel=0.1)
+
+
+def test_a_sensor_beside_an_error_of_unknown_size_is_told_the_same_way():
+    noise = AutocorrelatedNoise.unknown(
+        sd=(0.5 * SENSOR, 1.0), correlation_time=(0.05, 4.0), measurement_sd=SENSOR
+    )
+    model = SimulatorModel(
+        MODEL.fn, noise=noise, batched=True, sample_times=MODEL.sample_times
+    )
+    own = trials(lag=LAG, hidden=HIDDEN)
+    found, known = loop(own, model=model).trace(), loop(own).trace()
+    assert found.verdict == known.verdict == "lag"
+    assert found.misfit.cause["lag"] == pytest.approx(
+        known.misfit.cause["lag"], abs=0.1
+    )
+    assert loop(trials(), model=model).trace().verdict == "none"
+
+
+def test_draws_of_every_recorded_model_are_its_posterior(named):
+    tracing = named.trace()
+    fit = named.rivals.fit(ModelKey(("lag",)))
+    assert fit.evidence is tracing.evidences["lag"]
+    assert fit.sample.effective_sample_size >= 50
+    assert (
+        abs(fit.evidence.draws[:, -1].mean() - LAG)
+        < 3 * fit.evidence.draws[:, -1].std()
+    )
+
+
+def test_the_sensor_has_an_error_in_each_channel():
+    """The lag is that of the first sensor, in its own unit."""
+    units = torch.tensor([1.0, 100.0], dtype=torch.float64)
+
+    def fn(theta, action, *, lag=0.0):
+        x = MODEL.fn(theta, action, lag=lag)
+        return torch.stack([x, MODEL.fn(theta, action)], -1) * units
+
+    noise = AutocorrelatedNoise(
+        SENSOR * units, 1e-3, measurement_sd=(SENSOR * units).tolist()
+    )
+    model = SimulatorModel(
+        fn, noise=noise, batched=True, sample_times=MODEL.sample_times
+    )
+    one, other = trials(lag=LAG, hidden=HIDDEN).x, trials(seed=1, hidden=HIDDEN).x
+    own = Trials(
+        ACTION, torch.stack([one, 100 * other], -1), sample_times=MODEL.sample_times
+    )
+    found = loop(own, [EFFECTS[2]], model).trace()
+    assert found.misfit.sensor == pytest.approx([SENSOR, 100 * SENSOR])
+    bare, after = (found.misfit.of(name).left_out for name in ("none", "lag"))
+    assert after[0] < 0.7 * bare[0]
+    assert 100 * SENSOR < after[1] < bare[1]
+
+
+def test_an_error_of_measurement_is_positive():
+    with pytest.raises(ValueError, match="expected measurement_sd > 0; got 0"):
+        AutocorrelatedNoise(0.1, 1.0, measurement_sd=0.0)

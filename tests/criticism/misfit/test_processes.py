@@ -1,0 +1,168 @@
+"""The evidence under a residual process, against dense Gaussian integrals."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal, norm
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.misfit.intervals import shared_process
+from sbi_active.criticism.misfit.left_out import leave_out
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.misfit.processes import KERNELS, WIDTHS, Errors, integrated
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.error_models import NoiseCell
+
+NUM, SAMPLES = 7, 5
+
+
+def problem(*, low=-np.inf, ragged=False, num=NUM):
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(num, SAMPLES))
+    if ragged:
+        x[1, 3:] = np.nan
+    trials = Trials(np.arange(num) + 0.0, x, sample_times=np.arange(SAMPLES) * 0.1)
+    m = Measurements.of(trials)
+    jacobian = rng.normal(size=(len(m), 2))
+    model = LinearModel(
+        key=ModelKey(("a",)),
+        u=np.array([0.3, 0.4]),
+        residual=2 * rng.normal(size=len(m)),
+        jacobian=jacobian,
+        center=np.array([0.1, 0.0]),
+        sd=np.array([1.5, 0.8]),
+        scaled=np.array([False, True]),
+        low=np.array([-np.inf, low]),
+        high=np.array([np.inf, np.inf]),
+        own=2,
+    )
+    unit = np.full(len(m), 0.5)
+    errors = Errors(m, unit, [NoiseCell.of(m, sd=unit)], largest=2.0)
+    return model, errors
+
+
+def kernel(m, shape, tau):
+    apart = np.abs(m.time[:, None] - m.time) / tau
+    return shape(apart) * (m.trial[:, None] == m.trial)
+
+
+@pytest.mark.parametrize("ragged", [False, True])
+def test_the_evidence_is_that_of_the_dense_integral(ragged):
+    model, errors = problem(ragged=ragged)
+    m, rows = errors.measurements, model.rows
+    found = errors.posterior(model, errors.grams(rows))
+    logs, means = [], []
+    for shape in KERNELS:
+        for tau in errors.times:
+            for size in errors.sizes:
+                for width in WIDTHS:
+                    noise = np.eye(len(m)) + size**2 * kernel(m, shape, tau)
+                    prior = np.diag(model.widened(width) ** 2)
+                    design = rows[:, 1:]
+                    cov = noise + design @ prior @ design.T
+                    off = rows[:, 0] - design @ model.center
+                    logs.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
+                    gain = prior @ design.T @ np.linalg.inv(cov)
+                    means.append(model.center + gain @ off)
+    logs, means = np.array(logs), np.array(means)
+    p = np.exp(logs - logs.max())
+    assert found.log_process == pytest.approx(np.log(np.mean(p)) + logs.max())
+    assert found.mean == pytest.approx(p @ means / p.sum())
+    alone = []
+    for width in WIDTHS:
+        prior = np.diag(model.widened(width) ** 2)
+        cov = np.eye(len(m)) + rows[:, 1:] @ prior @ rows[:, 1:].T
+        off = rows[:, 0] - rows[:, 1:] @ model.center
+        alone.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
+    assert found.log_sensor == pytest.approx(np.log(np.mean(np.exp(alone))))
+
+
+def test_a_bound_of_phi_counts_by_the_posterior_within_it():
+    free, errors = problem()
+    bounded, _ = problem(low=0.0)
+    grams = errors.grams(free.rows)
+    use = np.ones(errors.num_folds, bool)
+    gram = grams.gram[-1:, use].sum(1)
+    shift = np.eye(3)
+    shift[1:, 0] = -free.center
+    gram = shift.T @ gram @ shift
+    log_z, mean, cov = integrated(gram, free, 1.0)
+    within = integrated(gram, bounded, 1.0)[0]
+    inside = norm.logsf(0.0, mean[0, 1], np.sqrt(cov[0, 1, 1]))
+    assert within[0] - log_z[0] == pytest.approx(inside - np.log(0.5))
+
+
+def test_left_out_errors_are_those_of_refits():
+    model, errors = problem()
+    left = leave_out(model, errors)
+    rows, fold = model.rows, errors.fold
+    scale = max(model.rms, 1.0)
+    prior = np.diag(1 / model.widened(3.0))
+    for k in range(errors.num_folds):
+        rest = fold != k
+        a = np.concatenate([rows[rest, 1:] / scale, prior])
+        b = np.concatenate([rows[rest, 0] / scale, prior @ model.center])
+        fit = np.linalg.lstsq(a, b, rcond=None)[0]
+        error = rows[~rest, 0] - rows[~rest, 1:] @ fit
+        assert left.refits[k] == pytest.approx(fit)
+        assert left.square[k] == pytest.approx(np.mean(error**2))
+
+
+def test_a_part_that_is_left_out_of_all_has_no_error():
+    model, errors = problem()
+    use = np.arange(errors.num_folds) != 2
+    left = leave_out(model, errors, use)
+    assert np.isnan(left.square[2])
+    assert np.isfinite(np.delete(left.square, 2)).all()
+
+
+def test_few_trials_are_left_out_in_parts():
+    _, errors = problem(num=3)
+    assert not errors.is_by_trial
+    assert errors.num_folds >= 8
+    m = errors.measurements
+    for k in range(errors.num_folds):
+        at = errors.fold == k
+        assert len(np.unique(m.trial[at])) == 1
+        assert np.ptp(np.flatnonzero(at)) == at.sum() - 1  # neighbors in time
+
+
+def test_a_process_that_trials_share_is_that_of_the_dense_integral():
+    model, errors = problem()
+    m, rows = errors.measurements, model.rows
+    action = np.linspace(-1, 1, NUM)[:, None]
+    mean, cov = shared_process(model, errors, action)
+    scaled = action / action.std()
+    square = (scaled - scaled.T) ** 2
+    logs, means, covs = [], [], []
+    between = [np.eye(NUM)]
+    for share in (0.5, 0.9):
+        for length in (0.7, 1e3):
+            shared = share * np.exp(-0.5 * square / length**2)
+            between.append(shared + (1 - share) * np.eye(NUM))
+    for shape in KERNELS:
+        for tau in errors.times:
+            apart = np.abs(m.time[:, None] - m.time) / tau
+            for a in between:
+                for size in errors.sizes[::2]:
+                    k = shape(apart) * a[m.trial[:, None], m.trial]
+                    noise = np.eye(len(m)) + size**2 * k
+                    prior = np.diag(model.sd**2)
+                    design = rows[:, 1:]
+                    whole = noise + design @ prior @ design.T
+                    off = rows[:, 0] - design @ model.center
+                    logs.append(multivariate_normal(cov=whole).logpdf(off))
+                    gain = prior @ design.T @ np.linalg.inv(whole)
+                    means.append(model.center + gain @ off)
+                    covs.append(prior - gain @ design @ prior)
+    p = np.exp(np.array(logs) - max(logs))
+    p, means = p / p.sum(), np.array(means)
+    assert mean == pytest.approx(p @ means, rel=1e-6)
+    off = means - p @ means
+    exact = np.einsum("h,hij->ij", p, np.array(covs)) + (p[:, None] * off).T @ off
+    assert cov == pytest.approx(exact, rel=1e-6)
+
+
+def test_trials_of_different_times_share_no_process():
+    model, errors = problem(ragged=True)
+    assert shared_process(model, errors, np.arange(NUM)[:, None] + 0.0) is None

@@ -1,0 +1,77 @@
+"""What helps and what is the cause, on errors that are given."""
+
+import numpy as np
+import pytest
+
+from sbi_active.criticism.misfit.rule import Scored, choose, predicts_better
+from sbi_active.criticism.results import ModelKey
+
+WIGGLE = 1 + 0.05 * np.sin(np.arange(8))
+
+
+def scored(log_p, square, *, passes=False):
+    return Scored(log_p, square * WIGGLE, passes)
+
+
+def models(**errors):
+    """Squared errors and log probabilities by names joined with _."""
+    return {
+        ModelKey(() if k == "none" else tuple(k.split("_"))): scored(*v)
+        for k, v in errors.items()
+    }
+
+
+def test_a_cause_is_certain_by_the_share_of_the_excess_that_it_removes():
+    found = choose(models(none=(0.0, 101.0), a=(20.0, 11.0), b=(1.0, 90.0)), "ab")
+    assert found.key == ModelKey(("a",))
+    assert found.remains["a"] == pytest.approx(0.1, abs=0.01)
+    assert found.cause["a"] == pytest.approx(0.85 * 0.9, abs=0.01)
+    assert found.better["a"] > 0.99
+
+
+def test_a_model_that_fits_to_the_sensor_leaves_nothing():
+    several = models(none=(0.0, 101.0), a=(20.0, 1.0))
+    several[ModelKey(("a",))] = scored(20.0, 1.0, passes=True)
+    assert choose(several, "a").cause["a"] == pytest.approx(1.0)
+
+
+def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
+    """A fast effect has the evidence, a slow one beside it the prediction."""
+    found = choose(
+        models(none=(0.0, 80.0), a=(60.0, 75.0), b=(2.0, 40.0), a_b=(50.0, 20.0)), "ab"
+    )
+    assert [*found.probabilities] == [ModelKey(("a", "b"))]
+    assert found.key == ModelKey(("a", "b"))
+    assert found.cause["a"] < 0.5 < found.better["a"]  # since b alone leaves half
+
+
+def test_an_effect_that_does_not_predict_better_is_dropped():
+    several = models(none=(0.0, 50.0), a=(20.0, 10.0), a_b=(25.0, 9.9), b=(0.0, 50.0))
+    uneven = 10.0 * np.array([0.8, 1.3, 0.9, 1.2, 0.7, 1.1, 1.0, 0.9])
+    several[ModelKey(("a", "b"))] = Scored(25.0, uneven, False)
+    found = choose(several, "ab")
+    assert found.key == ModelKey(("a",))
+    assert found.inclusion["b"] > 0.9
+
+
+def test_nothing_helps_where_left_out_trials_are_predicted_alike():
+    found = choose(models(none=(0.0, 50.0), a=(-1.0, 50.0), b=(0.5, 50.0)), "ab")
+    assert found.key == ModelKey()
+    assert found.cause == {}
+
+
+def test_effects_that_nothing_separates_share_their_mass():
+    several = models(none=(0.0, 101.0), a=(20.0, 11.0), b=(20.0, 11.0))
+    apart = choose(several, "ab")
+    assert apart.inclusion["a"] == pytest.approx(0.5)
+    together = choose(several, "ab", [frozenset("ab")])
+    assert len(together.key.effects) == 1
+    assert together.cause[together.key.effects[0]] < 0.5
+
+
+def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
+    one, other = np.array([1.0, 2.0, 3.0, 4.0]), np.array([2.0, 3.0, 5.0, 4.5])
+    assert predicts_better(one, other) > 0.9
+    assert predicts_better(one, other) == pytest.approx(1 - predicts_better(other, one))
+    few = predicts_better(np.append(one, np.nan), np.append(other, 1.0))
+    assert few == pytest.approx(predicts_better(one, other))

@@ -1,0 +1,107 @@
+"""Bars and lines of a log of what takes its time."""
+
+import logging
+import time
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Normal
+
+from sbi_active import GaussianNoise, SimulatorModel, progress
+from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.progress import stage
+
+SOON = 0.05
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch):
+    """Call long what takes a twentieth of a second."""
+    for name in ("LONG", "SHOWN", "SIGN"):
+        monkeypatch.setattr(progress, name, SOON)
+    monkeypatch.setattr(progress, "TICK", 0.01)
+
+
+def lines(caplog):
+    return [r.getMessage() for r in caplog.records if r.name == "sbi_active"]
+
+
+def test_steps_tell_how_long_the_rest_will_take(caplog, capsys):
+    caplog.set_level(logging.INFO, "sbi_active")
+    done = 0
+    with stage("folds", show_progress=True, count=lambda: (done, 10)):
+        for _ in range(4):
+            time.sleep(2 * SOON)
+            done += 1
+    said = lines(caplog)
+    assert said[0].startswith("folds, ")
+    assert "0 of 10 done" in said[0]
+    assert len(said) >= 4  # a sign of life now and then
+    (late,) = [line for line in said if "3 of 10 done" in line][:1]
+    left = float(late.split("about ")[1].split(" s left")[0])
+    assert 0.4 < left < 1.2  # seven steps of .1 s
+    assert said[-1].startswith("folds took 0.")
+    shown = capsys.readouterr().err
+    assert "folds:" in shown
+    assert "of about 1" in shown  # s in all
+
+
+def test_steps_of_an_unknown_number_are_counted(caplog):
+    caplog.set_level(logging.INFO, "sbi_active")
+    with stage("sets", count=lambda: (7, None)):
+        time.sleep(3 * SOON)
+    assert "so far; 7 done" in lines(caplog)[0]
+
+
+def failing():
+    time.sleep(3 * SOON)
+    raise ZeroDivisionError
+
+
+def test_of_a_stage_within_another_nothing_is_told(caplog):
+    caplog.set_level(logging.INFO, "sbi_active")
+    with stage("outer"), stage("inner"):
+        time.sleep(3 * SOON)
+    with pytest.raises(ZeroDivisionError), stage("second"):
+        failing()
+    said = lines(caplog)
+    assert not any("inner" in line for line in said)
+    assert said[-1].startswith("second ended with an error after")
+
+
+def loop(**options):
+    bias = Effect(
+        "bias",
+        hook="observation",
+        prior=Normal(0.0, 1.0),
+        null=0.0,
+        apply=lambda x, phi, action, context: x + phi,
+    )
+
+    def slow(theta, action):
+        time.sleep(0.001)
+        return theta * action
+
+    model = SimulatorModel(slow, noise=GaussianNoise(0.1))
+    action = torch.linspace(-1, 1, 6)[:, None]
+    prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
+    trials = Trials(action, 2 * action + 1)
+    return close_loop(model, prior, trials, effects=[bias], **options)
+
+
+def test_the_closed_loop_tells_of_its_stages(caplog, capsys):
+    caplog.set_level(logging.INFO, "sbi_active")
+    loop(show_progress=True)
+    shown, said = capsys.readouterr().err, "\n".join(lines(caplog))
+    for told in (shown, said):
+        assert "models fitted" in told
+        assert "error before and after, a verdict without each trial" in told
+    assert "of 6 done, about" in said
+    assert "of about" in shown
+
+
+def test_the_closed_loop_is_silent_by_default(caplog, capsys):
+    loop(evaluate=False)
+    assert capsys.readouterr().err == ""
+    assert lines(caplog) == []
