@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,16 +99,13 @@ class Pieces:
         Args:
             labels: What reports call both numbers of an action.
         """
-        given: Mapping[str, Any] = {
-            "inputs": self.inputs,
-            "input_times": self.input_times,
-        }
         return Trials(
             self.action,
             self.output,
             sample_times=self.times,
             action_labels=labels,
-            **given,
+            inputs=self.inputs,
+            input_times=self.input_times,
         )
 
 

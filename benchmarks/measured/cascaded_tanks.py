@@ -3,12 +3,12 @@
     python -m benchmarks.measured.cascaded_tanks --data DIR
     python -m benchmarks.measured.cascaded_tanks --data DIR --clean 0 --reports reports
 
-``DIR`` holds ``estimation.csv`` and ``validation.csv``. The first is fitted, in eight
-trials of 512 s whose start levels are nuisances; the second is scored after its first
+``DIR`` holds ``estimation.csv`` and ``validation.csv``. The first is fitted, in six
+trials of 680 s whose start levels are nuisances; the second is scored after its first
 50 samples, on which its start levels are found. Stages stand in
 :mod:`benchmarks.measured.record_stages`; each is added to
 ``results/cascaded_tanks.json`` unless it is there, and the tables are printed. Least
-squares fits the first record as a whole.
+squares fits the same pieces, and beside them the first record as a whole.
 """
 
 from __future__ import annotations
@@ -28,7 +28,12 @@ from benchmarks.measured.record_stages import (
     table,
     with_error,
 )
-from benchmarks.measured.tanks_least_squares import fit_tanks, run_pieces, score
+from benchmarks.measured.tanks_least_squares import (
+    fit_pieces,
+    fit_tanks,
+    run_pieces,
+    score,
+)
 from sbi_active.criticism import Trials
 from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
     DATA,
@@ -76,9 +81,12 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     fitted = records["estimation"]
 
     def least_squares(names: tuple[str, ...]) -> dict[str, Any]:
-        fit, effects = fit_tanks(fitted, names)
-        own = torch.from_numpy(fit.parameters[:-2])[None]
-        return as_row(fit, score(own, scored, effects))
+        fit, effects = fit_pieces(pieces, names)
+        whole, _ = fit_tanks(fitted, names)
+        own = torch.from_numpy(fit.parameters)[None]
+        row = as_row(fit, score(own, scored, effects))
+        own = torch.from_numpy(whole.parameters[:-2])[None]
+        return row | {"as one record": as_row(whole, score(own, scored, effects))}
 
     def replay(seed: int) -> Trials:
         bare, _ = fit_tanks(fitted)

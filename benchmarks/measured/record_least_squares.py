@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
-from torch.distributions import HalfNormal
+from torch.distributions import HalfNormal, Uniform
 
 from sbi_active.criticism import Effect
 
@@ -39,15 +39,20 @@ class Fit:
 
 
 def effect_bounds(effects: Sequence[Effect]) -> tuple[list[float], list[float]]:
-    """Return the smallest and largest strengths, six prior deviations either way.
+    """Return the smallest and largest strengths.
 
     Args:
-        effects: With normal or half-normal priors.
+        effects: With normal or half-normal priors, six deviations of them, or uniform
+            ones.
     """
     low: list[float] = []
     high: list[float] = []
     for effect in effects:
         prior: Any = getattr(effect.prior, "base_dist", effect.prior)
+        if isinstance(prior, Uniform):
+            low += prior.low.tolist()
+            high += prior.high.tolist()
+            continue
         edge = (LARGEST * prior.scale.double()).tolist()
         positive = isinstance(prior, HalfNormal)
         low += [0.0 if positive else -value for value in edge]

@@ -44,7 +44,7 @@ class Bench:
         removals: Sets of effects to remove from the library, one stage each.
         given: Sets of effects that least squares is given in any case, each in the
             order of the library.
-        score: Draws (n, d) and effects to errors by held-out record.
+        score: Theta and strengths (n, d), and effects, to errors by held-out record.
         least_squares: Names of effects to a fit's row.
         replay: Seed to trials that the bare model makes.
     """

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from sbi_active.criticism import Report
 from sbi_active.criticism.results import NONE
+from sbi_active.criticism.under_misfit import ModelError
 
 __all__ = ["Found", "read_report"]
-
-NUM_DRAWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +23,8 @@ class Found:
     Attributes:
         row: Plain figures for the results.
         helps: Names of the effects that are said to predict better.
-        before: Draws of theta of the bare model, shape (n, theta_dim), float64.
-        after: Draws of theta and strengths of the effects that help, shape (n, d).
+        before: Center of theta of the bare model, shape (1, theta_dim), float64.
+        after: The same of theta and the strengths of the effects that help, (1, d).
         text: The report's first paragraph.
     """
 
@@ -44,16 +43,20 @@ def read_report(report: Report, theta_dim: int) -> Found:
         theta_dim: Parameters of the bare simulator. Columns of draws beyond these and
             the strengths, those of nuisances, are left out.
     """
-    tracing, detection = report.tracing, report.detection
+    tracing, detection, misfit = report.tracing, report.detection, report.tracing.misfit
     helps = tracing.chosen
     sizes = {e.name: len(e.mean) for e in tracing.estimates}
     num = theta_dim + sum(sizes[name] for name in helps)
     after = tracing.evidences.get(" + ".join(helps) or NONE, tracing.evidences[NONE])
+    cause = tracing.inclusion if misfit is None else misfit.cause
     row = {
         "verdict": tracing.verdict,
+        "line": str(report).splitlines()[0],
         "alarm": bool(detection.alarm),
         "log_bayes_factor": float(detection.log_bayes_factor),
-        "cause": {name: float(p) for name, p in tracing.inclusion.items()},
+        "named": [*(helps if misfit is None else misfit.named)],
+        "cause": {name: float(cause.get(name, 0.0)) for name in tracing.inclusion},
+        "models": [] if misfit is None else [_model(m) for m in misfit.models],
         "probabilities": {n: float(p) for n, p in tracing.probabilities.items()},
         "credible_set": [*tracing.credible_set],
         "near": [sorted(group) for group in tracing.near],
@@ -66,12 +69,21 @@ def read_report(report: Report, theta_dim: int) -> Found:
     return Found(
         row=row,
         helps=helps,
-        before=_some(tracing.evidences[NONE].draws, theta_dim),
-        after=_some(after.draws, num),
+        before=_center(tracing.evidences[NONE].draws, theta_dim),
+        after=_center(after.draws, num),
         text=str(report).split("\n\n")[0],
     )
 
 
-def _some(draws: np.ndarray, columns: int) -> Tensor:
-    at = np.linspace(0, len(draws) - 1, min(NUM_DRAWS, len(draws))).astype(int)
-    return torch.from_numpy(draws[at, :columns]).double()
+def _model(model: ModelError) -> dict[str, Any]:
+    return {
+        "name": model.name,
+        "probability": float(model.probability),
+        "left_out": np.asarray(model.left_out).tolist(),
+        "remains": float(model.remains),
+    }
+
+
+def _center(draws: np.ndarray, columns: int) -> Tensor:
+    """Return the mean, at which held-out trials are predicted under misfit too."""
+    return torch.from_numpy(draws[:, :columns].mean(0, keepdims=True)).double()

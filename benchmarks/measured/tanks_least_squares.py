@@ -21,13 +21,15 @@ from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
     levels,
     make_effects,
 )
+from sbi_active.tasks.cascaded_tanks.effects import START_SD  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks.model import (  # pyright: ignore
     PRIOR_HIGH,
     PRIOR_LOW,
+    SENSOR_SD,
 )
 from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
-__all__ = ["fit_tanks", "run_pieces", "score"]
+__all__ = ["fit_pieces", "fit_tanks", "run_pieces", "score"]
 
 #: Of the start levels beside the first reading, V.
 START_LOW, START_HIGH = (-5.0, -1.0), (15.0, 1.0)
@@ -107,6 +109,46 @@ def score(
     x = run_pieces(parameters, best[:, None], scored, effects).mean(0)[0]
     error = x - torch.from_numpy(scored.output[0])
     return {"validation": float(error[known:].square().mean().sqrt())}
+
+
+def fit_pieces(
+    pieces: Pieces, names: Sequence[str] = (), *, seed: int = 0
+) -> tuple[Fit, list[Effect]]:
+    """Return the fit of pieces, each with its own start levels, and the effects.
+
+    Start levels keep to their prior as if it had been read with the sensor's error.
+
+    Args:
+        pieces: To fit.
+        names: Of the effects.
+        seed: Of the starts.
+
+    Returns:
+        Parameters are theta and the strengths.
+    """
+    effects = [effect for effect in make_effects() if effect.name in names]
+    least, most = effect_bounds(effects)
+    num, dim = len(pieces), len(PRIOR_LOW) + len(least)
+    output = torch.from_numpy(pieces.output)
+    known = output.isfinite()
+    scale = torch.tensor(START_SD, dtype=torch.float64).repeat(num)
+
+    def predict(z: Tensor) -> Tensor:
+        starts = z[:, dim:]
+        x = run_pieces(z[:, :dim], starts.reshape(len(z), num, 2), pieces, effects)
+        return torch.cat([x[:, known], SENSOR_SD * starts / scale], 1)
+
+    edge = (2 * scale).tolist()
+    found = fit_record(
+        predict,
+        torch.cat([output[known], torch.zeros(2 * num, dtype=torch.float64)]),
+        [*PRIOR_LOW, *least, *[-value for value in edge]],
+        [*PRIOR_HIGH, *most, *edge],
+        seed=seed,
+    )
+    error = predict(torch.from_numpy(found.parameters)[None])[0, : int(known.sum())]
+    rmse = float((error - output[known]).square().mean().sqrt())
+    return Fit(found.parameters[:dim], rmse), effects
 
 
 def fit_tanks(

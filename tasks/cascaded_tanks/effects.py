@@ -8,7 +8,7 @@ out more or less than Torricelli's law as the level grows, and an exponent other
 from __future__ import annotations
 
 import torch
-from torch.distributions import Distribution, HalfNormal, Independent, Normal
+from torch.distributions import Distribution, HalfNormal, Independent, Normal, Uniform
 
 from sbi_active.criticism import Effect
 
@@ -18,14 +18,6 @@ __all__ = ["make_effects", "start_levels"]
 START_SD = (3.0, 0.1)
 #: Keywords, name, family, unit, prior deviation (negative for either sign), sentence.
 TABLE = (
-    (
-        ("overflow",),
-        "overflow",
-        "tanks",
-        "1/s",
-        0.2,
-        "the upper tank runs over into the lower one, and that into the sink",
-    ),
     (
         ("upper_linear", "lower_linear"),
         "linear outflow",
@@ -118,16 +110,26 @@ def make_effects() -> list[Effect]:
         >>> [effect.name for effect in make_effects()][:3]
         ['overflow', 'linear outflow', 'outflow exponent']
     """
+    overflow = Effect.keyword(
+        "overflow",
+        prior=Independent(Uniform(torch.zeros(1), torch.ones(1)), 1),
+        units="of the height above a rim",
+        family="tanks",
+        describe="the upper tank runs over into the lower one, and that into the sink",
+    )
     return [
-        Effect.keyword(
-            name,
-            *keywords,
-            prior=_prior(sd, len(keywords)),
-            units=units,
-            family=family,
-            describe=describe,
-        )
-        for keywords, name, family, units, sd, describe in TABLE
+        overflow,
+        *(
+            Effect.keyword(
+                name,
+                *keywords,
+                prior=_prior(sd, len(keywords)),
+                units=units,
+                family=family,
+                describe=describe,
+            )
+            for keywords, name, family, units, sd, describe in TABLE
+        ),
     ]
 
 

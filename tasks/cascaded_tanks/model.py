@@ -12,9 +12,15 @@ rim and never read, so that without overflow its scale shows nowhere.
 
 Start levels are unknown: :math:`h_i(0) = y + \delta_i` with the first reading y.
 
-By midpoint steps of the input's grid; what stands above a rim after a step has run over
-by the share :math:`1 - e^{-s h}`, from the upper tank into the lower one, and from the
-lower one into the sink.
+By midpoint steps of the input's grid. What stands above a rim runs over at the rate
+
+.. math::
+    s = \frac{\omega}{(1 - \omega)\, 100\,\mathrm{s}},
+
+from the upper tank into the lower one, and from the lower one into the sink. Tanks that
+settle within some 100 s then stand above their rims by :math:`1 - \omega` of what they
+would without, so that x is nearly linear in :math:`\omega` from no rim at 0 to a sharp
+one at 1.
 """
 
 from __future__ import annotations
@@ -52,6 +58,7 @@ STEP = 4.0  # s, of the input's grid and the integrator
 RIM = 10.0  # V
 MIDDLE = 5.0  # V, about which curves bend
 PUMP_MIDDLE = 2.8  # V
+SETTLING = 100.0  # s, time constant of a tank
 FADE = 4096.0  # s, of a whole record
 SENSOR_SD = 0.02  # V
 #: What a simulator gets wrong: from the sensor's error to a fifth of the range, V, and
@@ -84,7 +91,7 @@ def levels(
     sensor_curve: Strength = 0.0,
     sensor_saturation: Strength = 0.0,
 ) -> Tensor:
-    """Return what the level sensor of the lower tank reads.
+    r"""Return what the level sensor of the lower tank reads.
 
     Every effect is a number, or one a row.
 
@@ -95,7 +102,7 @@ def levels(
         times: Of the readings, s, shape (k,) or (n, k), up to the end of the input.
         upper_start: delta_1, V.
         lower_start: delta_2, V.
-        overflow: s, rate at which water above a rim runs over, 1/s.
+        overflow: :math:`\omega`, from 0 to 1.
         upper_linear: Further outflow of the upper tank into the lower one in proportion
             to its level, 1/s.
         lower_linear: The same out of the lower tank.
@@ -140,7 +147,9 @@ def levels(
         flow = lagged(flow, rows(pump_lag) / STEP)
     up, down = rows(upper_linear), rows(lower_linear)
     seep, lost, bend = rows(leak), rows(loss), rows(exponent)
-    spilled = -torch.expm1(-STEP * rows(overflow))
+    omega = rows(overflow).clamp(0, 1)
+    rate = omega / ((1 - omega).clamp(min=1e-9) * SETTLING)
+    spilled = -torch.expm1(-STEP * rate)
     ratio = k2 / k1
     is_bent, has_linear = is_on(bend), is_on(up) or is_on(down)
     has_loss, spills = is_on(seep) or is_on(lost), is_on(spilled)

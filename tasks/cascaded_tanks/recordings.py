@@ -10,10 +10,12 @@ __all__ = ["DATA", "FOUND_ON", "read_recordings", "split"]
 
 DATA = Path("../shared/data/cascaded_tanks")
 FILES = ("estimation", "validation")
-#: Samples of a piece: 512 s, some time constants of the tanks, so that what a piece
-#: tells beyond its unknown start levels is most of it; eight pieces can be left out.
-LENGTH = 128
-EVERY = 4  # keep one reading in 16 s
+#: Samples of a piece: 680 s, some time constants of the tanks, so that what a piece
+#: tells beyond its two unknown start levels is most of it. Six pieces can be left out
+#: one by one; eight of 512 s spend more of the record on starts, and plain least
+#: squares then hardly tells one further outflow from another.
+LENGTH = 170
+EVERY = 5  # keep one reading in 20 s
 FOUND_ON = 50  # first samples of the scored record, on which its start is found
 
 

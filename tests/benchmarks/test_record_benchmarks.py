@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.measured import record_least_squares
 from benchmarks.measured.hoop_least_squares import fit_hoop, free_run, run_pieces
-from benchmarks.measured.tanks_least_squares import fit_tanks, score
+from benchmarks.measured.tanks_least_squares import fit_pieces, fit_tanks, score
 from sbi_active.tasks import ball_and_hoop, cascaded_tanks  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop.recordings import FITTED  # pyright: ignore
 from sbi_active.tasks.records import cut  # pyright: ignore
@@ -99,3 +99,16 @@ def tank_error(names):
 @needs_tanks
 def test_tanks_err_as_others_found(names, found):
     assert tank_error(names) == pytest.approx(found, rel=0.07)
+
+
+@needs_tanks
+def test_pieces_of_the_tanks_tell_as_much_as_the_whole_record():
+    records = cascaded_tanks.read_recordings(TANKS)
+    pieces, scored = cascaded_tanks.split(records)
+    assert len(pieces) == 6
+    errors = {}
+    for names in ((), ("overflow",), ("overflow", "linear outflow")):
+        fit, effects = fit_pieces(pieces, names)
+        own = torch.from_numpy(fit.parameters)[None]
+        errors[names] = score(own, scored, effects)["validation"]
+    assert [*errors.values()] == pytest.approx([0.686, 0.557, 0.290], rel=0.05)
