@@ -49,7 +49,8 @@ class Record:
 class Pieces:
     """A record cut into trials of one length, each with the start that was read.
 
-    The last sample of a piece is the first of the next one, where that begins.
+    The last reading of a piece is at the time of the first of the next one. A piece may
+    run for a while before its first reading, so that its start is forgotten.
 
     Attributes:
         step: Of the input, s.
@@ -58,6 +59,7 @@ class Pieces:
         voltage: Shape (t, m), at the times 0, step, ...
         times: Of the outputs after the first, s from the beginning of a piece, (k,).
         output: At these times, shape (t, k).
+        slope: Of the output at the start, per s, shape (t,); None where nobody asks.
     """
 
     step: float
@@ -66,14 +68,17 @@ class Pieces:
     voltage: Array
     times: Array
     output: Array
+    slope: Array | None = None
 
     def __len__(self) -> int:
         return len(self.begin)
 
     @property
     def action(self) -> Tensor:
-        """Begin in s and first output, shape (t, 2), float64."""
-        return torch.from_numpy(np.column_stack([self.begin, self.start]))
+        """Begin in s, first output and its slope if there, (t, 2 or 3), float64."""
+        parts = [self.begin, self.start]
+        parts += [] if self.slope is None else [self.slope]
+        return torch.from_numpy(np.column_stack(parts))
 
     @property
     def inputs(self) -> dict[str, Tensor]:
@@ -97,7 +102,7 @@ class Pieces:
         """Return the pieces as trials with their inputs over time.
 
         Args:
-            labels: What reports call both numbers of an action.
+            labels: What reports call the numbers of an action.
         """
         return Trials(
             self.action,
@@ -109,41 +114,49 @@ class Pieces:
         )
 
 
-def cut(record: Record, length: int, *, every: int = 1) -> Pieces:
+def cut(
+    record: Record, length: int, *, every: int = 1, slope: int = 0, lead: int = 0
+) -> Pieces:
     """Cut a record into as many whole pieces as it has.
 
     Args:
         record: The record.
         length: Of a piece, steps of the input.
         every: Keep each so many-th output.
+        slope: First samples of a piece through which a line gives its slope; 0 for
+            none.
+        lead: Steps that a piece runs before its readings begin to count.
 
     Raises:
         ValueError: If the record is shorter than a piece, or ``every`` does not divide
             the length.
     """
-    num = (len(record) - 1) // length
     # The last sample of all has no next one: a record of whole pieces lacks it.
-    whole = len(record) // length
-    if whole > num:
-        num = whole
-    if num == 0 or length % every:
+    num = (len(record) - lead) // length
+    if num <= 0 or length % every:
         raise ValueError(
             f"expected pieces of at most {len(record)} samples, a multiple of {every}; "
             f"got {length}; change length or every"
         )
     first = np.arange(num) * length
-    kept = np.arange(every, length + 1, every)
+    kept = lead + np.arange(every, length + 1, every)
     at = first[:, None] + kept
     output = np.where(
         at < len(record), record.output[np.minimum(at, len(record) - 1)], np.nan
     )
+    steep = None
+    if slope:
+        line = record.step * (np.arange(slope) - (slope - 1) / 2)
+        near = record.output[first[:, None] + np.arange(slope)]
+        steep = near @ line / (line @ line)
     return Pieces(
         record.step,
         first * record.step,
         record.output[first],
-        record.voltage[first[:, None] + np.arange(length)],
+        record.voltage[first[:, None] + np.arange(lead + length)],
         kept * record.step,
         output,
+        steep,
     )
 
 

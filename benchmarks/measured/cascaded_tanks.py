@@ -4,8 +4,8 @@
     python -m benchmarks.measured.cascaded_tanks --data DIR --clean 0 --reports reports
 
 ``DIR`` holds ``estimation.csv`` and ``validation.csv``. The first is fitted, in six
-trials of 680 s whose start levels are nuisances; the second is scored after its first
-50 samples, on which its start levels are found. Stages stand in
+trials of 600 s that run for 400 s before; the second is scored after its first 50
+samples, on which its start levels are found. Stages stand in
 :mod:`benchmarks.measured.record_stages`; each is added to
 ``results/cascaded_tanks.json`` unless it is there, and the tables are printed. Least
 squares fits the same pieces, and beside them the first record as a whole.
@@ -42,19 +42,20 @@ from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
     make_simulator,
     read_recordings,
     split,
-    start_levels,
 )
 from sbi_active.tasks.cascaded_tanks.model import SENSOR_SD  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks.recordings import (  # pyright: ignore
     EVERY,
+    LEAD,
     LENGTH,
+    SLOPE,
 )
 from sbi_active.tasks.records import Record, cut  # pyright: ignore
 
 __all__ = ["main", "make_bench"]
 
 RESULT = Path(__file__).parent / "results" / "cascaded_tanks.json"
-LABELS = ("begin [s]", "start [V]")
+LABELS = ("begin [s]", "start [V]", "slope [V/s]")
 REMOVALS = (
     ("overflow",),
     ("linear outflow",),
@@ -91,18 +92,19 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     def replay(seed: int) -> Trials:
         bare, _ = fit_tanks(fitted)
         z = torch.from_numpy(bare.parameters)[None]
-        whole = cut(fitted, len(fitted) - 1)
+        whole = cut(fitted, len(fitted) - 1, slope=SLOPE)
         x = run_pieces(z[:, :-2], z[:, None, -2:], whole)[0, 0]
         x = torch.cat([torch.from_numpy(whole.start) + z[0, -1:], x])
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage, output)
-        return cut(made, LENGTH, every=every).trials(LABELS)
+        pieces = cut(made, LENGTH, every=every, slope=SLOPE, lead=LEAD)
+        return pieces.trials(LABELS)
 
     return Bench(
         model=make_simulator(),
         prior=make_prior(),
         effects=make_effects(),
-        nuisances=[start_levels()],
+        nuisances=[],
         trials=pieces.trials(LABELS),
         removals=REMOVALS,
         given=GIVEN,

@@ -21,18 +21,17 @@ from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
     levels,
     make_effects,
 )
-from sbi_active.tasks.cascaded_tanks.effects import START_SD  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks.model import (  # pyright: ignore
     PRIOR_HIGH,
     PRIOR_LOW,
-    SENSOR_SD,
 )
+from sbi_active.tasks.cascaded_tanks.recordings import SLOPE  # pyright: ignore
 from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
 __all__ = ["fit_pieces", "fit_tanks", "run_pieces", "score"]
 
-#: Of the start levels beside the first reading, V.
-START_LOW, START_HIGH = (-5.0, -1.0), (15.0, 1.0)
+#: Of the start levels beside what the first readings tell, V.
+START_LOW, START_HIGH = (-10.0, -1.0), (10.0, 1.0)
 
 
 def run_pieces(
@@ -45,7 +44,7 @@ def run_pieces(
 
     Args:
         parameters: Theta and strengths, shape (n, 4 + d), float64.
-        starts: Of both levels beside the first reading, shape (n, t, 2), V.
+        starts: Of both levels beside what the first readings tell, shape (n, t, 2), V.
         pieces: t of them.
         effects: Whose strengths they are, all of them keyword arguments.
     """
@@ -92,7 +91,7 @@ def score(
         return torch.tensor(values, dtype=torch.float64)
 
     best, least = None, torch.full((num,), torch.inf, dtype=torch.float64)
-    for upper in (-2.0, 0.0, 3.0, 8.0):
+    for upper in (-3.0, 0.0, 3.0):
         z, residual = least_squares(
             predict,
             torch.from_numpy(begin.output).expand(num, -1),
@@ -114,9 +113,7 @@ def score(
 def fit_pieces(
     pieces: Pieces, names: Sequence[str] = (), *, seed: int = 0
 ) -> tuple[Fit, list[Effect]]:
-    """Return the fit of pieces, each with its own start levels, and the effects.
-
-    Start levels keep to their prior as if it had been read with the sensor's error.
+    """Return the fit of pieces that run before they are read, and the effects.
 
     Args:
         pieces: To fit.
@@ -128,27 +125,20 @@ def fit_pieces(
     """
     effects = [effect for effect in make_effects() if effect.name in names]
     least, most = effect_bounds(effects)
-    num, dim = len(pieces), len(PRIOR_LOW) + len(least)
-    output = torch.from_numpy(pieces.output)
-    known = output.isfinite()
-    scale = torch.tensor(START_SD, dtype=torch.float64).repeat(num)
+    known = torch.from_numpy(pieces.output).isfinite()
 
     def predict(z: Tensor) -> Tensor:
-        starts = z[:, dim:]
-        x = run_pieces(z[:, :dim], starts.reshape(len(z), num, 2), pieces, effects)
-        return torch.cat([x[:, known], SENSOR_SD * starts / scale], 1)
+        starts = torch.zeros(len(z), len(pieces), 2, dtype=torch.float64)
+        return run_pieces(z, starts, pieces, effects)[:, known]
 
-    edge = (2 * scale).tolist()
     found = fit_record(
         predict,
-        torch.cat([output[known], torch.zeros(2 * num, dtype=torch.float64)]),
-        [*PRIOR_LOW, *least, *[-value for value in edge]],
-        [*PRIOR_HIGH, *most, *edge],
+        torch.from_numpy(pieces.output)[known],
+        [*PRIOR_LOW, *least],
+        [*PRIOR_HIGH, *most],
         seed=seed,
     )
-    error = predict(torch.from_numpy(found.parameters)[None])[0, : int(known.sum())]
-    rmse = float((error - output[known]).square().mean().sqrt())
-    return Fit(found.parameters[:dim], rmse), effects
+    return found, effects
 
 
 def fit_tanks(
@@ -165,7 +155,7 @@ def fit_tanks(
         Parameters are theta, the strengths, and the two start levels beside the first
         reading.
     """
-    whole = cut(record, len(record) - 1)
+    whole = cut(record, len(record) - 1, slope=SLOPE)
     effects = [effect for effect in make_effects() if effect.name in names]
     least, most = effect_bounds(effects)
     found = fit_record(

@@ -8,16 +8,25 @@ out more or less than Torricelli's law as the level grows, and an exponent other
 from __future__ import annotations
 
 import torch
-from torch.distributions import Distribution, HalfNormal, Independent, Normal, Uniform
+from torch.distributions import Distribution, HalfNormal, Independent, Normal
 
 from sbi_active.criticism import Effect
 
 __all__ = ["make_effects", "start_levels"]
 
-#: Of the upper and the lower level around the first reading, V.
-START_SD = (3.0, 0.1)
+#: Of the upper level around what the slope tells, and of the lower one around the first
+#: reading, V.
+START_SD = (1.0, 0.1)
 #: Keywords, name, family, unit, prior deviation (negative for either sign), sentence.
 TABLE = (
+    (
+        ("overflow",),
+        "overflow",
+        "tanks",
+        "of the height above a rim",
+        0.5,
+        "the upper tank runs over into the lower one, and that into the sink",
+    ),
     (
         ("upper_linear", "lower_linear"),
         "linear outflow",
@@ -110,26 +119,16 @@ def make_effects() -> list[Effect]:
         >>> [effect.name for effect in make_effects()][:3]
         ['overflow', 'linear outflow', 'outflow exponent']
     """
-    overflow = Effect.keyword(
-        "overflow",
-        prior=Independent(Uniform(torch.zeros(1), torch.ones(1)), 1),
-        units="of the height above a rim",
-        family="tanks",
-        describe="the upper tank runs over into the lower one, and that into the sink",
-    )
     return [
-        overflow,
-        *(
-            Effect.keyword(
-                name,
-                *keywords,
-                prior=_prior(sd, len(keywords)),
-                units=units,
-                family=family,
-                describe=describe,
-            )
-            for keywords, name, family, units, sd, describe in TABLE
-        ),
+        Effect.keyword(
+            name,
+            *keywords,
+            prior=_prior(sd, len(keywords)),
+            units=units,
+            family=family,
+            describe=describe,
+        )
+        for keywords, name, family, units, sd, describe in TABLE
     ]
 
 
@@ -143,7 +142,7 @@ def start_levels() -> Effect:
         prior=Independent(Normal(torch.zeros(2), sd), 1),
         units="V",
         scope="trial",
-        describe="levels of both tanks at the start, beside the first reading",
+        describe="levels at the start, beside what the first readings tell",
     )
 
 

@@ -10,7 +10,14 @@ in V of the sensor, which reads :math:`h_2` and whose rim is at 10 V;
 :math:`\theta = (k_1, k_2, k_3, k_4)`. The upper level is in units of a tenth of its own
 rim and never read, so that without overflow its scale shows nowhere.
 
-Start levels are unknown: :math:`h_i(0) = y + \delta_i` with the first reading y.
+Start levels are unknown. The lower one is about the first reading y, and the upper one
+about what lets the reading begin with the slope that it has,
+
+.. math::
+    h_1(0) = \Bigl(\frac{\dot y + k_3 \sqrt{y}}{k_2}\Bigr)^2 + \delta_1, \qquad
+    h_2(0) = y + \delta_2,
+
+with whatever else flows, where there are such effects.
 
 By midpoint steps of the input's grid. What stands above a rim runs over at the rate
 
@@ -59,6 +66,7 @@ RIM = 10.0  # V
 MIDDLE = 5.0  # V, about which curves bend
 PUMP_MIDDLE = 2.8  # V
 SETTLING = 100.0  # s, time constant of a tank
+NEWTON = 4  # steps to the upper level
 FADE = 4096.0  # s, of a whole record
 SENSOR_SD = 0.02  # V
 #: What a simulator gets wrong: from the sensor's error to a fifth of the range, V, and
@@ -97,12 +105,13 @@ def levels(
 
     Args:
         theta: Shape (n, 4).
-        action: When the record was begun, s, and the first reading, V, shape (n, 2).
+        action: When the record was begun, s, the first reading, V, and its slope, V/s,
+            shape (n, 3).
         inputs: "voltage", shape (n, m), at the times 0, 4, 8, ... s.
         times: Of the readings, s, shape (k,) or (n, k), up to the end of the input.
         upper_start: delta_1, V.
         lower_start: delta_2, V.
-        overflow: :math:`\omega`, from 0 to 1.
+        overflow: :math:`\omega`, from 0 to 1; more is a sharp rim as well.
         upper_linear: Further outflow of the upper tank into the lower one in proportion
             to its level, 1/s.
         lower_linear: The same out of the lower tank.
@@ -125,7 +134,7 @@ def levels(
         >>> theta = torch.tensor([[0.05, 0.05, 0.05, 0.04]])
         >>> voltage = torch.full((1, 1_000), 2.5)  # settles at (.04 * 2.5 / .05)^2
         >>> x = levels(
-        ...     theta, torch.tensor([[0.0, 1.0]]), inputs={"voltage": voltage},
+        ...     theta, torch.tensor([[0.0, 1.0, 0.0]]), inputs={"voltage": voltage},
         ...     times=torch.tensor([4_000.0]),
         ... )
         >>> round(float(x), 2)
@@ -136,7 +145,7 @@ def levels(
         return row(value, len(theta))
 
     k1, k2, k3, k4 = theta.double().unbind(1)
-    begin, first = action.double().unbind(1)
+    begin, first, slope = action.double().unbind(1)
     u = inputs["voltage"].double().nan_to_num()
     u = (u - rows(pump_dead_zone)[:, None]).clamp(min=0)
     u = u * (1 + rows(pump_curve)[:, None] * (u - PUMP_MIDDLE))
@@ -168,7 +177,10 @@ def levels(
             d1, d2 = d1 - seep * h1, d2 - lost * (h2 > 0)
         return d1, d2
 
-    h1, h2 = first + rows(upper_start), first + rows(lower_start)
+    wanted = slope + k3 * outflow(first) + down * first + lost
+    h1 = _level(wanted.clamp(min=0) / ratio, k1, up) + rows(upper_start)
+    h1 = h1.clamp(min=0)
+    h2 = first + rows(lower_start)
     path = [h2]
     for pumped in flow:
         d1, d2 = change(h1, h2, pumped)
@@ -184,6 +196,15 @@ def levels(
     x = x - rows(sensor_saturation)[:, None].clamp(max=1) * (x - RIM).clamp(min=0)
     x = x + rows(sensor_curve)[:, None] * (x / MIDDLE - 1) ** 2
     return (x + rows(sensor_offset)[:, None]).to(theta.dtype)
+
+
+def _level(flow: Tensor, outlet: Tensor, linear: Tensor) -> Tensor:
+    """Return the level at which a tank lets out a flow, by Newton's method."""
+    root = flow / outlet
+    for _ in range(NEWTON if is_on(linear) else 0):
+        excess = (outlet + linear * root) * root - flow
+        root = root - excess / (outlet + 2 * linear * root).clamp(min=0.2 * outlet)
+    return root.clamp(min=0) ** 2
 
 
 def make_prior() -> BoxUniform:

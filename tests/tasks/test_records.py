@@ -35,7 +35,7 @@ def record(step, bounds, num=240):
 
 def run(name, num=1, **effects):
     fn, theta, _, step, bounds = MACHINES[name]
-    pieces = cut(record(step, bounds), 120, every=4)
+    pieces = cut(record(step, bounds), 120, every=4, slope=6 * (name == "tanks"))
     return fn(theta.expand(num * len(pieces), -1), **pieces.rows(num), **effects)
 
 
@@ -49,6 +49,26 @@ def test_pieces_meet_at_their_ends():
     assert pieces.begin.tolist() == pytest.approx([0.0, 8.0, 16.0])
     assert pieces.output[1, 0] == made.output[88]
     assert pieces.rows(2)["inputs"]["voltage"].shape == (6, 80)
+
+
+def test_a_piece_knows_its_first_slope():
+    made = record(0.1, (-1, 1), 241)
+    line = Record("line", 0.1, made.voltage, 3 + 0.5 * 0.1 * np.arange(241))
+    pieces = cut(line, 80, every=8, slope=5)
+    assert pieces.slope == pytest.approx(0.5)
+    assert pieces.action.shape == (3, 3)
+    assert cut(line, 80).action.shape == (3, 2)
+
+
+def test_a_piece_runs_before_its_readings_count():
+    made = record(0.1, (-1, 1), 241)
+    pieces = cut(made, 60, every=6, lead=50)
+    assert pieces.voltage.shape == (3, 110)
+    assert pieces.times[[0, -1]].tolist() == pytest.approx([5.6, 11.0])
+    assert (
+        pieces.output[1].tolist() == made.output[60 + 50 + np.arange(6, 61, 6)].tolist()
+    )
+    assert pieces.start[1] == made.output[60]
 
 
 def test_a_record_of_whole_pieces_lacks_its_last_reading_alone():
@@ -109,7 +129,7 @@ def test_rows_are_apart_and_of_the_prior(name):
     module = {"hoop": ball_and_hoop, "tanks": cascaded_tanks}[name]
     with forked_generators(0):
         theta = module.make_prior().sample((6,)).double()
-    pieces = cut(record(step, bounds), 120, every=4)
+    pieces = cut(record(step, bounds), 120, every=4, slope=6 * (name == "tanks"))
     x = fn(theta.repeat_interleave(2, 0), **pieces.rows(6))
     assert x.isfinite().all()
     alone = fn(theta[2:3].repeat_interleave(2, 0), **pieces.rows(1))
@@ -160,12 +180,11 @@ def test_tanks_keep_their_water():
     voltage = torch.full((1, 100), 2.0)
     out = levels(
         theta,
-        torch.tensor([[0.0, 1.0]]),
+        torch.tensor([[0.0, 1.0, 0.1]]),
         inputs={"voltage": voltage},
         times=torch.tensor([400.0]),
-        upper_start=3.0,
     )
-    upper = 4.0  # its steady level is (.04 * 2 / .05)^2 = 2.56
+    upper = 4.0  # (.1 / .05)^2, which makes the slope below; it sinks to 2.56
     for _ in range(40_000):
         upper += 0.01 * (0.08 - 0.05 * upper**0.5)
     assert float(out) == pytest.approx(1.0 + 400 * 0.08 - (upper - 4.0), rel=1e-4)
@@ -173,7 +192,7 @@ def test_tanks_keep_their_water():
 
 def test_overflow_keeps_levels_at_their_rims():
     full = {"inputs": {"voltage": torch.full((1, 300), 6.0)}}
-    rows = {"action": torch.tensor([[0.0, 5.0]]), "times": torch.tensor([1_200.0])}
+    rows = {"action": torch.tensor([[0.0, 5.0, 0.0]]), "times": torch.tensor([1_200.0])}
     high = levels(TANKS, **rows, **full)
     kept = levels(TANKS, **rows, **full, overflow=1.0)
     assert high > 20
