@@ -31,9 +31,9 @@ TABLE = (
         ("upper_linear", "lower_linear"),
         "linear outflow",
         "outlets",
-        "1/s",
-        -0.01,
-        "further outflows of both tanks in proportion to their levels",
+        "",
+        -0.3,
+        "outflows of both tanks are partly in proportion to their levels",
     ),
     (
         ("exponent",),

@@ -112,9 +112,10 @@ def levels(
         upper_start: delta_1, V.
         lower_start: delta_2, V.
         overflow: :math:`\omega`, from 0 to 1; more is a sharp rim as well.
-        upper_linear: Further outflow of the upper tank into the lower one in proportion
-            to its level, 1/s.
-        lower_linear: The same out of the lower tank.
+        upper_linear: m, by which the upper tank's outflow is in proportion to its level
+            and not to the root of it: :math:`k_1 \sqrt{5}\, ((1 - m) \sqrt{h / 5} +
+            m\, h / 5)`, so that at 5 V it is what it was.
+        lower_linear: The same of the lower tank.
         exponent: By which both outflows' exponent exceeds 1/2, about 5 V.
         leak: Outflow of the upper tank into the sink in proportion to its level, 1/s.
         loss: Constant outflow of the lower tank, V/s.
@@ -171,14 +172,16 @@ def levels(
     def change(h1: Tensor, h2: Tensor, pumped: Tensor) -> tuple[Tensor, Tensor]:
         out, below = k1 * outflow(h1), k3 * outflow(h2)
         if has_linear:
-            out, below = out + up * h1, below + down * h2
+            out = (1 - up) * out + up * k1 * h1 / MIDDLE**0.5
+            below = (1 - down) * below + down * k3 * h2 / MIDDLE**0.5
         d1, d2 = pumped - out, ratio * out - below
         if has_loss:
             d1, d2 = d1 - seep * h1, d2 - lost * (h2 > 0)
         return d1, d2
 
-    wanted = slope + k3 * outflow(first) + down * first + lost
-    h1 = _level(wanted.clamp(min=0) / ratio, k1, up) + rows(upper_start)
+    below = k3 * ((1 - down) * outflow(first) + down * first / MIDDLE**0.5)
+    wanted = (slope + below + lost).clamp(min=0) / ratio
+    h1 = _level(wanted, (1 - up) * k1, up * k1 / MIDDLE**0.5) + rows(upper_start)
     h1 = h1.clamp(min=0)
     h2 = first + rows(lower_start)
     path = [h2]
@@ -200,11 +203,13 @@ def levels(
 
 def _level(flow: Tensor, outlet: Tensor, linear: Tensor) -> Tensor:
     """Return the level at which a tank lets out a flow, by Newton's method."""
-    root = flow / outlet
+    whole = outlet + linear * MIDDLE**0.5
+    root = flow / whole  # exact where all is turbulent, or the level 5 V
     for _ in range(NEWTON if is_on(linear) else 0):
         excess = (outlet + linear * root) * root - flow
-        root = root - excess / (outlet + 2 * linear * root).clamp(min=0.2 * outlet)
-    return root.clamp(min=0) ** 2
+        slope = torch.maximum(outlet + 2 * linear * root, 0.2 * whole)
+        root = (root - excess / slope).clamp(min=0)
+    return root**2
 
 
 def make_prior() -> BoxUniform:

@@ -11,9 +11,9 @@ __all__ = ["DATA", "FOUND_ON", "SLOPE", "read_recordings", "split"]
 DATA = Path("../shared/data/cascaded_tanks")
 FILES = ("estimation", "validation")
 #: Samples of a piece, 600 s, and of what runs before its readings count, 400 s or four
-#: time constants: start levels, of which the upper one is never read, are then forgotten
-#: and need no nuisance. A trial that is left out would have to be predicted from start
-#: levels that nobody knows, and their error hides all others.
+#: time constants: start levels, of which the upper one is never read, are forgotten by
+#: then and need no nuisance. A trial that is left out would have to be predicted from
+#: start levels that nobody knows, and their error hides all others.
 LENGTH, LEAD = 150, 100
 EVERY = 5  # keep one reading in 20 s
 SLOPE = 6  # first samples, 20 s, whose slope tells of the upper tank
