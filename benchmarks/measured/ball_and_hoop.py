@@ -18,7 +18,7 @@ squares is therefore given with the offset at zero, and with the offset free bes
 
 Besides friction the library has an amplifier whose gain falls with the command. Least
 squares given it alone fits better (.38 V) than given quadratic drag and Coulomb
-friction (.50 V), and predicts the three records to .39 / .33 / .35 V (.48 / .35 / .35);
+friction (.50 V), and predicts the three records to .39 / .33 / .35 V (.48 / .37 / .37);
 with quadratic drag beside it, .38 / .29 / .32 V. ``without compression`` is the library
 of friction alone.
 """

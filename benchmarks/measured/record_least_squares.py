@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 DRAWS, STARTS, EVALUATIONS = 200, 6, 60
 DIFFERENCE = 1e-6  # of a parameter's range
-LARGEST = 6.0  # strengths of effects, in deviations of their priors
+LARGEST = 3.0  # strengths of effects, in deviations of their priors
 LOST = 1e3  # reading in place of one that is not finite
 
 
@@ -42,7 +42,7 @@ def effect_bounds(effects: Sequence[Effect]) -> tuple[list[float], list[float]]:
     """Return the smallest and largest strengths.
 
     Args:
-        effects: With normal or half-normal priors, six deviations of them, or uniform
+        effects: With normal or half-normal priors, three deviations of them, or uniform
             ones.
     """
     low: list[float] = []

@@ -63,6 +63,7 @@ PRIOR_LOW = (0.01, 0.01, 0.02, 0.01)
 PRIOR_HIGH = (0.12, 0.15, 0.2, 0.12)
 STEP = 4.0  # s, of the input's grid and the integrator
 RIM = 10.0  # V
+HIGHEST = 100.0  # V; what runs away stays there
 MIDDLE = 5.0  # V, about which curves bend
 PUMP_MIDDLE = 2.8  # V
 SETTLING = 100.0  # s, time constant of a tank
@@ -188,7 +189,8 @@ def levels(
     for pumped in flow:
         d1, d2 = change(h1, h2, pumped)
         d1, d2 = change(h1 + 0.5 * STEP * d1, h2 + 0.5 * STEP * d2, pumped)
-        h1, h2 = (h1 + STEP * d1).clamp(min=0), (h2 + STEP * d2).clamp(min=0)
+        h1 = (h1 + STEP * d1).clamp(0, HIGHEST)
+        h2 = (h2 + STEP * d2).clamp(0, HIGHEST)
         if spills:
             over = spilled * (h1 - RIM).clamp(min=0)
             h1, h2 = h1 - over, h2 + ratio * over

