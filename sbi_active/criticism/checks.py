@@ -21,6 +21,7 @@ from sbi_active.criticism.effects.trial_conditions import (
     conditions_for,
     conditions_of_trials,
 )
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
@@ -127,6 +128,76 @@ def _require_no_labels_changed(trials: Trials, effects: Sequence[Effect]) -> Non
                 "expected effects on the inputs where the action is the trial's "
                 f"number; got {effect.name!r} on the action; declare hook='input'"
             )
+
+
+def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -> float:
+    """Return the time in which trials that were not fitted tell of their nuisances.
+
+    Raises:
+        ValueError: If it is negative, there is nothing to tell of, x has no times, or a
+            trial is no longer than that.
+    """
+    if not 0 <= warm_up < float("inf"):
+        raise ValueError(
+            f"expected warm_up >= 0; got {warm_up}; pass a time in the unit of the "
+            "sample times, or 0"
+        )
+    if warm_up == 0:
+        return 0.0
+    if not any(e.scope == "trial" for e in effects):
+        raise ValueError(
+            f"expected effects of scope 'trial' with warm_up = {warm_up:g}; got none; "
+            "declare the nuisances that the first samples of a trial tell of, or leave "
+            "warm_up out"
+        )
+    times = trials.sample_times
+    if times is None:
+        raise ValueError(
+            f"expected sample_times with warm_up; got warm_up = {warm_up:g} and none; "
+            "give Trials(sample_times=...)"
+        )
+    stamps = times.expand(len(trials), -1).nan_to_num(-torch.inf)
+    span = stamps.amax(1) - times.expand(len(trials), -1)[:, 0]
+    short = [trials.names[i] for i in range(len(trials)) if span[i] <= warm_up]
+    if short:
+        raise ValueError(
+            f"expected trials longer than warm_up = {warm_up:g}; got "
+            f"{float(span.min()):g} in trial {short[0]}; pass a shorter warm_up, in "
+            "the unit of the sample times"
+        )
+    return float(warm_up)
+
+
+def comparison_given(
+    rivals: RivalSet, trials: Trials, num_summaries: int, left_out: Sequence[str]
+) -> tuple[str, ...]:
+    """Return what a comparison was made given, a sentence each.
+
+    Args:
+        rivals: The models.
+        trials: All of them.
+        num_summaries: Of x, that were compared in its place; 0 for none.
+        left_out: Effects of the order of the trials, where that is unknown.
+    """
+    found = []
+    if num_summaries:
+        found.append(
+            f"given {num_summaries} summaries of the {trials.x[0].numel()} numbers of "
+            "a trial: what they leave out was not looked at"
+        )
+    if left_out:
+        found.append(
+            "the order of the trials is unknown: what grows from trial to trial was "
+            f"not looked for ({', '.join(left_out)})"
+        )
+    names = [e.name for e in rivals.nuisances]
+    if names and rivals.warm_up == 0:
+        found.append(
+            f"trials that were not fitted draw {', '.join(names)} from the prior, "
+            "which is part of their error; pass warm_up, the time in which their first "
+            "samples tell of it"
+        )
+    return (*found,)
 
 
 def _warn_outside(trials: Trials, actions: ActionSpace) -> None:

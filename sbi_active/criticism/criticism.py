@@ -11,7 +11,13 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.criticism.checks import digest, require_fitting, with_noise
+from sbi_active.criticism.checks import (
+    comparison_given,
+    digest,
+    require_fitting,
+    require_warm_up,
+    with_noise,
+)
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
@@ -70,6 +76,9 @@ class Criticism:
         summaries: Compare at most this many summaries of x in place of all its numbers,
             0 for none; None takes 20 where a trial has more than 500 numbers without a
             time axis, with independent noise.
+        warm_up: Time from its first sample, in the unit of the sample times, in which a
+            held-out or left-out trial tells of its nuisances (effects of scope
+            "trial"), and is not scored; 0 draws them from their priors.
         seed: Of all draws.
         show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
             of all that takes 2 s anyway.
@@ -106,6 +115,7 @@ class Criticism:
         effects: Sequence[Effect] = (),
         actions: Actions | None = None,
         summaries: int | None = None,
+        warm_up: float = 0.0,
         seed: int = 0,
         show_progress: bool = False,
     ) -> None:
@@ -144,6 +154,7 @@ class Criticism:
             self.rivals = RivalSet(
                 own, prior, measured.fit, some, actions=actions, seed=seed
             )
+        self.rivals.warm_up = require_warm_up(warm_up, measured, some)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
         self._equivalent: tuple[frozenset[str], ...] | None = None
@@ -369,21 +380,7 @@ class Criticism:
             exploratory=exploratory,
             leave_one_out=left_out,
             severe_tests=tests,
-            warnings=self._given(),
+            warnings=comparison_given(
+                self.rivals, self.trials, self.num_summaries, self.left_out
+            ),
         )
-
-    def _given(self) -> tuple[str, ...]:
-        """Return what the comparison was made given, a sentence each."""
-        found = []
-        if self.num_summaries:
-            found.append(
-                f"given {self.num_summaries} summaries of the "
-                f"{self.trials.x[0].numel()} numbers of a trial: what they leave out "
-                "was not looked at"
-            )
-        if self.left_out:
-            found.append(
-                "the order of the trials is unknown: what grows from trial to trial "
-                f"was not looked for ({', '.join(self.left_out)})"
-            )
-        return (*found,)

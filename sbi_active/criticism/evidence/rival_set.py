@@ -95,6 +95,8 @@ class RivalSet:
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
+        warm_up: Time from its first sample in which a trial that was not fitted tells
+            of its nuisances, and is not scored.
     """
 
     def __init__(
@@ -120,6 +122,7 @@ class RivalSet:
             augmented, trials, seed=derive_seed(seed, "trials")
         )
         self.measurements = self.simulator.measurements
+        self.warm_up = 0.0
         self._factors: tuple[Array, Array] | None = None
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
