@@ -15,7 +15,7 @@ from torch.distributions import Distribution, HalfNormal, Independent, Normal, U
 
 from sbi_active.criticism import Effect
 from sbi_active.tasks.ball_drops.model import RELEASE_HEIGHT
-from sbi_active.tasks.ball_drops.product import Product
+from sbi_active.tasks.product import Product
 
 __all__ = ["DRAG", "make_effects", "release"]
 

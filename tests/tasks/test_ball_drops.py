@@ -23,7 +23,7 @@ from sbi_active.tasks.ball_drops import (  # pyright: ignore
     read_drops,
     trials_of,
 )
-from sbi_active.tasks.ball_drops.product import Product  # pyright: ignore
+from sbi_active.tasks.product import Product  # pyright: ignore
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "ball_drops"
 measured = pytest.mark.skipif(not DATA.is_dir(), reason=f"no data in {DATA}")

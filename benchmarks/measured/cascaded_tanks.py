@@ -1,0 +1,136 @@
+"""The cascaded tanks: what Torricelli's law lacks, from two records.
+
+    python -m benchmarks.measured.cascaded_tanks --data DIR
+    python -m benchmarks.measured.cascaded_tanks --data DIR --clean 0 --reports reports
+
+``DIR`` holds ``estimation.csv`` and ``validation.csv``. The first is fitted, in eight
+trials of 512 s whose start levels are nuisances; the second is scored after its first
+50 samples, on which its start levels are found. Stages stand in
+:mod:`benchmarks.measured.record_stages`; each is added to
+``results/cascaded_tanks.json`` unless it is there, and the tables are printed. Least
+squares fits the first record as a whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.measured.record_stages import (
+    Bench,
+    as_row,
+    run_stages,
+    table,
+    with_error,
+)
+from benchmarks.measured.tanks_least_squares import fit_tanks, run_pieces, score
+from sbi_active.criticism import Trials
+from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
+    DATA,
+    make_effects,
+    make_prior,
+    make_simulator,
+    read_recordings,
+    split,
+    start_levels,
+)
+from sbi_active.tasks.cascaded_tanks.model import SENSOR_SD  # pyright: ignore
+from sbi_active.tasks.cascaded_tanks.recordings import (  # pyright: ignore
+    EVERY,
+    LENGTH,
+)
+from sbi_active.tasks.records import Record, cut  # pyright: ignore
+
+__all__ = ["main", "make_bench"]
+
+RESULT = Path(__file__).parent / "results" / "cascaded_tanks.json"
+LABELS = ("begin [s]", "start [V]")
+REMOVALS = (
+    ("overflow",),
+    ("linear outflow",),
+    ("linear outflow", "outflow exponent"),
+    ("overflow", "sensor saturation", "linear outflow", "outflow exponent"),
+)
+#: Effects that least squares is given in any case.
+GIVEN = (
+    ("overflow",),
+    ("linear outflow",),
+    ("overflow", "linear outflow"),
+    ("overflow", "outflow exponent"),
+)
+
+
+def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
+    """Return the machine.
+
+    Args:
+        records: Of ``read_recordings``.
+        every: Readings of the fitted pieces that are kept.
+    """
+    pieces, scored = split(records, every=every)
+    fitted = records["estimation"]
+
+    def least_squares(names: tuple[str, ...]) -> dict[str, Any]:
+        fit, effects = fit_tanks(fitted, names)
+        own = torch.from_numpy(fit.parameters[:-2])[None]
+        return as_row(fit, score(own, scored, effects))
+
+    def replay(seed: int) -> Trials:
+        bare, _ = fit_tanks(fitted)
+        z = torch.from_numpy(bare.parameters)[None]
+        whole = cut(fitted, len(fitted) - 1)
+        x = run_pieces(z[:, :-2], z[:, None, -2:], whole)[0, 0]
+        x = torch.cat([torch.from_numpy(whole.start) + z[0, -1:], x])
+        output = with_error(x, SENSOR_SD, seed)
+        made = Record("replay", fitted.step, fitted.voltage, output)
+        return cut(made, LENGTH, every=every).trials(LABELS)
+
+    return Bench(
+        model=make_simulator(),
+        prior=make_prior(),
+        effects=make_effects(),
+        nuisances=[start_levels()],
+        trials=pieces.trials(LABELS),
+        removals=REMOVALS,
+        given=GIVEN,
+        score=lambda draws, effects: score(draws, scored, effects),
+        least_squares=least_squares,
+        replay=replay,
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the stages that are missing from the results, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--every", type=int, default=EVERY, help="readings kept")
+    parser.add_argument("--clean", type=int, default=10, help="clean sets")
+    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--reports", type=Path, help="folder for whole reports")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args(argv)
+    try:
+        records = read_recordings(arguments.data)
+    except FileNotFoundError as error:
+        print(f"{error}, as in --data DIR", file=sys.stderr)
+        return 2
+    rows = run_stages(
+        make_bench(records, every=arguments.every),
+        arguments.out,
+        clean=arguments.clean,
+        seed=arguments.seed,
+        reports=arguments.reports,
+    )
+    print(table(rows, "V"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,205 @@
+"""Stages that both machines with recorded inputs share, and their table.
+
+- ``recorded``: the verdict on the pieces to fit, held-out errors in free run before and
+  after, and plain least squares given the same effects on the same split.
+- ``without NAME + ...``: the same with effects removed from the library.
+- ``clean 0``, ``clean 1``, ...: the pieces simulated by the bare model at its
+  least-squares fit, with the sensor's error alone.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.criticism.scores import counted
+from benchmarks.measured.record_least_squares import Fit
+from benchmarks.measured.record_verdicts import read_report
+from sbi_active import SimulatorModel
+from sbi_active.criticism import Effect, Trials, close_loop
+
+__all__ = ["Bench", "run_stages", "table"]
+
+Errors = dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """A machine with records.
+
+    Attributes:
+        model: The bare simulator.
+        prior: Of theta.
+        effects: The declared library.
+        nuisances: Declared besides.
+        trials: To fit.
+        removals: Sets of effects to remove from the library, one stage each.
+        given: Sets of effects that least squares is given in any case, each in the
+            order of the library.
+        score: Draws (n, d) and effects to errors by held-out record.
+        least_squares: Names of effects to a fit's row.
+        replay: Seed to trials that the bare model makes.
+    """
+
+    model: SimulatorModel
+    prior: Any
+    effects: Sequence[Effect]
+    nuisances: Sequence[Effect]
+    trials: Trials
+    removals: Sequence[tuple[str, ...]]
+    given: Sequence[tuple[str, ...]]
+    score: Callable[[Tensor, Sequence[Effect]], Errors]
+    least_squares: Callable[[tuple[str, ...]], dict[str, Any]]
+    replay: Callable[[int], Trials]
+
+
+def run_stages(
+    bench: Bench,
+    path: Path,
+    *,
+    clean: int = 10,
+    seed: int = 0,
+    reports: Path | None = None,
+) -> dict[str, Any]:
+    """Run the stages that a file lacks, and return all of them.
+
+    Args:
+        bench: The machine.
+        path: JSON file of the results.
+        clean: Clean sets.
+        seed: Of all draws.
+        reports: Folder for whole reports.
+    """
+    rows: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+
+    def keep(name: str, row: dict[str, Any]) -> None:
+        rows[name] = row
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(rows, indent=1) + "\n")
+        print(
+            f"{name}: {row.get('verdict', '')}, {row.get('cpu_seconds', 0):.0f} CPU s",
+            flush=True,
+        )
+
+    stages: dict[str, tuple[tuple[str, ...], int | None]] = {"recorded": ((), None)}
+    stages |= {f"without {' + '.join(gone)}": (gone, None) for gone in bench.removals}
+    stages |= {f"clean {k}": ((), k) for k in range(clean)}
+    for name, (gone, replay) in stages.items():
+        if name not in rows:
+            folder = None if reports is None else reports / name.replace(" ", "_")
+            keep(name, judge(bench, gone=gone, replay=replay, seed=seed, folder=folder))
+    fits = rows.get("least squares", {})
+    judged = [name for name, (_, replay) in stages.items() if replay is None]
+    wanted = {(), *bench.given, *[(*rows[name]["helps"],) for name in judged]}
+    for names in sorted(wanted):
+        label = " + ".join(names) or "none"
+        if label not in fits:
+            fits[label] = bench.least_squares(names)
+            keep("least squares", fits)
+    return rows
+
+
+def judge(
+    bench: Bench,
+    *,
+    gone: Sequence[str] = (),
+    replay: int | None = None,
+    seed: int = 0,
+    folder: Path | None = None,
+) -> dict[str, Any]:
+    """Return the row of one verdict.
+
+    Args:
+        bench: The machine.
+        gone: Names of effects that are not declared.
+        replay: Seed of a clean set in place of the recorded trials.
+        seed: Of all draws.
+        folder: Where the whole report goes.
+    """
+    effects = [effect for effect in bench.effects if effect.name not in gone]
+    model, count = counted(bench.model)
+    begin = time.process_time()
+    report = close_loop(
+        model,
+        bench.prior,
+        bench.trials if replay is None else bench.replay(replay),
+        effects=[*effects, *bench.nuisances],
+        seed=seed,
+        evaluate=False,  # held-out records are scored in free run, below
+        plan=False,
+    )
+    seconds = time.process_time() - begin
+    if folder is not None:
+        report.save(folder)
+    found = read_report(report, bench.prior.event_shape[0])
+    row = {
+        **found.row,
+        "helps": [*found.helps],
+        "text": found.text,
+        "cpu_seconds": seconds,
+        "trial_simulations": count(),
+    }
+    if replay is None:
+        chosen = [e for n in found.helps for e in effects if e.name == n]
+        row["before"] = bench.score(found.before, [])
+        row["after"] = bench.score(found.after, chosen)
+    return row
+
+
+def as_row(fit: Fit, errors: Errors) -> dict[str, Any]:
+    """Return a least-squares fit as plain figures."""
+    return {"parameters": fit.parameters.tolist(), "fitted": fit.rmse, "held": errors}
+
+
+def table(rows: dict[str, Any], unit: str) -> str:
+    """Return the stages and the least-squares fits in Markdown.
+
+    Args:
+        rows: Of :func:`run_stages`.
+        unit: Of the errors.
+    """
+    records = [*rows["recorded"]["before"]]
+    head = " / ".join(records)
+    lines = [
+        f"| stage | verdict | P(cause) | before, {unit}: {head} | after | simulated "
+        "trials | CPU s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, row in rows.items():
+        if name == "least squares":
+            continue
+        likely = {n: p for n, p in row["cause"].items() if p > 0.05 and row["alarm"]}
+        causes = ", ".join(f"{n} {p:.2f}" for n, p in likely.items())
+        lines.append(
+            f"| {name} | {row['verdict']} | {causes} | {_errors(row.get('before'))} | "
+            f"{_errors(row.get('after'))} | {row['trial_simulations']:,} | "
+            f"{row['cpu_seconds']:.0f} |"
+        )
+    lines += ["", f"| least squares | fitted, {unit} | {head} |", "|---|---|---|"]
+    for name, row in rows.get("least squares", {}).items():
+        lines.append(f"| {name} | {row['fitted']:.3f} | {_errors(row['held'])} |")
+    return "\n".join(lines)
+
+
+def _errors(errors: Errors | None) -> str:
+    return "" if errors is None else " / ".join(f"{e:.3f}" for e in errors.values())
+
+
+def with_error(x: Tensor, sd: float, seed: int) -> np.ndarray:
+    """Return readings with a sensor's error.
+
+    Args:
+        x: Without it.
+        sd: Of the error.
+        seed: Of its draw.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    return (x + sd * torch.randn(x.shape, generator=generator, dtype=x.dtype)).numpy()

@@ -1,0 +1,136 @@
+"""Plain least squares of the cascaded tanks, and its error on the scored record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.measured.record_least_squares import (
+    Fit,
+    effect_bounds,
+    fit_record,
+)
+from benchmarks.misfit.refit import least_squares
+from sbi_active.criticism import Context, Effect
+from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
+    FOUND_ON,
+    levels,
+    make_effects,
+)
+from sbi_active.tasks.cascaded_tanks.model import (  # pyright: ignore
+    PRIOR_HIGH,
+    PRIOR_LOW,
+)
+from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
+
+__all__ = ["fit_tanks", "run_pieces", "score"]
+
+#: Of the start levels beside the first reading, V.
+START_LOW, START_HIGH = (-5.0, -1.0), (15.0, 1.0)
+
+
+def run_pieces(
+    parameters: Tensor,
+    starts: Tensor,
+    pieces: Pieces,
+    effects: Sequence[Effect] = (),
+) -> Tensor:
+    """Return predictions, shape (n, t, k).
+
+    Args:
+        parameters: Theta and strengths, shape (n, 4 + d), float64.
+        starts: Of both levels beside the first reading, shape (n, t, 2), V.
+        pieces: t of them.
+        effects: Whose strengths they are, all of them keyword arguments.
+    """
+    sizes = [4, *[effect.phi_dim for effect in effects]]
+    each = parameters.double().repeat_interleave(len(pieces), 0)
+    theta, *strengths = each.split(sizes, 1)
+    rows = pieces.rows(len(parameters))
+    context = Context(torch.arange(len(each)).double())
+    keywords: dict[str, Any] = {}
+    for effect, phi in zip(effects, strengths, strict=True):
+        keywords = effect.apply(keywords, phi, rows["action"], context)
+    upper, lower = starts.reshape(-1, 2).unbind(1)
+    x = levels(theta, **rows, upper_start=upper, lower_start=lower, **keywords)
+    return x.reshape(len(parameters), len(pieces), -1)
+
+
+def score(
+    parameters: Tensor, scored: Pieces, effects: Sequence[Effect] = ()
+) -> dict[str, float]:
+    """Return the root mean square error of the mean prediction of a record, V.
+
+    The start levels are found on the first 50 samples, for each row of the parameters,
+    and the record is scored after these.
+
+    Args:
+        parameters: Draws or one fit, shape (n, 4 + d).
+        scored: In one piece.
+        effects: As for :func:`run_pieces`.
+    """
+    known = FOUND_ON - 1  # readings after the first
+    begin = replace(
+        scored,
+        voltage=scored.voltage[:, :FOUND_ON],
+        times=scored.times[:known],
+        output=scored.output[:, :known],
+    )
+    num = len(parameters)
+
+    def predict(z: Tensor) -> Tensor:
+        own = parameters.repeat_interleave(len(z) // num, 0)
+        return run_pieces(own, z[:, None], begin, effects).flatten(1)
+
+    def row(*values: float) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    best, least = None, torch.full((num,), torch.inf, dtype=torch.float64)
+    for upper in (-2.0, 0.0, 3.0, 8.0):
+        z, residual = least_squares(
+            predict,
+            torch.from_numpy(begin.output).expand(num, -1),
+            row(upper, 0.0).expand(num, 2),
+            low=row(*START_LOW),
+            high=row(*START_HIGH),
+            scale=row(1.0, 1.0),
+            weak=row(torch.inf, torch.inf),
+        )
+        cost = residual.square().sum(1)
+        best = z if best is None else torch.where((cost < least)[:, None], z, best)
+        least = torch.minimum(cost, least)
+    assert best is not None
+    x = run_pieces(parameters, best[:, None], scored, effects).mean(0)[0]
+    error = x - torch.from_numpy(scored.output[0])
+    return {"validation": float(error[known:].square().mean().sqrt())}
+
+
+def fit_tanks(
+    record: Record, names: Sequence[str] = (), *, seed: int = 0
+) -> tuple[Fit, list[Effect]]:
+    """Return the fit of the whole record with both start levels, and the effects.
+
+    Args:
+        record: ``estimation``.
+        names: Of the effects.
+        seed: Of the starts.
+
+    Returns:
+        Parameters are theta, the strengths, and the two start levels beside the first
+        reading.
+    """
+    whole = cut(record, len(record) - 1)
+    effects = [effect for effect in make_effects() if effect.name in names]
+    least, most = effect_bounds(effects)
+    found = fit_record(
+        lambda z: run_pieces(z[:, :-2], z[:, None, -2:], whole, effects).flatten(1),
+        torch.from_numpy(whole.output[0]),
+        [*PRIOR_LOW, *least, *START_LOW],
+        [*PRIOR_HIGH, *most, *START_HIGH],
+        seed=seed,
+    )
+    return found, effects

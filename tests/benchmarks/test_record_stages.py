@@ -1,0 +1,103 @@
+"""Stages of machines with recorded inputs, on a machine that takes none."""
+
+import json
+
+import pytest
+import torch
+from torch.distributions import HalfNormal, Independent, Normal
+
+from benchmarks.measured import ball_and_hoop, cascaded_tanks
+from benchmarks.measured.hoop_least_squares import free_run, run_pieces
+from benchmarks.measured.record_stages import Bench, run_stages, table
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect, Trials
+from sbi_active.tasks import ball_and_hoop as hoop  # pyright: ignore
+from sbi_active.tasks.records import cut  # pyright: ignore
+from tests.tasks.test_records import record
+
+PLACES = torch.linspace(-1, 1, 12, dtype=torch.float64)[:, None]
+
+
+def line(theta, action, *, bend=0.0):
+    bend = torch.as_tensor(bend, dtype=theta.dtype).reshape(-1, 1)
+    return theta * action + bend * action**2
+
+
+def line_bench():
+    """A line with a hidden parabola; held out is what lies beyond the trials."""
+    far = torch.tensor([[2.0]], dtype=torch.float64)
+    kind = Independent(HalfNormal(torch.ones(1)), 1)
+
+    def score(draws, effects):
+        bend = draws[:, 1] if effects else 0.0
+        x = line(draws[:, :1], far.expand(len(draws), 1), bend=bend)
+        return {"far": float((x.mean() - 4.0).abs())}
+
+    def replay(seed):
+        generator = torch.Generator().manual_seed(seed)
+        error = 0.01 * torch.randn(12, 1, generator=generator, dtype=torch.float64)
+        return Trials(PLACES, PLACES + error)
+
+    return Bench(
+        model=SimulatorModel(line, noise=GaussianNoise(0.01)),
+        prior=Independent(Normal(torch.zeros(1), 3 * torch.ones(1)), 1),
+        effects=[
+            Effect.keyword("bend", prior=kind),
+            Effect(
+                "bias",
+                hook="observation",
+                prior=Normal(0.0, 0.1),
+                null=0.0,
+                apply=lambda x, phi, action, context: x + phi,
+            ),
+        ],
+        nuisances=[],
+        trials=Trials(PLACES, PLACES + 0.5 * PLACES**2),
+        removals=[("bend",)],
+        given=[("bias",)],
+        score=score,
+        least_squares=lambda names: {
+            "parameters": [1.0],
+            "fitted": 0.5,
+            "held": {"far": len(names)},
+        },
+        replay=replay,
+    )
+
+
+def test_stages_name_what_is_there_and_are_run_once(tmp_path, capsys):
+    path = tmp_path / "out" / "rows.json"
+    rows = run_stages(line_bench(), path, clean=1)
+    assert [*rows] == ["recorded", "without bend", "clean 0", "least squares"]
+    recorded = rows["recorded"]
+    assert recorded["verdict"] == "bend"
+    assert recorded["before"]["far"] > 1
+    assert recorded["after"]["far"] < 0.05
+    assert "bend" not in rows["without bend"]["cause"]
+    assert rows["clean 0"]["verdict"] == "none"
+    assert {*rows["least squares"]} == {"none", "bias", "bend"}
+    assert json.loads(path.read_text()) == rows
+    capsys.readouterr()
+    assert run_stages(line_bench(), path, clean=1) == rows
+    assert capsys.readouterr().out == ""
+    text = table(rows, "m")
+    assert "| recorded | bend | bend 1.00 |" in text
+    assert "before, m: far" in text
+
+
+@pytest.mark.parametrize("module", [ball_and_hoop, cascaded_tanks])
+def test_without_the_records_it_says_where_they_should_be(module, tmp_path, capsys):
+    assert module.main(["--data", str(tmp_path)]) == 2
+    assert "expected a record in" in capsys.readouterr().err
+
+
+def test_free_run_of_a_hoop_with_its_own_effects_has_no_error():
+    made = record(0.1, (-0.9, 0.9), 241)
+    whole = cut(made, 240)
+    effects = [e for e in hoop.make_effects() if e.name in ("Coulomb", "warm-up")]
+    z = torch.tensor([[7.0, 0.8, 0.01, 0.5, 0.1]], dtype=torch.float64)
+    x = run_pieces(z, whole, effects)
+    output = torch.cat([torch.from_numpy(whole.start), x[0, 0]]).numpy()
+    held = {"made": cut(type(made)("made", 0.1, made.voltage, output), 240)}
+    assert free_run(z, held, effects)["made"] == 0
+    assert free_run(z[:, :3], held)["made"] > 0.1

@@ -1,0 +1,180 @@
+"""Records of one input and one output, and the two machines that have them."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from sbi_active.seeding import forked_generators
+from sbi_active.tasks import ball_and_hoop, cascaded_tanks  # pyright: ignore
+from sbi_active.tasks.ball_and_hoop import spin  # pyright: ignore
+from sbi_active.tasks.cascaded_tanks import levels, start_levels  # pyright: ignore
+from sbi_active.tasks.records import Record, cut, read_record  # pyright: ignore
+from sbi_active.tasks.stepping import lagged  # pyright: ignore
+
+HOOP = torch.tensor([[7.3, 0.8, 0.0]], dtype=torch.float64)
+TANKS = torch.tensor([[0.05, 0.05, 0.05, 0.04]], dtype=torch.float64)
+MACHINES = {
+    "hoop": (spin, HOOP, ball_and_hoop.make_effects(), 0.1, (-0.9, 0.9)),
+    "tanks": (
+        levels,
+        TANKS,
+        [*cascaded_tanks.make_effects(), start_levels()],
+        4.0,
+        (0.5, 6.0),
+    ),
+}
+
+
+def record(step, bounds, num=240):
+    """Steps between the bounds, and a first output."""
+    rng = np.random.default_rng(0)
+    voltage = np.repeat(rng.uniform(*bounds, num // 20), 20)
+    return Record("made", step, voltage, np.linspace(4.0, 11.0, num))
+
+
+def run(name, num=1, **effects):
+    fn, theta, _, step, bounds = MACHINES[name]
+    pieces = cut(record(step, bounds), 120, every=4)
+    return fn(theta.expand(num * len(pieces), -1), **pieces.rows(num), **effects)
+
+
+def test_pieces_meet_at_their_ends():
+    made = record(0.1, (-1, 1), 241)
+    pieces = cut(made, 80, every=8)
+    assert pieces.voltage.shape == (3, 80)
+    assert pieces.output.shape == (3, 10)
+    assert pieces.times.tolist() == pytest.approx(np.arange(1, 11) * 0.8)
+    assert pieces.output[:-1, -1].tolist() == pieces.start[1:].tolist()
+    assert pieces.begin.tolist() == pytest.approx([0.0, 8.0, 16.0])
+    assert pieces.output[1, 0] == made.output[88]
+    assert pieces.rows(2)["inputs"]["voltage"].shape == (6, 80)
+
+
+def test_a_record_of_whole_pieces_lacks_its_last_reading_alone():
+    pieces = cut(record(0.1, (-1, 1), 240), 80, every=8)
+    assert len(pieces) == 3
+    assert np.isnan(pieces.output).sum() == 1
+    assert np.isnan(pieces.output[-1, -1])
+
+
+@pytest.mark.parametrize(("length", "every"), [(500, 1), (80, 7)])
+def test_a_length_that_does_not_fit_is_refused(length, every):
+    with pytest.raises(ValueError, match="expected pieces of at most 240 samples"):
+        cut(record(0.1, (-1, 1)), length, every=every)
+
+
+def write(path, **columns):
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+def test_a_record_is_read_or_refused_with_the_reason(tmp_path):
+    time, u = np.arange(5) * 0.1, np.ones(5)
+    path = write(tmp_path / "a.csv", time_s=time, u=u, y=2 * u)
+    one = read_record(path, voltage="u", output="y")
+    assert one.name == "a"
+    assert one.step == pytest.approx(0.1)
+    assert len(one.part(1, 3)) == 2
+    with pytest.raises(ValueError, match="expected columns time_s, u, z .* got no z"):
+        read_record(path, voltage="u", output="z")
+    with pytest.raises(FileNotFoundError, match="expected a record in .*b.csv"):
+        read_record(tmp_path / "b.csv", voltage="u", output="y")
+    write(path, time_s=time, u=u, y=[1, 2, np.nan, 4, 5])
+    with pytest.raises(ValueError, match="expected finite y in a.csv; got nan in samp"):
+        read_record(path, voltage="u", output="y")
+    write(path, time_s=[0, 0.1, 0.3, 0.4, 0.5], u=u, y=u)
+    with pytest.raises(ValueError, match="expected a constant rate in a.csv"):
+        read_record(path, voltage="u", output="y")
+
+
+@pytest.mark.parametrize("name", [*MACHINES])
+def test_effects_vanish_at_zero_and_have_a_slope_there(name):
+    bare = run(name)
+    assert bare.isfinite().all()
+    for effect in MACHINES[name][2]:
+        unit = effect.prior.base_dist.scale.double().expand(2, -1)
+        sizes = []
+        for share in (0.0, 1e-4, 1e-2):
+            x = run(name, **effect.apply({}, share * unit, None, None))
+            sizes.append(float((x - bare).norm()))
+        assert sizes[0] == 0, effect.name
+        assert sizes[2] > 0, effect.name
+        assert sizes[1] == pytest.approx(sizes[2] / 100, rel=0.3), effect.name
+
+
+@pytest.mark.parametrize("name", [*MACHINES])
+def test_rows_are_apart_and_of_the_prior(name):
+    fn, _, _, step, bounds = MACHINES[name]
+    module = {"hoop": ball_and_hoop, "tanks": cascaded_tanks}[name]
+    with forked_generators(0):
+        theta = module.make_prior().sample((6,)).double()
+    pieces = cut(record(step, bounds), 120, every=4)
+    x = fn(theta.repeat_interleave(2, 0), **pieces.rows(6))
+    assert x.isfinite().all()
+    alone = fn(theta[2:3].repeat_interleave(2, 0), **pieces.rows(1))
+    torch.testing.assert_close(x[4:6], alone)
+    assert module.make_prior().log_prob(theta).isfinite().all()
+
+
+def test_the_hoop_follows_the_linear_equation():
+    voltage = torch.ones(1, 40)
+    times = torch.linspace(0.1, 4.0, 40)
+    x = spin(HOOP, torch.zeros(1, 2), inputs={"voltage": voltage}, times=times)
+    exact = 7.3 / 0.8 * (1 - torch.exp(-0.8 * times))
+    torch.testing.assert_close(x[0], exact.double(), atol=0.01, rtol=0)
+
+
+def test_dry_friction_holds_the_hoop_and_never_turns_it_around():
+    voltage = torch.full((1, 60), 0.05)
+    times = torch.linspace(0.1, 6.0, 60)
+    start = torch.tensor([[0.0, 0.0], [0.0, 2.0]], dtype=torch.float64)
+    rows = {"inputs": {"voltage": voltage.expand(2, -1)}, "times": times}
+    x = spin(HOOP.expand(2, -1), start, **rows, coulomb=1.0)
+    assert x[0].abs().max() == 0
+    assert (x[1].diff() <= 0).all()
+    assert x[1].min() >= 0
+
+
+def test_a_delay_of_whole_steps_shifts_the_command():
+    made = record(0.1, (-1, 1), 241)
+    late = Record("late", 0.1, np.roll(made.voltage, 3), made.output)
+    late.voltage[:3] = made.voltage[0]
+    x = spin(HOOP, **cut(made, 240).rows(1), delay=0.3)
+    torch.testing.assert_close(x, spin(HOOP, **cut(late, 240).rows(1)))
+
+
+def test_a_lag_is_exact_for_a_step_and_has_a_slope_below_a_step():
+    drive = torch.cat([torch.zeros(1, 2), torch.ones(50, 2)]).double()
+    steps = torch.tensor([5.0, 1e-3], dtype=torch.float64)
+    x = lagged(drive, steps)
+    ends = torch.arange(51, dtype=torch.float64)
+    filled = 5 * (1 - torch.exp(-ends / 5))  # integral of what still lacks
+    torch.testing.assert_close((drive - x)[:, 0].cumsum(0), filled)
+    assert (drive - x)[1, 1] == pytest.approx(1e-3)
+
+
+def test_tanks_keep_their_water():
+    """What is pumped less what flows out is what is there, both areas alike."""
+    theta = torch.tensor([[0.05, 0.05, 1e-9, 0.04]], dtype=torch.float64)
+    voltage = torch.full((1, 100), 2.0)
+    out = levels(
+        theta,
+        torch.tensor([[0.0, 1.0]]),
+        inputs={"voltage": voltage},
+        times=torch.tensor([400.0]),
+        upper_start=3.0,
+    )
+    upper = 4.0  # its steady level is (.04 * 2 / .05)^2 = 2.56
+    for _ in range(40_000):
+        upper += 0.01 * (0.08 - 0.05 * upper**0.5)
+    assert float(out) == pytest.approx(1.0 + 400 * 0.08 - (upper - 4.0), rel=1e-4)
+
+
+def test_overflow_keeps_levels_at_their_rims():
+    full = {"inputs": {"voltage": torch.full((1, 300), 6.0)}}
+    rows = {"action": torch.tensor([[0.0, 5.0]]), "times": torch.tensor([1_200.0])}
+    high = levels(TANKS, **rows, **full)
+    kept = levels(TANKS, **rows, **full, overflow=3.0)
+    assert high > 20
+    assert float(kept) == pytest.approx(10.0, abs=0.3)
