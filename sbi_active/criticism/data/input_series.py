@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
@@ -23,8 +24,6 @@ FAR = 0.1
 SAME = 1e-6
 #: Share of a step by which a time may be off and count as that of a grid point.
 ON_TIME = 1e-3
-#: Grid points per sample of the longest trial, at most: beyond, clocks disagree.
-MOST = 20
 
 
 def inputs_of(
@@ -284,18 +283,36 @@ def _grid(stamps: Tensor, lengths: Mapping[str, list[int]]) -> Array | None:
     known = [own[own.isfinite()].numpy() for own in stamps]
     step = min(float(np.median(np.diff(own))) for own in known)
     low, high = min(own[0] for own in known), max(own[-1] for own in known)
-    num = round((high - low) / step)
-    longest = max(len(own) for own in known)
-    if num > MOST * longest:
-        raise ValueError(
-            f"expected trials whose inputs are at similar times; got {low:g} to "
-            f"{high:g}, {num} steps of {step:g} for at most {longest} values a trial; "
-            "give each trial's times, those of x too, from its own begin, and all in "
-            "one unit"
-        )
+    _require_one_origin(known, low)
     # Where the last time is between two steps, the grid goes up to the next.
     num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
     return low + step * np.arange(num + 1)
+
+
+def _require_one_origin(known: list[Array], low: float) -> None:
+    """Raise, or warn, where trials begin long after the grid: they hold what is first.
+
+    Pieces of one record have its clock, and a simulator would run up to each.
+    """
+    late = [
+        (i, own[0] - low, own[-1] - own[0])
+        for i, own in enumerate(known)
+        if own[0] - low > FAR * (own[-1] - own[0])
+    ]
+    if not late:
+        return
+    i, after, span = max(late, key=lambda each: each[1] / each[2])
+    remedy = "give the times of each trial, those of x too, from its own begin"
+    if after > span:
+        raise ValueError(
+            f"expected trials that begin at similar times; got trial {i} of {span:g} "
+            f"that begins {after:g} after the earliest; {remedy}, and all in one unit"
+        )
+    warnings.warn(
+        f"trials {[i for i, *_ in late]} begin up to {after:g} after the earliest, and "
+        f"hold their first inputs until then: {remedy} where a simulator starts there",
+        stacklevel=6,
+    )
 
 
 def _at(grid: Array, times: Array, values: Array, hold: Hold) -> Array:

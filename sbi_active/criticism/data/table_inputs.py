@@ -55,6 +55,7 @@ class InputRows:
         rows = [at[whole[at]] for at in self.members]
         for name, at in zip(self.trials, rows, strict=True):
             self._require_dense(name, at)
+        self._require_one_origin(rows)
         return {
             "inputs": {
                 name: [self.values[at, j] for at in rows]
@@ -117,6 +118,19 @@ class InputRows:
                     f"s in {self.source}; got x at {time[i]:g} s in {place(i)} of "
                     f"{source}; give both times from one origin, with their units as "
                     "in time_ms, or remove what is beyond"
+                )
+
+    def _require_one_origin(self, rows: Sequence[Array]) -> None:
+        """Raise where a trial begins after another of its length has ended."""
+        earliest = min(self.time[at[0]] for at in rows)
+        for at in rows:
+            begin, end = self.time[at[0]], self.time[at[-1]]
+            if begin - earliest > end - begin:
+                raise ValueError(
+                    f"expected trials that begin at similar times; got {begin:g} s in "
+                    f"{self.place(at[0])} of {self.source} and {earliest:g} s in "
+                    "another trial; give the times of each trial, those of x too, from "
+                    "its own begin, and all in one unit"
                 )
 
     def _require_dense(self, name: str, at: Array) -> None:

@@ -59,6 +59,14 @@ def test_values_are_held_on_the_finest_grid():
     assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
 
 
+def test_trials_that_begin_later_are_noted():
+    late = torch.stack([FINE, FINE + 0.3])
+    with pytest.warns(UserWarning, match="trials .1. begin up to 0.3 after the"):
+        found = trials(torch.randn(2, 11), late, sample_times=late[:, [0, 5, 10]])
+    assert found.input_times is not None
+    assert len(found.input_times) == 14
+
+
 def test_values_are_drawn_as_lines_where_asked():
     found = trials(
         [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
@@ -148,7 +156,7 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
                 "input_times": torch.stack([FINE, 5000 + FINE]),
                 "sample_times": torch.stack([TIMES, 5000 + TIMES]),
             },
-            "similar times; .* from its own begin",
+            "begin at similar times; got trial 1 of 1 .* 5000 after .* its own begin",
         ),
         ({"inputs": torch.zeros(2, 11), "input_hold": "cubic"}, "'previous' or"),
         ({"inputs": torch.zeros(2, 11), "start": [1.0]}, "start states of shape"),

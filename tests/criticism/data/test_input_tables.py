@@ -126,6 +126,11 @@ def test_columns_of_another_file_may_have_names_of_their_own():
             "one value of start_w in each trial; .* value at the start in each row",
         ),
         (
+            ["a,0,1,5", "a,1,2,5", "b,2,1,6", "b,3,1,7"],
+            "trial,time,input_u,x_y",
+            "similar times; got 2 s in row 3 .trial b. .* from its own begin",
+        ),
+        (
             ["a,0,1 V,5", "a,1,1,5"],
             "trial,time,input_u,x_y",
             "a number in column input_u, row 1 .trial a.; got '1 V'",
