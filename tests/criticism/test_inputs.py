@@ -15,6 +15,7 @@ from sbi_active.criticism import (
     close_loop,
     generic_effects,
 )
+from sbi_active.criticism.report.rendering import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from tests.criticism.motor_world import (
     DEAD_ZONE,
@@ -36,6 +37,8 @@ def test_what_a_motor_lacks_is_found(phi, name):
     rmse = report.before_after.set_index("metric").loc["rmse"]
     assert rmse["after"] < 0.06 < rmse["before"]
     assert "trial from" not in str(report)
+    panels = [ax.get_xlabel() for ax in figures(report)["residuals"].axes]
+    assert panels == ["trial", "time [s]"] * 2  # the label has none of its own
 
 
 def test_a_right_model_is_left_alone():
