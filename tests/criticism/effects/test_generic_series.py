@@ -5,8 +5,14 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Trials, generic_effects
+from sbi_active.criticism import (
+    AugmentedSimulator,
+    Criticism,
+    Trials,
+    generic_effects,
+)
 from sbi_active.criticism.effects.series import delayed_input, played
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 
 ACTUATOR = {
@@ -115,3 +121,24 @@ def test_a_required_time_of_the_trials_is_enough():
     trials = Trials(torch.ones(3), torch.zeros(3, 5), sample_times=times)
     names = {e.name for e in generic_effects(model, trials, prior=prior)}
     assert {"action gain", "sensor lag", "drift in time"} <= names
+
+
+def test_a_small_effect_changes_x_in_proportion():
+    """By 1e-4 and 2e-4 of its prior's deviation; a limit at infinity has no such."""
+    trials = measured(0, {}, held_out=0)
+    effects = generic_effects(MODEL, trials, prior=PRIOR)
+    simulator = TrialSimulator(AugmentedSimulator(MODEL, effects), trials)
+    theta = torch.tensor([[3.0, 0.3]]).double()
+    bare, _, _ = simulator.predict(theta, {})
+    for effect in effects:
+        if not bool(effect.null_phi(1).isfinite().all()):
+            continue
+        scale = effect.declared_draws().square().mean(0).sqrt()[None]
+        one, two = (
+            (simulator.predict(theta, {effect.name: k * 1e-4 * scale})[0] - bare) / k
+            for k in (1, 2)
+        )
+        size = abs(one).max() / 1e-4
+        assert size > 1e-3, effect.name
+        if effect.name != "sensor quantum":  # which rounds up or down
+            assert abs(one - two).max() / 1e-4 < 0.02 * size, effect.name
