@@ -142,3 +142,37 @@ def test_a_small_effect_changes_x_in_proportion():
         assert size > 1e-3, effect.name
         if effect.name != "sensor quantum":  # which rounds up or down
             assert abs(one - two).max() / 1e-4 < 0.02 * size, effect.name
+
+
+def two_sensors(theta, action, *, inputs, times):
+    """An angle and its rate, which follow the input at once."""
+    u = inputs["u"]
+    x = torch.stack([theta * u, 10 * theta * u.diff(dim=1, prepend=u[:, :1])], -1)
+    return x[:, : times.shape[1]]
+
+
+def test_sensors_have_effects_each_for_itself():
+    prior = BoxUniform(torch.ones(1), 3 * torch.ones(1))
+    model = SimulatorModel(two_sensors, noise=GaussianNoise([0.05, 0.2]))
+    gen = torch.Generator().manual_seed(0)
+    u = torch.randn(6, 20, generator=gen).double().cumsum(1)
+    times = torch.arange(20).double()
+    x = two_sensors(
+        torch.tensor([[2.0]]).double(), None, inputs={"u": u}, times=times[None]
+    )
+    x = x + torch.tensor([0.05, 0.2]) * torch.randn(x.shape, generator=gen)
+    x[..., 1] += 0.6
+    trials = Trials(
+        None,
+        x,
+        sample_times=times,
+        inputs={"u": u},
+        channel_labels=["angle [rad]", "rate [rad/s]"],
+    )
+    effects = {e.name: e for e in generic_effects(model, trials, prior=prior)}
+    assert {"angle bias", "rate bias", "rate sensor lag"} <= {*effects}
+    assert "bias" not in effects
+    sd = [effects[f"{n} bias"].declared_draws().std() for n in ("angle", "rate")]
+    assert 3 < float(sd[1] / sd[0]) < 5
+    loop = Criticism(model, prior, trials, effects=[*effects.values()])
+    assert loop.trace().verdict == "rate bias"
