@@ -107,8 +107,10 @@ def require_fitting(
         )
     _require_no_labels_changed(trials, effects)
     if trials.inputs is not None and has_own_times(model, trials):
-        times = torch.as_tensor(model.sample_times)
-        require_covered(times[None], trials.inputs, trials.input_times)
+        times, grid = model.sample_times, trials.input_times
+        assert times is not None
+        assert grid is not None
+        require_covered(times[None], dict.fromkeys(trials.inputs, grid[None]))
     if actions is not None:
         _warn_outside(trials, actions)
     theta, action = _some_rows(prior, trials)

@@ -235,5 +235,5 @@ def test_inputs_cover_the_model_s_own_times():
         input_times=torch.linspace(0, 1, 11),
     )
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    with pytest.raises(ValueError, match="its inputs u, 0 to 1; got x at 50"):
+    with pytest.raises(ValueError, match="its input 'u', 0 to 1; got x at 50"):
         Criticism(model, prior, trials)

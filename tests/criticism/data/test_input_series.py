@@ -78,6 +78,20 @@ def test_values_are_drawn_as_lines_where_asked():
     assert torch.allclose(found.inputs["input"], torch.tensor(expected).double())
 
 
+def test_inputs_may_have_clocks_of_their_own():
+    found = trials(
+        {"u": [1.0, 2.0, 3.0], "v": torch.arange(5.0).expand(2, -1)},
+        {"u": [0.0, 0.5, 1.0], "v": torch.linspace(0, 1, 5)},
+    )
+    assert found.input_times is not None
+    assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1]
+    assert found.inputs is not None
+    assert found.inputs["u"].tolist() == [[1, 1, 2, 2, 3]] * 2
+    assert found.inputs["v"].tolist() == [[0, 1, 2, 3, 4]] * 2
+    with pytest.raises(ValueError, match="input_times of u; got those of v"):
+        trials({"u": [1.0, 2.0, 3.0]}, {"v": [0.0, 0.5, 1.0]})
+
+
 def test_jitter_does_not_move_values():
     """A value whose stamp is late by less than a thousandth step is on time."""
     steps = np.arange(11) * 0.1
@@ -133,22 +147,25 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"inputs": NAN}, "of input 'input' .* NaN in trial 1, value 4; fill it in"),
+        ({"inputs": NAN}, "NaN for input 'input' of trial 1, value 4; fill it in"),
         ({"inputs": {"u": torch.zeros(3, 11)}}, "input 'u' of shape .2, m."),
-        ({"inputs": torch.zeros(2, 11), "input_times": BACK}, "increase.* trial 0"),
+        (
+            {"inputs": torch.zeros(2, 11), "input_times": BACK},
+            "increase; got 0.1 after 0.2 for input 'input' of trial 0",
+        ),
         (
             {
                 "inputs": torch.zeros(2, 4),
                 "input_times": [[0, 0.1, 0.2, 1.0], [0.0, 0.1, 0.2, 0.3]],
             },
-            "without gaps; got none from 0.2 to 1 in trial 0",
+            "without gaps; got no value from 0.2 to 1 for input 'input' of trial 0",
         ),
         ({"inputs": torch.zeros(2, 11), "input_times": None}, "expected input_times"),
         ({"inputs": None, "input_times": FINE, "action": [1.0, 2.0]}, "got none; pass"),
         ({"inputs": None}, "expected actions, or inputs"),
         (
             {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
-            "x of trial 0 measured within the time of its inputs input, 0 to 0.001",
+            "x of trial 0 measured within the time of its input 'input', 0 to 0.001",
         ),
         (
             {
