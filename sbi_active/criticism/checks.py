@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.input_series import require_covered
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
 from sbi_active.criticism.effects.declarations import require_distinct, require_nested
@@ -20,6 +21,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import (
     conditions_for,
     conditions_of_trials,
+    has_own_times,
 )
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import CATCH_ALLS, NONE
@@ -105,6 +107,11 @@ def require_fitting(
             f"trials; got {actions.action_dim}; give the space they were drawn from"
         )
     _require_no_labels_changed(trials, effects)
+    if trials.inputs is not None and has_own_times(model, trials):
+        times, grid = model.sample_times, trials.input_times
+        assert times is not None
+        assert grid is not None
+        require_covered(times[None], dict.fromkeys(trials.inputs, grid[None]))
     if actions is not None:
         _warn_outside(trials, actions)
     theta, action = _some_rows(prior, trials)

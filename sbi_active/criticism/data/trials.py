@@ -64,8 +64,9 @@ class Trials:
         inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
             all trials share it, or a list of n arrays. An array (n, m) or a list
             without a name is "input"; (n, m, c) is "input 1" to "input c".
-        input_times: Of the inputs, shape (m,), (n, m), or a list of n, from the same
-            origin as ``sample_times``, which they are where there are as many.
+        input_times: Of the inputs, shape (m,), (n, m), or a list of n, or such by name,
+            from the same origin as ``sample_times``, which they are where there are as
+            many.
         input_hold: Between two of its times an input has the "previous" value, as a
             command is held, or is "linear".
         input_labels: What reports call each input, with its unit.
