@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.criticism.checks import digest, require_fitting, with_noise
+from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
@@ -35,6 +36,7 @@ from sbi_active.criticism.steps.formulas import guess
 from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.tracing import trace
+from sbi_active.criticism.thinning import in_words, thinned_to_need
 from sbi_active.progress import stage
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -65,6 +67,9 @@ class Criticism:
         summaries: Compare at most this many summaries of x in place of all its numbers,
             0 for none; None takes 20 where a trial has more than 500 numbers without a
             time axis, with independent noise.
+        thin: Leave out samples of trajectories that say again what others say, as the
+            bare model's fit shows, where the sensor's error is declared by
+            ``measurement_sd``. What the simulator is given stays as it is.
         seed: Of all draws.
         show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
             of all that takes 2 s anyway.
@@ -101,6 +106,7 @@ class Criticism:
         effects: Sequence[Effect] = (),
         actions: Actions | None = None,
         summaries: int | None = None,
+        thin: bool = True,
         seed: int = 0,
         show_progress: bool = False,
     ) -> None:
@@ -113,8 +119,16 @@ class Criticism:
         #: Names of effects of the order of the trials where that is unknown.
         self.left_out = [e.name for e in effects if unordered and e.needs_order]
         self.effects = [e for e in effects if e.name not in self.left_out]
-        self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
+        #: What was found of the sampling of trajectories; None where nobody looked.
+        self.sampling: Sampling | None = None
+        if thin:
+            with stage("rate of sampling", show_progress=show_progress):
+                self.trials, self.sampling = thinned_to_need(
+                    model, prior, trials, self.effects, seed=seed
+                )
+            trials = self.trials
+        self._parts = model, trials, self.effects
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
@@ -268,7 +282,11 @@ class Criticism:
     def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
         model, _, effects = self._parts
         part = Criticism(
-            model, self.prior, trials, effects=effects, summaries=0, seed=self.seed
+            *(model, self.prior, trials),
+            effects=effects,
+            summaries=0,
+            thin=False,
+            seed=self.seed,
         )
         part._equivalent = groups = self.equivalent()
         return part.rivals, trace(part.rivals, part.detect(), groups, compare=False)
@@ -340,6 +358,8 @@ class Criticism:
                 f"{self.trials.x[0].numel()} numbers of a trial: what they leave out "
                 "was not looked at"
             )
+        if self.sampling is not None and self.sampling.every > 1:
+            found.append(in_words(self.sampling))
         if self.left_out:
             found.append(
                 "the order of the trials is unknown: what grows from trial to trial "
@@ -356,6 +376,7 @@ def close_loop(
     effects: Sequence[Effect] = (),
     actions: Actions | None = None,
     summaries: int | None = None,
+    thin: bool = True,
     seed: int = 0,
     evaluate: bool = True,
     plan: bool = True,
@@ -373,6 +394,7 @@ def close_loop(
         effects=effects,
         actions=actions,
         summaries=summaries,
+        thin=thin,
         seed=seed,
         show_progress=show_progress,
     ).report(evaluate=evaluate, plan=plan, designed=designed)

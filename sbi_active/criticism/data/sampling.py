@@ -27,7 +27,7 @@ Array = NDArray[Any]
 
 #: Correlation of neighboring innovations that counts as none, and the multiple of its
 #: standard error :math:`1 / \sqrt{N}` that does.
-INDEPENDENT, SIGNIFICANT = 0.2, 2.0
+INDEPENDENT, SIGNIFICANT = 0.2, 3.0
 #: Samples of the median trial that are left, at least.
 FEWEST = 8
 #: Correlation times that are tried, from .2 steps to 2 spans of the recording.
@@ -41,7 +41,8 @@ class Sampling:
     Attributes:
         step: Median time between samples, s.
         every: Which samples to keep: every 1st, 2nd, ...
-        before: Correlation of neighboring innovations of all samples.
+        before: Largest correlation of neighboring innovations at the higher rates that
+            were looked at, of all samples where they are all kept.
         after: The same of those that are kept.
     """
 
@@ -60,7 +61,9 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
     """Return how densely trials are sampled, and how densely they need to be.
 
     It is the highest rate at which neighboring innovations are correlated by no more
-    than .2, or their standard error; at least 8 samples of a trial are left.
+    than .2, or three standard errors, and below which they are not for want of motion:
+    at a very high rate the sensor's error is larger than what the simulator gets wrong
+    from sample to sample, and hides it. At least 8 samples of a trial are left.
 
     Args:
         trials: With sample times.
@@ -101,12 +104,22 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
     gaps = np.diff(stamps, axis=1)
     step = float(np.nanmedian(gaps)) if gaps.size else 1.0
     count = int(np.median(np.isfinite(series).sum(1)))
-    found = [_innovations(series, stamps, 1)]
-    for every in range(2, max(count // FEWEST, 1) + 1):
-        if _independent(*found[-1]):
+    found: list[float] = []
+    is_hidden = True  # and may yet show
+    for every in range(1, max(count // FEWEST, 1) + 1):
+        correlation, num = _innovations(series, stamps, every)
+        found.append(correlation)
+        if not _independent(correlation, num):
+            is_hidden = False
+        elif not is_hidden:
             break
-        found.append(_innovations(series, stamps, every))
-    return Sampling(step=step, every=len(found), before=found[0][0], after=found[-1][0])
+    every = 1 if is_hidden else len(found)
+    return Sampling(
+        step=step,
+        every=every,
+        before=found[0] if every == 1 else max(found[:-1]),
+        after=found[every - 1],
+    )
 
 
 def thinned(trials: Trials, every: int) -> Trials:
@@ -126,7 +139,8 @@ def thinned(trials: Trials, every: int) -> Trials:
 
 
 def _independent(correlation: float, num: int) -> bool:
-    return abs(correlation) <= max(INDEPENDENT, SIGNIFICANT / np.sqrt(max(num, 1)))
+    # Differences of independent errors are correlated as well, with the other sign.
+    return correlation <= max(INDEPENDENT, SIGNIFICANT / np.sqrt(max(num, 1)))
 
 
 def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:

@@ -265,6 +265,9 @@ class Trials:
             sample times, shape (k,), NaN there too, or None.
         """
         x, times = torch.zeros_like(self.x[0]), self.sample_times
+        if times is not None:  # a sample that no trial has, such as one thinned out
+            seen = self.mask.reshape(*self.x.shape[:2], -1).any(-1).any(0)
+            x = x.where(seen.reshape(-1, *[1] * (x.ndim - 1)), torch.nan)
         if times is None or times.ndim == 1:
             return x, times
         longest = times[int(times.isfinite().sum(-1).argmax())]

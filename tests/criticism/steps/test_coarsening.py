@@ -54,7 +54,7 @@ def trace(shape, *, measurement_sd=SENSOR):
     x = 0.8 * action * (5 * TIMES).sin() - 0.2 * action * shape(TIMES)
     x = x + SENSOR * torch.randn(x.shape, generator=gen)
     trials = Trials(action, x, sample_times=TIMES)
-    loop = Criticism(model, PRIOR, trials, effects=EFFECTS, seed=0)
+    loop = Criticism(model, PRIOR, trials, effects=EFFECTS, thin=False, seed=0)
     return loop, loop.trace()
 
 
@@ -96,7 +96,7 @@ def test_a_channel_in_another_unit_counts_as_in_the_same(unit):
     x = fn(torch.full((4, 1), 0.8), action)
     x = x + SENSOR * units * torch.randn(x.shape, generator=gen)
     x[..., 0] -= 0.2 * action * step(TIMES)
-    loop = Criticism(model, PRIOR, Trials(action, x, sample_times=TIMES))
+    loop = Criticism(model, PRIOR, Trials(action, x, sample_times=TIMES), thin=False)
     none = ModelKey()
     loop.rivals.fit(none)
     # Half of the numbers count in full, the others a 400th, and else once a trial.
