@@ -19,6 +19,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.given import made_given
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     NONE,
@@ -36,7 +37,7 @@ from sbi_active.criticism.steps.formulas import guess
 from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.tracing import trace
-from sbi_active.criticism.thinning import in_words, thinned_to_need
+from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.progress import stage
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -346,26 +347,15 @@ class Criticism:
             exploratory=exploratory,
             leave_one_out=left_out,
             severe_tests=tests,
-            warnings=self._given(),
+            warnings=(
+                *made_given(
+                    self.trials,
+                    num_summaries=self.num_summaries,
+                    sampling=self.sampling,
+                    left_out=self.left_out,
+                ),
+            ),
         )
-
-    def _given(self) -> tuple[str, ...]:
-        """Return what the comparison was made given, a sentence each."""
-        found = []
-        if self.num_summaries:
-            found.append(
-                f"given {self.num_summaries} summaries of the "
-                f"{self.trials.x[0].numel()} numbers of a trial: what they leave out "
-                "was not looked at"
-            )
-        if self.sampling is not None and self.sampling.every > 1:
-            found.append(in_words(self.sampling))
-        if self.left_out:
-            found.append(
-                "the order of the trials is unknown: what grows from trial to trial "
-                f"was not looked for ({', '.join(self.left_out)})"
-            )
-        return (*found,)
 
 
 def close_loop(
