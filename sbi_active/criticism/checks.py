@@ -23,7 +23,6 @@ from sbi_active.criticism.effects.trial_conditions import (
     conditions_of_trials,
     has_own_times,
 )
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
@@ -173,38 +172,6 @@ def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -
             "the unit of the sample times"
         )
     return float(warm_up)
-
-
-def comparison_given(
-    rivals: RivalSet, trials: Trials, num_summaries: int, left_out: Sequence[str]
-) -> tuple[str, ...]:
-    """Return what a comparison was made given, a sentence each.
-
-    Args:
-        rivals: The models.
-        trials: All of them.
-        num_summaries: Of x, that were compared in its place; 0 for none.
-        left_out: Effects of the order of the trials, where that is unknown.
-    """
-    found = []
-    if num_summaries:
-        found.append(
-            f"given {num_summaries} summaries of the {trials.x[0].numel()} numbers of "
-            "a trial: what they leave out was not looked at"
-        )
-    if left_out:
-        found.append(
-            "the order of the trials is unknown: what grows from trial to trial was "
-            f"not looked for ({', '.join(left_out)})"
-        )
-    names = [e.name for e in rivals.nuisances]
-    if names and rivals.warm_up == 0:
-        found.append(
-            f"trials that were not fitted draw {', '.join(names)} from the prior, "
-            "which is part of their error; pass warm_up, the time in which their first "
-            "samples tell of it"
-        )
-    return (*found,)
 
 
 def _warn_outside(trials: Trials, actions: ActionSpace) -> None:

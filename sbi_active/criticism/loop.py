@@ -26,6 +26,7 @@ def close_loop(
     actions: Actions | None = None,
     summaries: int | None = None,
     warm_up: float = 0.0,
+    thin: bool = True,
     seed: int = 0,
     evaluate: bool = True,
     plan: bool = True,
@@ -44,6 +45,7 @@ def close_loop(
         actions=actions,
         summaries=summaries,
         warm_up=warm_up,
+        thin=thin,
         seed=seed,
         show_progress=show_progress,
     ).report(evaluate=evaluate, plan=plan, designed=designed)

@@ -161,7 +161,9 @@ def _by_entry(
         length = residuals.x.shape[1]
         times = np.broadcast_to(residuals.times, (len(each), length))
         for time, z in zip(times, residuals.refitted, strict=True):
-            ax.plot(time, z.reshape(length, -1), color=color, lw=0.8, alpha=0.6)
+            for channel in z.reshape(length, -1).T:
+                seen = np.isfinite(channel)  # through samples that are not used
+                ax.plot(time[seen], channel[seen], color=color, lw=0.8, alpha=0.6)
         ax.set_xlabel("time [s]")
         return
     num = each.shape[1]
