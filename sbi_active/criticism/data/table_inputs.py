@@ -138,8 +138,9 @@ class InputRows:
         for k in np.flatnonzero(steps > GAP * np.median(steps)):
             raise ValueError(
                 f"expected inputs without gaps; got no {name} from "
-                f"{self.time[at[k]]:g} to {self.time[at[k + 1]]:g} s between {self.place(at[k])} and "
-                f"{self.place(at[k + 1])} of {self.source}, where the median step is "
-                f"{np.median(steps):g} s; fill in what was commanded there, or split "
+                f"{self.time[at[k]]:g} to {self.time[at[k + 1]]:g} s between "
+                f"{self.place(at[k])} and {self.place(at[k + 1])} of {self.source}, "
+                f"where the median step is {np.median(steps):g} s; fill in what was "
+                "commanded there, or split "
                 "the trial"
             )
