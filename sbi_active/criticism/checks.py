@@ -106,6 +106,7 @@ def require_fitting(
             f"trials; got {actions.action_dim}; give the space they were drawn from"
         )
     _require_no_labels_changed(trials, effects)
+    _warn_unused(model, trials)
     if trials.inputs is not None and has_own_times(model, trials):
         times, grid = model.sample_times, trials.input_times
         assert times is not None
@@ -133,6 +134,18 @@ def _require_no_labels_changed(trials: Trials, effects: Sequence[Effect]) -> Non
             raise ValueError(
                 "expected effects on the inputs where the action is the trial's "
                 f"number; got {effect.name!r} on the action; declare hook='input'"
+            )
+
+
+def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
+    """Warn of what was recorded and the simulator's function does not take."""
+    for name in ("inputs", "start"):
+        if getattr(trials, name) is not None and name not in model.conditions:
+            warnings.warn(
+                f"the trials have {name}, and the simulator's function takes no "
+                f"argument {name!r}: they are not used; write fn(theta, action, *, "
+                f"{name})",
+                stacklevel=5,
             )
 
 
