@@ -106,6 +106,7 @@ def require_fitting(
             f"trials; got {actions.action_dim}; give the space they were drawn from"
         )
     _require_no_labels_changed(trials, effects)
+    _warn_unused(model, trials)
     if trials.inputs is not None and has_own_times(model, trials):
         times, grid = model.sample_times, trials.input_times
         assert times is not None
@@ -172,6 +173,18 @@ def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -
             "the unit of the sample times"
         )
     return float(warm_up)
+
+
+def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
+    """Warn of what was recorded and the simulator's function does not take."""
+    for name in ("inputs", "start"):
+        if getattr(trials, name) is not None and name not in model.conditions:
+            warnings.warn(
+                f"the trials have {name}, and the simulator's function takes no "
+                f"argument {name!r}: they are not used; write fn(theta, action, *, "
+                f"{name})",
+                stacklevel=5,
+            )
 
 
 def _warn_outside(trials: Trials, actions: ActionSpace) -> None:

@@ -237,3 +237,16 @@ def test_inputs_cover_the_model_s_own_times():
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
     with pytest.raises(ValueError, match="its input 'u', 0 to 1; got x at 50"):
         Criticism(model, prior, trials)
+
+
+def test_inputs_that_nobody_takes_are_noted():
+    model = SimulatorModel(lambda theta, action: theta * action, noise=0.1)
+    trials = Trials(
+        torch.tensor([1.0, 2.0, 3.0]),
+        torch.tensor([0.5, 1.0, 1.5]),
+        inputs={"u": torch.randn(3, 11)},
+        input_times=torch.linspace(0, 1, 11),
+    )
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    with pytest.warns(UserWarning, match="takes no argument 'inputs': they are not"):
+        Criticism(model, prior, trials)

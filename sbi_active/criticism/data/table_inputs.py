@@ -140,7 +140,7 @@ class InputRows:
                 f"expected inputs without gaps; got no {name} from "
                 f"{self.time[at[k]]:g} to {self.time[at[k + 1]]:g} s between "
                 f"{self.place(at[k])} and {self.place(at[k + 1])} of {self.source}, "
-                f"where the median step is "
-                f"{np.median(steps):g} s; fill in what was commanded there, or split "
+                f"where the median step is {np.median(steps):g} s; fill in what was "
+                "commanded there, or split "
                 "the trial"
             )
