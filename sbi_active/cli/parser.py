@@ -206,6 +206,12 @@ def _add_criticize(commands: Any) -> None:
         default="known",
         help="unknown: rows (or the column index) are not the order of execution",
     )
+    criticize.add_argument(
+        "--no-thin",
+        action="store_true",
+        help="use all samples of trajectories, where the simulator declares the "
+        "sensor's error by measurement_sd",
+    )
     source = criticize.add_mutually_exclusive_group()
     _add_task(source, "--task")
     source.add_argument("--simulator", metavar="MODULE:FUNCTION")
