@@ -42,9 +42,8 @@ def thinned_to_need(
         their sampling, None where it was not looked at.
     """
     fit = trials.fit
-    times = fit.sample_times
-    if times is None:
-        times = model.sample_times
+    own = fit.sample_times is not None
+    times = fit.sample_times if own else model.sample_times
     declared = getattr(model.noise, "measurement_sd", None) is not None
     if not declared or times is None:
         return trials, None
@@ -58,7 +57,7 @@ def thinned_to_need(
     found = suggested_sampling(fit, left.reshape(fit.x.shape), times)
     if found.every == 1:
         return trials, found
-    return thinned(trials, found.every), found
+    return thinned(trials, found, trials.sample_times if own else times), found
 
 
 def in_words(found: Sampling) -> str:

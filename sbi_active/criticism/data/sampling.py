@@ -72,7 +72,7 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
         times: Sample times, shape (k,) or (n, k), where the trials have none.
 
     Raises:
-        ValueError: If there are no times, or shapes differ.
+        ValueError: If there are no sample times, or shapes differ.
 
     References:
         Ljung, System Identification, 2nd edition, 1999, section 16.6: residuals that
@@ -87,22 +87,23 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
         True
     """
     r = np.asarray(residuals, dtype=float)
-    stamps = trials.sample_times if times is None else times
-    if stamps is None or r.shape != tuple(trials.x.shape):
+    if r.shape != tuple(trials.x.shape):
         raise ValueError(
-            f"expected residuals of the shape of x, {tuple(trials.x.shape)}, and "
-            f"sample times; got {r.shape} and "
-            f"{'times' if stamps is not None else 'none'}; pass what the fitted "
-            "model leaves of each number, and the times of x"
+            f"expected residuals of the shape of x, {tuple(trials.x.shape)}; got "
+            f"{r.shape}; pass what the fitted model leaves of each number"
         )
     n, k = r.shape[:2]
-    stamps = np.broadcast_to(np.asarray(stamps, dtype=float), (n, k))
     r = r.reshape(n, k, -1)
     size = np.sqrt(np.nanmean(r**2, axis=(0, 1)))
     series = (r / np.where(size > 0, size, 1.0)).transpose(0, 2, 1).reshape(-1, k)
-    stamps = np.repeat(stamps, r.shape[2], axis=0)
+    stamps = np.repeat(_stamps(trials, times), r.shape[2], axis=0)
+    # Each trial and channel by its own samples, whatever others have between them.
+    order = np.argsort(~np.isfinite(series), axis=1, kind="stable")
+    series = np.take_along_axis(series, order, 1)
+    stamps = np.take_along_axis(stamps, order, 1)
+    stamps = np.where(np.isfinite(series), stamps, np.nan)
     gaps = np.diff(stamps, axis=1)
-    step = float(np.nanmedian(gaps)) if gaps.size else 1.0
+    step = float(np.nanmedian(gaps)) if np.isfinite(gaps).any() else 1.0
     count = int(np.median(np.isfinite(series).sum(1)))
     found: list[float] = []
     is_hidden = True  # and may yet show
@@ -122,20 +123,48 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
     )
 
 
-def thinned(trials: Trials, every: int) -> Trials:
-    """Return trials of which every so manieth sample counts as measured.
+def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
+    """Return trials of which only samples as far apart as suggested count as measured.
 
-    The others are masked: times, and what else the simulator is given, stay as they
-    are. The first sample, which is often the start that the simulator is given, goes.
+    The others are masked, in each trial and channel by itself: times, and what else the
+    simulator is given, stay as they are. The first samples, often the start that the
+    simulator is given, go; of a trial that is shorter the last one stays.
 
     Args:
         trials: With x of shape (n, k, ...).
-        every: 1 keeps all.
+        sampling: What was found of them.
+        times: As in :func:`suggested_sampling`.
     """
     found = trials.select(slice(None))
-    kept = (np.arange(1, trials.x.shape[1] + 1) % every) == 0
-    found.x[:, ~kept] = float("nan")
+    if sampling.every == 1:
+        return found
+    n, k = trials.x.shape[:2]
+    stamps = _stamps(trials, times)
+    x = found.x.reshape(n, k, -1)
+    for i in range(n):
+        for channel in x[i].T:
+            place = np.flatnonzero(channel.isfinite().numpy())
+            if not len(place):
+                continue
+            at, apart = stamps[i, place], sampling.suggested_step - 0.5 * sampling.step
+            kept, last = [], at[0] - sampling.step
+            while (following := np.searchsorted(at, last + apart)) < len(at):
+                kept.append(following)
+                last = at[following]
+            keep = place[kept or [-1]]
+            channel[np.setdiff1d(np.arange(k), keep)] = float("nan")
     return found
+
+
+def _stamps(trials: Trials, times: Any) -> Array:
+    """Return sample times, shape (n, k)."""
+    stamps = trials.sample_times if times is None else times
+    if stamps is None:
+        raise ValueError(
+            "expected sample times of trajectories; got none; pass Trials(sample_times="
+            "...) or times="
+        )
+    return np.broadcast_to(np.asarray(stamps, dtype=float), trials.x.shape[:2])
 
 
 def _independent(correlation: float, num: int) -> bool:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data.sampling import suggested_sampling, thinned
+from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
 
 STEP = 0.02
 
@@ -85,10 +85,14 @@ def test_gaps_several_channels_and_ragged_trials():
     assert 5 <= suggested_sampling(trials, x).every <= 13
     by_model = Trials(torch.arange(6.0), x)
     assert suggested_sampling(by_model, x, times).every <= 13
-    with pytest.raises(ValueError, match="expected residuals of the shape of x"):
+    with pytest.raises(ValueError, match="expected sample times of trajectories"):
         suggested_sampling(by_model, x)
     with pytest.raises(ValueError, match="expected residuals of the shape of x"):
         suggested_sampling(trials, x[:, :3])
+
+
+def sampling(every, step=1.0):
+    return Sampling(step=step, every=every, before=0.9, after=0.1)
 
 
 def test_thinning_masks_and_changes_nothing_else():
@@ -97,10 +101,34 @@ def test_thinning_masks_and_changes_nothing_else():
     trials = Trials(
         [1.0, 2.0], x, sample_times=times, role=["fit", "held out"], names=["a", "b"]
     )
-    few = thinned(trials, 3)
+    few = thinned(trials, sampling(3))
     assert few.mask[0, :, 0].tolist() == [False, False, True, False, False, True]
     assert few.x[1, 5].tolist() == [22, 23]
     assert few.sample_times.tolist() == times.tolist()
     assert (few.names, few.role) == (trials.names, trials.role)
     assert trials.mask.all()
-    assert torch.equal(thinned(trials, 1).x, trials.x)
+    assert torch.equal(thinned(trials, sampling(1)).x, trials.x)
+    with pytest.raises(ValueError, match="expected sample times of trajectories"):
+        thinned(Trials([1.0, 2.0], x), sampling(3))
+
+
+def test_channels_of_other_rates_and_short_trials_keep_their_own():
+    x = torch.full((2, 12, 2), torch.nan)
+    x[0, :, 0] = 1.0
+    x[0, 1::4, 1] = 2.0  # a slow sensor, between the other's samples
+    x[1, :2] = 3.0  # a trial that ended early
+    trials = Trials([1.0, 2.0], x, sample_times=torch.arange(12.0))
+    few = thinned(trials, sampling(3)).mask
+    assert few[0, :, 0].nonzero()[:, 0].tolist() == [2, 5, 8, 11]
+    assert few[0, :, 1].nonzero()[:, 0].tolist() == [5, 9]
+    assert few[1].nonzero()[:, 0].tolist() == [1, 1]
+
+
+def test_a_slow_channel_beside_a_fast_one_does_not_hide_it():
+    rng = np.random.default_rng(0)
+    x = np.full((6, 600, 2), np.nan)
+    x[:, :, 0] = smooth(6, 600, 10, rng)
+    x[:, 3::50, 1] = rng.normal(size=(6, 12))
+    assert 8 <= suggested_sampling(trials_of(x), x).every <= 25
+    x[:, 3::5, 1] = smooth(6, 600, 10, rng)[:, 3::5]
+    assert 4 <= suggested_sampling(trials_of(x), x).every <= 25
