@@ -53,8 +53,10 @@ FEW_TRIALS = 5
 #: Below this effective sample size importance sampling is not trusted.
 TOO_FEW = 20.0
 #: Nats by which a largest likelihood stays below another model's evidence, so that its
-#: own evidence need not be precise.
+#: own need not be precise.
 HOPELESS = 30.0
+#: Nats by which Laplace's evidence stays below another's, so that nobody samples.
+FAR_BEHIND = 15.0
 #: The same, so that its evidence is worth no tempering.
 UNLIKELY = 10.0
 #: Particles and moves of the first cross-check by tempering, and the standard errors
@@ -290,8 +292,10 @@ class RivalSet:
         modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
         rng = np.random.default_rng(seed)
         behind = self._behind(rival, modes.u)
-        if self.is_smooth and behind > HOPELESS and rival.key != ModelKey():
-            return laplace_sample(rival, modes, rng), "linear"
+        if self.is_smooth and rival.key != ModelKey() and behind > 0:
+            sample = laplace_sample(rival, modes, rng)
+            if sample.log_evidence < self._best_evidence() - FAR_BEHIND:
+                return sample, "linear"
         if self.is_smooth:
             better = ridges
             options: dict[str, Any] = {"dismissed": self._best_evidence() - BEHIND}
@@ -330,8 +334,7 @@ class RivalSet:
     def _behind(self, rival: Rival, modes: Array) -> float:
         """Return how far even the largest likelihood is below a known evidence, nats.
 
-        An evidence is an average of likelihoods, so that no precision of it matters
-        where it is much.
+        An evidence is an average of likelihoods.
         """
         if rival.has_noise_effect:  # whose coordinates the search leaves alone
             return -np.inf
