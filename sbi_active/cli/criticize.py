@@ -63,6 +63,7 @@ def criticize(arguments: argparse.Namespace) -> int:
         trials,
         effects=[*own, *(e for e in generic if e.name not in taken)],
         actions=actions,
+        thin=not arguments.no_thin,
         seed=arguments.seed,
         designed=arguments.designed,
         show_progress=sys.stderr.isatty(),

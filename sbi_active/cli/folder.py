@@ -21,7 +21,13 @@ from sbi_active.simulation import SimulatorModel
 #: How the command line made the campaign: where its simulator is.
 DECLARED = "command.json"
 #: Of ``init``, which a file may change.
-DEFAULTS = {"method": "asbi", "seed": 0, "order": "known", "designed": False}
+DEFAULTS = {
+    "method": "asbi",
+    "seed": 0,
+    "order": "known",
+    "designed": False,
+    "no_thin": False,
+}
 
 
 def read_config(arguments: argparse.Namespace) -> None:

@@ -222,6 +222,12 @@ def _add_criticize(commands: Any) -> None:
         default="previous",
         help="between two times an input has the value before (default), or is linear",
     )
+    criticize.add_argument(
+        "--no-thin",
+        action="store_true",
+        help="use all samples of trajectories, where the simulator declares the "
+        "sensor's error by measurement_sd",
+    )
     source = criticize.add_mutually_exclusive_group()
     _add_task(source, "--task")
     source.add_argument("--simulator", metavar="MODULE:FUNCTION")

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.input_series import require_covered
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
 from sbi_active.criticism.effects.declarations import require_distinct, require_nested
@@ -20,6 +21,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import (
     conditions_for,
     conditions_of_trials,
+    has_own_times,
 )
 from sbi_active.criticism.results import CATCH_ALLS, NONE
 from sbi_active.seeding import forked_generators
@@ -104,6 +106,12 @@ def require_fitting(
             f"trials; got {actions.action_dim}; give the space they were drawn from"
         )
     _require_no_labels_changed(trials, effects)
+    _warn_unused(model, trials)
+    if trials.inputs is not None and has_own_times(model, trials):
+        times, grid = model.sample_times, trials.input_times
+        assert times is not None
+        assert grid is not None
+        require_covered(times[None], dict.fromkeys(trials.inputs, grid[None]))
     if actions is not None:
         _warn_outside(trials, actions)
     theta, action = _some_rows(prior, trials)
@@ -126,6 +134,56 @@ def _require_no_labels_changed(trials: Trials, effects: Sequence[Effect]) -> Non
             raise ValueError(
                 "expected effects on the inputs where the action is the trial's "
                 f"number; got {effect.name!r} on the action; declare hook='input'"
+            )
+
+
+def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -> float:
+    """Return the time in which trials that were not fitted tell of their nuisances.
+
+    Raises:
+        ValueError: If it is negative, there is nothing to tell of, x has no times, or a
+            trial is no longer than that.
+    """
+    if not 0 <= warm_up < float("inf"):
+        raise ValueError(
+            f"expected warm_up >= 0; got {warm_up}; pass a time in the unit of the "
+            "sample times, or 0"
+        )
+    if warm_up == 0:
+        return 0.0
+    if not any(e.scope == "trial" for e in effects):
+        raise ValueError(
+            f"expected effects of scope 'trial' with warm_up = {warm_up:g}; got none; "
+            "declare the nuisances that the first samples of a trial tell of, or leave "
+            "warm_up out"
+        )
+    times = trials.sample_times
+    if times is None:
+        raise ValueError(
+            f"expected sample_times with warm_up; got warm_up = {warm_up:g} and none; "
+            "give Trials(sample_times=...)"
+        )
+    stamps = times.expand(len(trials), -1).nan_to_num(-torch.inf)
+    span = stamps.amax(1) - times.expand(len(trials), -1)[:, 0]
+    short = [trials.names[i] for i in range(len(trials)) if span[i] <= warm_up]
+    if short:
+        raise ValueError(
+            f"expected trials longer than warm_up = {warm_up:g}; got "
+            f"{float(span.min()):g} in trial {short[0]}; pass a shorter warm_up, in "
+            "the unit of the sample times"
+        )
+    return float(warm_up)
+
+
+def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
+    """Warn of what was recorded and the simulator's function does not take."""
+    for name in ("inputs", "start"):
+        if getattr(trials, name) is not None and name not in model.conditions:
+            warnings.warn(
+                f"the trials have {name}, and the simulator's function takes no "
+                f"argument {name!r}: they are not used; write fn(theta, action, *, "
+                f"{name})",
+                stacklevel=5,
             )
 
 

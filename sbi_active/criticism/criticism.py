@@ -11,13 +11,20 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.criticism.checks import digest, require_fitting, with_noise
+from sbi_active.criticism.checks import (
+    digest,
+    require_fitting,
+    require_warm_up,
+    with_noise,
+)
+from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.given import made_given
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.record import detected, traced
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
@@ -40,6 +47,7 @@ from sbi_active.criticism.steps.formulas import guess
 from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.tracing import trace
+from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.progress import stage
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -70,6 +78,12 @@ class Criticism:
         summaries: Compare at most this many summaries of x in place of all its numbers,
             0 for none; None takes 20 where a trial has more than 500 numbers without a
             time axis, with independent noise.
+        warm_up: Time from its first sample, in the unit of the sample times, in which a
+            held-out or left-out trial tells of its nuisances (effects of scope
+            "trial"), and is not scored; 0 draws them from their priors.
+        thin: Leave out samples of trajectories that say again what others say, as the
+            bare model's fit shows, where the sensor's error is declared by
+            ``measurement_sd``. What the simulator is given stays as it is.
         seed: Of all draws.
         show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
             of all that takes 2 s anyway.
@@ -106,6 +120,8 @@ class Criticism:
         effects: Sequence[Effect] = (),
         actions: Actions | None = None,
         summaries: int | None = None,
+        warm_up: float = 0.0,
+        thin: bool = True,
         seed: int = 0,
         show_progress: bool = False,
     ) -> None:
@@ -118,11 +134,19 @@ class Criticism:
         #: Names of effects of the order of the trials where that is unknown.
         self.left_out = [e.name for e in effects if unordered and e.needs_order]
         self.effects = [e for e in effects if e.name not in self.left_out]
-        self._parts = model, trials, self.effects
         require_fitting(model, prior, trials, self.effects, actions)
         if actions is not None:
             actions = with_known_inputs(model, trials.fit, actions)
         self.actions = actions
+        #: What was found of the sampling of trajectories; None where nobody looked.
+        self.sampling: Sampling | None = None
+        if thin:
+            with stage("rate of sampling", show_progress=show_progress):
+                self.trials, self.sampling = thinned_to_need(
+                    model, prior, trials, self.effects, seed=seed
+                )
+            trials = self.trials
+        self._parts = model, trials, self.effects
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
@@ -144,6 +168,7 @@ class Criticism:
             self.rivals = RivalSet(
                 own, prior, measured.fit, some, actions=actions, seed=seed
             )
+        self.rivals.warm_up = require_warm_up(warm_up, measured, some)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
         self._equivalent: tuple[frozenset[str], ...] | None = None
@@ -280,20 +305,9 @@ class Criticism:
             return None
         if tracing.misfit is not None and self._misfit is not None:
             return evaluate_linear(self._misfit, trials.fit)
-        num, done = int(trials.fit.valid.sum()), 0
-
-        def fold(rest: Trials) -> tuple[RivalSet, Tracing]:
-            nonlocal done
-            found = self._fold(rest)
-            done += 1
-            return found
-
-        with stage(
-            "error before and after, a verdict without each trial",
-            show_progress=self.show_progress,
-            count=lambda: (done, num),
-        ):
-            return evaluate_left_out(trials.fit, fold)
+        return evaluate_left_out(
+            trials.fit, self._fold, show_progress=self.show_progress
+        )
 
     def _fitting(
         self, what: str, total: int | None = None
@@ -309,7 +323,11 @@ class Criticism:
     def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
         model, _, effects = self._parts
         part = Criticism(
-            model, self.prior, trials, effects=effects, summaries=0, seed=self.seed
+            *(model, self.prior, trials),
+            effects=effects,
+            summaries=0,
+            thin=False,
+            seed=self.seed,
         )
         part._equivalent = groups = self.equivalent()
         return part.rivals, trace(part.rivals, part.detect(), groups, compare=False)
@@ -369,21 +387,14 @@ class Criticism:
             exploratory=exploratory,
             leave_one_out=left_out,
             severe_tests=tests,
-            warnings=self._given(),
+            warnings=(
+                *made_given(
+                    self.trials,
+                    num_summaries=self.num_summaries,
+                    sampling=self.sampling,
+                    left_out=self.left_out,
+                    nuisances=[e.name for e in self.rivals.nuisances],
+                    warm_up=self.rivals.warm_up,
+                ),
+            ),
         )
-
-    def _given(self) -> tuple[str, ...]:
-        """Return what the comparison was made given, a sentence each."""
-        found = []
-        if self.num_summaries:
-            found.append(
-                f"given {self.num_summaries} summaries of the "
-                f"{self.trials.x[0].numel()} numbers of a trial: what they leave out "
-                "was not looked at"
-            )
-        if self.left_out:
-            found.append(
-                "the order of the trials is unknown: what grows from trial to trial "
-                f"was not looked for ({', '.join(self.left_out)})"
-            )
-        return (*found,)

@@ -25,6 +25,8 @@ def close_loop(
     effects: Sequence[Effect] = (),
     actions: Actions | None = None,
     summaries: int | None = None,
+    warm_up: float = 0.0,
+    thin: bool = True,
     seed: int = 0,
     evaluate: bool = True,
     plan: bool = True,
@@ -42,6 +44,8 @@ def close_loop(
         effects=effects,
         actions=actions,
         summaries=summaries,
+        warm_up=warm_up,
+        thin=thin,
         seed=seed,
         show_progress=show_progress,
     ).report(evaluate=evaluate, plan=plan, designed=designed)

@@ -3,7 +3,7 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, GaussianNoise, SimulatorModel
+from sbi_active import Campaign, GaussianNoise, SimulatorModel, simulate
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Criticism, Trials, generic_effects
@@ -98,3 +98,14 @@ def test_recorded_inputs_take_the_place_of_the_signals():
     assert abs(posterior[:, 0].mean() - 3.0) < 0.05
     assert loop.actions is SPACE
     assert loop.equivalent() == ()
+
+
+def test_workers_play_the_same_signals():
+    theta, action = PRIOR.sample((40,)), SPACE.sample((40,), seed=2)
+    one, two = (
+        simulate(MODEL, theta, action, seed=5, num_workers=n, show_progress=False).x
+        for n in (1, 2)
+    )
+    assert torch.equal(one, two)
+    seen = speed(theta, action, inputs=SPACE.inputs(action), times=TIMES.expand(40, -1))
+    assert float((one - seen).square().mean().sqrt()) < 0.03

@@ -15,6 +15,7 @@ from sbi_active.criticism import (
     close_loop,
     generic_effects,
 )
+from sbi_active.criticism.report.rendering import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from tests.criticism.motor_world import (
     DEAD_ZONE,
@@ -36,6 +37,8 @@ def test_what_a_motor_lacks_is_found(phi, name):
     rmse = report.before_after.set_index("metric").loc["rmse"]
     assert rmse["after"] < 0.06 < rmse["before"]
     assert "trial from" not in str(report)
+    panels = [ax.get_xlabel() for ax in figures(report)["residuals"].axes]
+    assert panels == ["trial", "time [s]"] * 2  # the label has none of its own
 
 
 def test_a_right_model_is_left_alone():
@@ -190,3 +193,60 @@ def test_context_is_what_was_recorded():
     )
     with pytest.raises(ValueError, match="dict of the inputs voltage"):
         Criticism(MODEL, PRIOR, trials, effects=[wrong])
+
+
+def test_what_was_found_can_be_simulated_on():
+    trials = measured(0, {"dead zone": 0.25})
+    loop = Criticism(MODEL, PRIOR, trials, effects=LIBRARY)
+    model, prior = loop.add()
+    assert prior.event_shape == (3,)
+    run = {
+        "inputs": trials.inputs,
+        "input_times": trials.input_times,
+        "times": trials.sample_times.expand(len(trials), -1),
+        "start": trials.start,
+    }
+    z = torch.tensor([[3.0, 0.3, 0.25]]).double().expand(len(trials), -1)
+    x = model.mean(z, trials.action, **run)
+    assert float((x - trials.x).square().mean().sqrt()) < 0.06
+    without = model.mean(
+        torch.cat([z[:, :2], torch.zeros(len(z), 1)], 1), trials.action, **run
+    )
+    assert float((without - trials.x).square().mean().sqrt()) > 0.1
+
+
+def test_a_residual_of_one_label_says_nothing_of_another():
+    loop = Criticism(MODEL, PRIOR, measured(0, {}), effects=LIBRARY)
+    scaled = loop.rivals.scaled_actions(loop.trials.held_out)
+    assert scaled.shape == (10, 1)
+    assert (abs(scaled - scaled.T) + 100 * torch.eye(10).numpy()).min() >= 100
+
+
+def test_inputs_cover_the_model_s_own_times():
+    model = SimulatorModel(
+        lambda theta, action, *, inputs: theta * inputs["u"][:, :3],
+        noise=GaussianNoise(0.1),
+        sample_times=[0.0, 50.0, 100.0],
+    )
+    trials = Trials(
+        None,
+        torch.zeros(3, 3),
+        inputs={"u": torch.randn(3, 11)},
+        input_times=torch.linspace(0, 1, 11),
+    )
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    with pytest.raises(ValueError, match="its input 'u', 0 to 1; got x at 50"):
+        Criticism(model, prior, trials)
+
+
+def test_inputs_that_nobody_takes_are_noted():
+    model = SimulatorModel(lambda theta, action: theta * action, noise=0.1)
+    trials = Trials(
+        torch.tensor([1.0, 2.0, 3.0]),
+        torch.tensor([0.5, 1.0, 1.5]),
+        inputs={"u": torch.randn(3, 11)},
+        input_times=torch.linspace(0, 1, 11),
+    )
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    with pytest.warns(UserWarning, match="takes no argument 'inputs': they are not"):
+        Criticism(model, prior, trials)

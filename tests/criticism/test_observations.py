@@ -275,7 +275,8 @@ def test_times_beyond_those_of_the_simulator():
 def test_actions_that_are_not_permitted_are_simulated_where_they_were():
     model = SimulatorModel(line, noise=GaussianNoise(NOISE))
     trials = Trials(ACTION, X)
-    with pytest.warns(UserWarning, match=r"\[-2.0\] of trial 0 is not in .*0, 7\)"):
+    said = r"\[-2.0\] of trial 0 is not in .*\(trials 0, 7\)"
+    with pytest.warns(UserWarning, match=said):
         criticism = Criticism(
             model, PRIOR, trials, actions=DiscreteActions(ACTION[1:-1])
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -23,8 +24,6 @@ FAR = 0.1
 SAME = 1e-6
 #: Share of a step by which a time may be off and count as that of a grid point.
 ON_TIME = 1e-3
-#: Grid points per sample of the longest trial, at most: beyond, clocks disagree.
-MOST = 20
 
 
 def inputs_of(
@@ -39,7 +38,8 @@ def inputs_of(
 
     Args:
         inputs: As in :func:`named_series`; None for none.
-        times: As in :func:`on_one_grid`; None takes those of x where there are as many.
+        times: Of the values, shape (m,), (t, m), or a list of t, or a dict of such by
+            name; None takes those of x where there are as many.
         x: What was measured, shape (t, k, ...).
         x_times: Its times, shape (k,) or (t, k).
         hold: As in :func:`on_one_grid`.
@@ -52,8 +52,8 @@ def inputs_of(
             raise ValueError("expected inputs with input_times; got none; pass inputs=")
         return None, None
     series = named_series(inputs, len(x))
-    length = next(iter(series.values())).shape[1]
     if times is None:
+        length = next(iter(series.values())).shape[1]
         if x_times is None or x_times.shape[-1] != length:
             raise ValueError(
                 f"expected input_times, the time of each of {length} values of the "
@@ -61,11 +61,11 @@ def inputs_of(
                 "sample_times"
             )
         times = x_times
-    grid = on_one_grid(series, times, hold=hold)
+    stamps = _stamps(series, times)
+    grid = on_one_grid(series, stamps, hold=hold)
     if x_times is not None:
         has_x = x.isfinite().reshape(*x.shape[:2], -1).any(-1)
-        stamps = x_times.expand(has_x.shape).where(has_x, torch.nan)
-        require_covered(stamps, series, times)
+        require_covered(x_times.expand(has_x.shape).where(has_x, torch.nan), stamps)
     return grid
 
 
@@ -98,23 +98,21 @@ def named_series(inputs: Any, num: int) -> dict[str, Tensor]:
 
 def on_one_grid(
     series: Mapping[str, Tensor],
-    times: Any,
+    stamps: Mapping[str, Tensor],
     *,
     hold: Hold = "previous",
-    names: Sequence[str] | None = None,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Return series on one uniform grid, and the grid.
 
-    Its step is the smallest median step of a trial, and it reaches from the earliest to
-    the latest time. What is on one uniform grid already stays as it is. Beyond a
-    trial's end its last value is held, before its begin its first.
+    Its step is the smallest median step of an input in a trial, and it reaches from the
+    earliest to the latest time. What is on one uniform grid already stays as it is.
+    Beyond a trial's end its last value is held, before its begin its first.
 
     Args:
         series: By name, shape (t, m), NaN after the last value of a trial.
-        times: Of the values, shape (m,), (t, m), or a list of t.
+        stamps: Times of the values, by name, shape (t, m), NaN where there are none.
         hold: "previous" holds each value until the next one, as a command is held;
             "linear" draws lines between them.
-        names: What messages call the trials; None counts from 0.
 
     Raises:
         ValueError: If times and values differ in number, a value is missing, times do
@@ -124,29 +122,22 @@ def on_one_grid(
         raise ValueError(
             f"expected input_hold 'previous' or 'linear'; got {hold!r}; choose one"
         )
-    num = len(next(iter(series.values())))
-    stamps = padded(times)
-    if stamps.ndim == 1:
-        stamps = stamps.expand(num, -1)
-    for name, value in series.items():
-        if value.shape != stamps.shape:
-            raise ValueError(
-                f"expected input_times of shape ({value.shape[1]},) or "
-                f"{tuple(value.shape)} for input {name!r}; got "
-                f"{tuple(padded(times).shape)}; give one time a value"
-            )
-    trials = [str(i) for i in range(num)] if names is None else names
-    lengths = _lengths(series, stamps, trials)
+    lengths = {
+        name: [
+            _length(f"input {name!r} of trial {i}", u, t)
+            for i, (u, t) in enumerate(zip(value, stamps[name], strict=True))
+        ]
+        for name, value in series.items()
+    }
     grid = _grid(stamps, lengths)
     if grid is None:
-        return {name: value.clone() for name, value in series.items()}, stamps[
-            0
-        ].clone()
+        own = next(iter(stamps.values()))[0].clone()
+        return {name: value.clone() for name, value in series.items()}, own
     found = {
         name: torch.stack(
             [
                 torch.from_numpy(_at(grid, t[:k].numpy(), u[:k].numpy(), hold))
-                for t, u, k in zip(stamps, value, lengths[name], strict=True)
+                for t, u, k in zip(stamps[name], value, lengths[name], strict=True)
             ]
         )
         for name, value in series.items()
@@ -170,37 +161,48 @@ def held_at(
     return {name: value[:, place] for name, value in series.items()}
 
 
-def require_covered(
-    x_times: Tensor,
-    series: Mapping[str, Tensor],
-    times: Any,
-    names: Sequence[str] | None = None,
-) -> None:
-    """Raise where x was measured long before or after the inputs of its trial.
+def require_covered(x_times: Tensor, stamps: Mapping[str, Tensor]) -> None:
+    """Raise where x was measured long before or after an input of its trial.
 
     Args:
         x_times: Of what was measured, shape (t, k), NaN for none.
-        series: As in :func:`on_one_grid`.
-        times: As there.
-        names: As there.
+        stamps: Times of the inputs, by name, shape (t, m).
     """
-    stamps = padded(times)
-    stamps = stamps.expand(len(x_times), -1) if stamps.ndim == 1 else stamps
-    for i, own in enumerate(x_times):
-        known = stamps[i][stamps[i].isfinite()]
-        first, last = float(known.min()), float(known.max())
-        step = float(known.diff().median()) if len(known) > 1 else 0.0
-        slack = max(GAP * step, FAR * (last - first))
-        own = own[own.isfinite()]
-        far = own[(own < first - slack) | (own > last + slack)]
-        if len(far):
-            which = str(i) if names is None else names[i]
+    for name, times in stamps.items():
+        for i, row in enumerate(x_times):
+            known = times[i][times[i].isfinite()]
+            first, last = float(known.min()), float(known.max())
+            step = float(known.diff().median()) if len(known) > 1 else 0.0
+            slack = max(GAP * step, FAR * (last - first))
+            own = row[row.isfinite()]
+            far = own[(own < first - slack) | (own > last + slack)]
+            if len(far):
+                raise ValueError(
+                    f"expected x of trial {i} measured within the time of its input "
+                    f"{name!r}, {first:g} to {last:g}; got x at {far[0]:g}; give both "
+                    "in one unit and from one origin, or leave out the samples beyond"
+                )
+
+
+def _stamps(series: Mapping[str, Tensor], times: Any) -> dict[str, Tensor]:
+    """Return the times of each input's values, shape (t, m)."""
+    if isinstance(times, Mapping) and {*times} != {*series}:
+        raise ValueError(
+            f"expected input_times of {', '.join(series)}; got those of "
+            f"{', '.join(map(str, times)) or 'none'}; give each input its own, or one "
+            "array for all"
+        )
+    found = {}
+    for name, value in series.items():
+        own = padded(times[name] if isinstance(times, Mapping) else times)
+        found[name] = own.expand(len(value), -1) if own.ndim == 1 else own
+        if found[name].shape != value.shape:
             raise ValueError(
-                f"expected x of trial {which} measured within the time of its inputs "
-                f"{', '.join(series)}, {first:g} to {last:g}; got x at {far[0]:g}; "
-                "give both in one unit and from one origin, or leave out the samples "
-                "beyond"
+                f"expected input_times of shape ({value.shape[1]},) or "
+                f"{tuple(value.shape)} for input {name!r}; got {tuple(own.shape)}; "
+                "give one time a value"
             )
+    return found
 
 
 def _series(name: str, value: Any, num: int) -> Tensor:
@@ -224,78 +226,96 @@ def _series(name: str, value: Any, num: int) -> Tensor:
     return found
 
 
-def _lengths(
-    series: Mapping[str, Tensor], stamps: Tensor, trials: Sequence[str]
-) -> dict[str, list[int]]:
-    """Return how many values each trial has, or raise where they are no series."""
-    found: dict[str, list[int]] = {name: [] for name in series}
-    for i, own in enumerate(stamps):
-        in_trial = f"trial {trials[i]}"
-        known = own.isfinite()
-        length = int(known.sum())
-        if not bool(known[:length].all()):
-            k = int((~known).nonzero()[0])
-            raise ValueError(
-                f"expected finite input_times; got {float(own[k])} in {in_trial}, "
-                f"value {k}; give the time of each value"
-            )
-        steps = own[:length].diff()
-        if bool((steps <= 0).any()):
-            k = int((steps <= 0).nonzero()[0])
-            raise ValueError(
-                f"expected input_times that increase; got {float(own[k + 1]):g} after "
-                f"{float(own[k]):g} in {in_trial}, value {k + 1}; sort the values by "
-                "time, and give each trial its own times"
-            )
-        middle = float(steps.median()) if len(steps) else 0.0
-        if bool((steps > GAP * middle).any()):
-            k = int((steps > GAP * middle).nonzero()[0])
-            raise ValueError(
-                f"expected inputs without gaps; got none from {float(own[k]):g} to "
-                f"{float(own[k + 1]):g} in {in_trial}, where the median step is "
-                f"{middle:g}; fill in what was commanded there, or split the trial"
-            )
-        for name, value in series.items():
-            has = value[i].isfinite()
-            last = int(has.nonzero().max()) + 1 if bool(has.any()) else 0
-            if last < 2 or not bool(has[:last].all()):
-                k = 0 if last < 2 else int((~has[:last]).nonzero()[0])
-                raise ValueError(
-                    f"expected a value of input {name!r} at each time; got NaN in "
-                    f"{in_trial}, value {k}; fill it in, or leave the trial out"
-                )
-            if last > length:
-                raise ValueError(
-                    f"expected as many input_times as values; got {length} for {last} "
-                    f"of input {name!r} in {in_trial}; give one time a value"
-                )
-            found[name].append(last)
-    return found
+def _length(what: str, values: Tensor, times: Tensor) -> int:
+    """Return how many values a series has, or raise where it is none."""
+    known = times.isfinite()
+    length = int(known.sum())
+    if not bool(known[:length].all()):
+        k = int((~known).nonzero()[0])
+        raise ValueError(
+            f"expected finite input_times; got {float(times[k])} for {what}, value "
+            f"{k}; give the time of each value"
+        )
+    steps = times[:length].diff()
+    if bool((steps <= 0).any()):
+        k = int((steps <= 0).nonzero()[0])
+        raise ValueError(
+            f"expected input_times that increase; got {float(times[k + 1]):g} after "
+            f"{float(times[k]):g} for {what}, value {k + 1}; sort the values by time, "
+            "and give each trial its own times"
+        )
+    middle = float(steps.median()) if len(steps) else 0.0
+    if bool((steps > GAP * middle).any()):
+        k = int((steps > GAP * middle).nonzero()[0])
+        raise ValueError(
+            f"expected inputs without gaps; got no value from {float(times[k]):g} to "
+            f"{float(times[k + 1]):g} for {what}, where the median step is "
+            f"{middle:g}; fill in what was commanded there, or split the trial"
+        )
+    has = values.isfinite()
+    last = int(has.nonzero().max()) + 1 if bool(has.any()) else 0
+    if last < 2 or not bool(has[:last].all()):
+        k = 0 if last < 2 else int((~has[:last]).nonzero()[0])
+        raise ValueError(
+            f"expected a value at each time; got NaN for {what}, value {k}; fill it "
+            "in, or leave the trial out"
+        )
+    if last > length:
+        raise ValueError(
+            f"expected as many input_times as values; got {length} for {last} of "
+            f"{what}; give one time a value"
+        )
+    return last
 
 
-def _grid(stamps: Tensor, lengths: Mapping[str, list[int]]) -> Array | None:
+def _grid(
+    stamps: Mapping[str, Tensor], lengths: Mapping[str, list[int]]
+) -> Array | None:
     """Return the grid, None where all are on one that is uniform already."""
-    first = stamps[0]
-    whole = all(k == stamps.shape[1] for each in lengths.values() for k in each)
-    if whole and bool((stamps == first).all()):
+    every = [*stamps.values()]
+    first = every[0][0]
+    whole = all(k == len(first) for each in lengths.values() for k in each)
+    same = all(t.shape == every[0].shape and bool((t == first).all()) for t in every)
+    if whole and same:
         steps = first.diff()
         if bool(((steps - steps.mean()).abs() <= SAME * steps.mean()).all()):
             return None
-    known = [own[own.isfinite()].numpy() for own in stamps]
-    step = min(float(np.median(np.diff(own))) for own in known)
-    low, high = min(own[0] for own in known), max(own[-1] for own in known)
-    num = round((high - low) / step)
-    longest = max(len(own) for own in known)
-    if num > MOST * longest:
-        raise ValueError(
-            f"expected trials whose inputs are at similar times; got {low:g} to "
-            f"{high:g}, {num} steps of {step:g} for at most {longest} values a trial; "
-            "give each trial's times, those of x too, from its own begin, and all in "
-            "one unit"
-        )
+    known = [
+        [t[i][t[i].isfinite()].numpy() for t in every] for i in range(len(every[0]))
+    ]
+    step = min(float(np.median(np.diff(t))) for own in known for t in own)
+    ends = [(min(t[0] for t in own), max(t[-1] for t in own)) for own in known]
+    low, high = min(begin for begin, _ in ends), max(end for _, end in ends)
+    _require_one_origin(ends, low)
     # Where the last time is between two steps, the grid goes up to the next.
     num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
     return low + step * np.arange(num + 1)
+
+
+def _require_one_origin(ends: list[tuple[float, float]], low: float) -> None:
+    """Raise, or warn, where trials begin long after the grid: they hold what is first.
+
+    Pieces of one record have its clock, and a simulator would run up to each.
+    """
+    late = [
+        (i, begin - low, end - begin)
+        for i, (begin, end) in enumerate(ends)
+        if begin - low > FAR * (end - begin)
+    ]
+    if not late:
+        return
+    i, after, span = max(late, key=lambda each: each[1] / each[2])
+    remedy = "give the times of each trial, those of x too, from its own begin"
+    if after > span:
+        raise ValueError(
+            f"expected trials that begin at similar times; got trial {i} of {span:g} "
+            f"that begins {after:g} after the earliest; {remedy}, and all in one unit"
+        )
+    warnings.warn(
+        f"trials {[i for i, *_ in late]} begin up to {after:g} after the earliest, and "
+        f"hold their first inputs until then: {remedy} where a simulator starts there",
+        stacklevel=6,
+    )
 
 
 def _at(grid: Array, times: Array, values: Array, hold: Hold) -> Array:

@@ -41,26 +41,21 @@ class InputRows:
         """Return them as arguments of ``Trials``.
 
         Raises:
-            ValueError: If a row has some inputs and not all, a trial has fewer than two
-                rows of inputs, or its inputs have a gap.
+            ValueError: If a trial has fewer than two values of an input, which has a
+                gap, or begins long after another trial.
         """
         has = np.isfinite(self.values)
-        for i in np.flatnonzero(has.any(1) & ~has.all(1)):
-            missing = [*self.names][int(np.flatnonzero(~has[i])[0])]
-            raise ValueError(
-                f"expected all inputs in a row, or none; got an empty cell of input "
-                f"{missing}, {self.place(i)} of {self.source}; fill it in"
-            )
-        whole: Array = np.asarray(has.all(1))
-        rows = [at[whole[at]] for at in self.members]
-        for name, at in zip(self.trials, rows, strict=True):
-            self._require_dense(name, at)
+        found, times = {}, {}
+        for j, name in enumerate(self.names):
+            rows = [at[has[at, j]] for at in self.members]
+            for trial, at in zip(self.trials, rows, strict=True):
+                self._require_dense(name, trial, at)
+            self._require_one_origin(rows)
+            found[name] = [self.values[at, j] for at in rows]
+            times[name] = [self.time[at] for at in rows]
         return {
-            "inputs": {
-                name: [self.values[at, j] for at in rows]
-                for j, name in enumerate(self.names)
-            },
-            "input_times": [self.time[at] for at in rows],
+            "inputs": found,
+            "input_times": times,
             "input_labels": [*self.names.values()],
         }
 
@@ -119,19 +114,33 @@ class InputRows:
                     "in time_ms, or remove what is beyond"
                 )
 
-    def _require_dense(self, name: str, at: Array) -> None:
-        in_trial = f" of trial {name}" if name else ""
+    def _require_one_origin(self, rows: Sequence[Array]) -> None:
+        """Raise where a trial begins after another of its length has ended."""
+        earliest = min(self.time[at[0]] for at in rows)
+        for at in rows:
+            begin, end = self.time[at[0]], self.time[at[-1]]
+            if begin - earliest > end - begin:
+                raise ValueError(
+                    f"expected trials that begin at similar times; got {begin:g} s in "
+                    f"{self.place(at[0])} of {self.source} and {earliest:g} s in "
+                    "another trial; give the times of each trial, those of x too, from "
+                    "its own begin, and all in one unit"
+                )
+
+    def _require_dense(self, name: str, trial: str, at: Array) -> None:
         if len(at) < 2:
+            of_trial = f" in trial {trial}" if trial else ""
             raise ValueError(
-                f"expected two or more rows of inputs{in_trial}; got {len(at)} in "
-                f"{self.source}; give what does not vary in time as action_*"
+                f"expected two or more values of input {name}{of_trial}; got {len(at)} "
+                f"in {self.source}; give what does not vary in time as action_*"
             )
         steps = np.diff(self.time[at])
         for k in np.flatnonzero(steps > GAP * np.median(steps)):
             raise ValueError(
-                f"expected inputs without gaps; got none from {self.time[at[k]]:g} to "
-                f"{self.time[at[k + 1]]:g} s between {self.place(at[k])} and "
-                f"{self.place(at[k + 1])} of {self.source}, where the median step is "
-                f"{np.median(steps):g} s; fill in what was commanded there, or split "
+                f"expected inputs without gaps; got no {name} from "
+                f"{self.time[at[k]]:g} to {self.time[at[k + 1]]:g} s between "
+                f"{self.place(at[k])} and {self.place(at[k + 1])} of {self.source}, "
+                f"where the median step is {np.median(steps):g} s; fill in what was "
+                "commanded there, or split "
                 "the trial"
             )

@@ -46,13 +46,11 @@ class Trials:
         x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
         role: "fit", or "held out" of everything that is fitted or chosen; one a
             trial, or None for all "fit".
-        mask: True where x is a measurement, of the shape of x; None takes what is not
-            NaN.
+        mask: True where x is a measurement, of its shape; None takes what is not NaN.
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
-        order: "known", or "unknown" where the index says nothing of when a trial was
-            executed, as for records that were collected: nothing is then traced to
-            wear, warming or drift from trial to trial.
+        order: "known", or "unknown" where the index does not say when a trial was
+            executed: nothing is then traced to wear or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
         names: What reports, warnings and figures call each trial; None takes its index.
             A selection keeps them.
@@ -64,8 +62,9 @@ class Trials:
         inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
             all trials share it, or a list of n arrays. An array (n, m) or a list
             without a name is "input"; (n, m, c) is "input 1" to "input c".
-        input_times: Of the inputs, shape (m,), (n, m), or a list of n, from the same
-            origin as ``sample_times``, which they are where there are as many.
+        input_times: Of the inputs, shape (m,), (n, m), or a list of n, or such by name,
+            from the same origin as ``sample_times``, which they are where there are as
+            many.
         input_hold: Between two of its times an input has the "previous" value, as a
             command is held, or is "linear".
         input_labels: What reports call each input, with its unit.
@@ -328,6 +327,9 @@ class Trials:
             sample times, shape (k,), NaN there too, or None.
         """
         x, times = torch.zeros_like(self.x[0]), self.sample_times
+        if times is not None:  # a sample that no trial has, such as one thinned out
+            seen = self.mask.reshape(*self.x.shape[:2], -1).any(-1).any(0)
+            x = x.where(seen.reshape(-1, *[1] * (x.ndim - 1)), torch.nan)
         if times is None or times.ndim == 1:
             return x, times
         longest = times[int(times.isfinite().sum(-1).argmax())]
@@ -374,8 +376,7 @@ class Trials:
         positions = [i for i, r in enumerate(self.role) if r == role]
         if not positions:
             raise ValueError(
-                f"expected at least one trial of role {role!r}; got none of "
-                f"{len(self)}; change role"
+                f"expected a trial of role {role!r}; got none of {len(self)}; change it"
             )
         return self.select(positions)
 

@@ -21,6 +21,7 @@ from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.generic_series import (
     of_inputs,
     of_samples,
+    on_channel,
     typical_delay,
 )
 from sbi_active.criticism.effects.trial_conditions import (
@@ -44,6 +45,8 @@ LIMIT = (0.3, 1.0)
 #: Where a sensor saturates, in deviations of the prior predictive.
 RANGE = (0.1, 10.0)
 NUM_ACTIONS, NUM_PRIOR = 256, 256
+#: Sensors along a trajectory that have effects each for itself.
+MOST_SENSORS = 4
 
 
 def generic_effects(
@@ -66,8 +69,9 @@ def generic_effects(
     input over time there are gain, offset, saturation, dead zone, delay, first-order
     lag and backlash of its actuator, with the input's name where there are several.
     Where x has sample times, a drift along them, delay, first-order lag and quantum of
-    the sensor take the place of the clock's offset. Delays and lags are a fiftieth of
-    a recording, and ten samples at most.
+    the sensor take the place of the clock's offset; up to four sensors have theirs
+    each, with the channel's name. Delays and lags are a fiftieth of a recording, and
+    ten samples at most.
 
     Args:
         model: The simulator.
@@ -83,14 +87,11 @@ def generic_effects(
             "expected a simulator with declared noise, or its prior; got neither, so "
             "nothing says how large a bias may be; give prior="
         )
-    spread = None
     sd = None if model.noise is None else declared_sds(model.noise)
-    if prior is not None:
-        spread, within = _predictive_spread(model, actions, prior)
-        sd = within if sd is None else sd
-    assert sd is not None
+    draws = None if prior is None else _prior_draws(model, actions, prior)
     if isinstance(actions, Trials):
-        return _of_trials(model, actions, sd, spread)
+        return _of_trials(model, actions, sd, draws)
+    sd, spread = _sizes(sd, draws)
     if model.inputs is not None:
         signals = model.inputs.inputs(actions.sample((NUM_ACTIONS,), seed=0).double())
         grid, times = model.inputs.input_times, model.sample_times
@@ -100,13 +101,14 @@ def generic_effects(
 
 
 def _of_trials(
-    model: SimulatorModel, trials: Trials, sd: Tensor, spread: Tensor | None
+    model: SimulatorModel,
+    trials: Trials,
+    sd: Tensor | None,
+    draws: tuple[Tensor, Tensor] | None,
 ) -> list[Effect]:
     times = trials.sample_times
     if has_own_times(model, trials):
         times = model.sample_times
-    if times is not None and trials.x.ndim == 2:
-        sd = sd.mean().reshape(1)  # a sample is no channel
     found, inputs, grid = [], trials.inputs, trials.input_times
     if inputs is None and model.inputs is not None:
         inputs = model.inputs.inputs(trials.action)
@@ -119,8 +121,37 @@ def _of_trials(
     if inputs is not None:
         assert grid is not None
         found += _of_series(inputs, grid, times, trials.input_labels)
-    found += _of_observation(sd, spread, None)
-    return found if times is None else [*found, *of_samples(sd, times)]
+    return [*found, *_of_sensors(trials, sd, draws, times, model.channel_names)]
+
+
+def _of_sensors(
+    trials: Trials,
+    sd: Tensor | None,
+    draws: tuple[Tensor, Tensor] | None,
+    times: Tensor | None,
+    names: Sequence[str] | None,
+) -> list[Effect]:
+    """Return effects of one sensor, or of each where few have a series of their own."""
+    if times is None:
+        return _of_observation(*_sizes(sd, draws), None)
+    num = 1 if trials.x.ndim == 2 else trials.x.shape[2]
+    if num == 1 or trials.x.ndim > 3 or num > MOST_SENSORS:
+        if num == 1 and sd is not None:
+            sd = sd.mean().reshape(1)  # a sample is no channel
+        sd, spread = _sizes(sd, draws)
+        return [*_of_observation(sd, spread, None), *of_samples(sd, times)]
+    labels = trials.channel_labels or names or [f"x {j + 1}" for j in range(num)]
+    found = []
+    for j, label in enumerate(labels):
+        own = None if sd is None else sd[[j if len(sd) == num else 0]]
+        part = None
+        if draws is not None:
+            part = draws[0][..., [j]], draws[1][..., [j]]
+        own, spread = _sizes(own, part)
+        name = label.partition(" [")[0]
+        each = [*_of_observation(own, spread, None), *of_samples(own, times)]
+        found += [on_channel(effect, j, name) for effect in each]
+    return found
 
 
 def _of_series(
@@ -289,10 +320,10 @@ def _shift_in_time(
     return (1 - weight) * value.gather(1, index) + weight * value.gather(1, index + 1)
 
 
-def _predictive_spread(
+def _prior_draws(
     model: SimulatorModel, actions: ActionSpace | Trials, prior: Distribution
 ) -> tuple[Tensor, Tensor]:
-    """Return deviations of x over the prior, and within one parameter set."""
+    """Return x over the prior, and again at the same parameters."""
     with forked_generators(0, "spread"):
         theta = prior.sample(torch.Size([NUM_PRIOR]))
         run = {}
@@ -304,9 +335,19 @@ def _predictive_spread(
             action = actions.sample((NUM_PRIOR,)).to(theta.dtype)
         x = model(theta, action, seeds=row_seeds(0, NUM_PRIOR), **run)
         again = model(theta, action, seeds=row_seeds(1, NUM_PRIOR), **run)
-    x, again = x.double(), again.double()
+    return x.double(), again.double()
+
+
+def _sizes(
+    sd: Tensor | None, draws: tuple[Tensor, Tensor] | None
+) -> tuple[Tensor, Tensor | None]:
+    """Return deviations of the noise, and of x over the prior where that is known."""
+    if draws is None:
+        assert sd is not None
+        return sd, None
+    x, again = draws
     finite = x.flatten(1).isfinite().all(-1) & again.flatten(1).isfinite().all(-1)
     within = (x - again)[finite].square().mean().sqrt().reshape(1) / 2**0.5
     # A median: a spread that a few extreme actions make is not the typical one.
     spread = (x[finite] - x[finite].median(0).values).abs().median() * 1.4826
-    return spread.clamp(min=float(within)), within
+    return within if sd is None else sd, spread.clamp(min=float(within))

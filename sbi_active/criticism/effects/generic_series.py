@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -191,6 +191,37 @@ def of_samples(sd: Tensor, times: Tensor) -> list[Effect]:
             describe="the sensor reads multiples of a step",
         ),
     ]
+
+
+def on_channel(effect: Effect, channel: int, name: str) -> Effect:
+    """Return an effect of one sensor, on its channel alone.
+
+    Args:
+        effect: Of an observation of one channel.
+        channel: Entry of x's last axis.
+        name: What reports call it.
+    """
+    return replace(
+        effect,
+        name=f"{name} {effect.name}",
+        apply=_OnChannel(channel, effect.apply),
+        describe=f"{name}: {effect.describe}",
+    )
+
+
+@dataclass(frozen=True)
+class _OnChannel:
+    """Changes one channel."""
+
+    channel: int
+    change: Callable[..., Any]
+
+    def __call__(
+        self, x: Tensor, phi: Tensor, action: Tensor, context: Context
+    ) -> Tensor:
+        parts = [*x.split(1, -1)]
+        parts[self.channel] = self.change(parts[self.channel], phi, action, context)
+        return torch.cat(parts, -1)
 
 
 @dataclass(frozen=True)

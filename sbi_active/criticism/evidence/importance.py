@@ -16,7 +16,7 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 #: Particles a round, rounds at most, and the effective number that ends them.
-ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 100.0
+ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 60.0
 #: Effective particles that suffice for an evidence far behind another.
 ENOUGH_BEHIND = 20.0
 #: Effective particles below which a round missed the shape, and rounds after which that

@@ -16,8 +16,6 @@ from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
-#: Draws of the prior, the best of which are among the starts of a search.
-NUM_SCREENED = 128
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
@@ -46,7 +44,8 @@ class Search:
     Attributes:
         num_starts: In all.
         num_near: Of these, points near smaller rivals' posteriors, at most.
-        num_best: Of these, the best of many draws of the prior.
+        num_best: Of these, the best of the screened draws.
+        num_screened: Draws of the prior that are screened.
         num_kept: Starts that go on after either half of the first phase.
         phases: Later ones, at least and at most.
         widened: Factor on the covariances at the modes.
@@ -55,18 +54,39 @@ class Search:
     num_starts: int
     num_near: int
     num_best: int
+    num_screened: int
     num_kept: tuple[int, int]
     phases: tuple[int, int]
     widened: float = 1.0
 
 
 THOROUGH = Search(
-    num_starts=20, num_near=6, num_best=6, num_kept=(10, 6), phases=(2, 10)
+    num_starts=20,
+    num_near=6,
+    num_best=6,
+    num_screened=128,
+    num_kept=(10, 6),
+    phases=(2, 10),
+)
+#: With fits of smaller models to start from.
+NESTED = Search(
+    num_starts=10,
+    num_near=6,
+    num_best=2,
+    num_screened=32,
+    num_kept=(6, 4),
+    phases=(2, 10),
 )
 #: Where the simulator jumps, derivatives lead to the neighborhood of a mode at most,
 #: and the mode is wider than they say.
 ROUGH = Search(
-    num_starts=10, num_near=4, num_best=4, num_kept=(5, 3), phases=(1, 2), widened=4.0
+    num_starts=10,
+    num_near=4,
+    num_best=4,
+    num_screened=128,
+    num_kept=(5, 3),
+    phases=(1, 2),
+    widened=4.0,
 )
 
 
@@ -115,7 +135,9 @@ def find_modes(
         u[:some] = near[:some]
     fixed = ~rival.searched
     whiten = rival.error.start()
-    screened = rival.coordinates.sample(NUM_SCREENED, seed=derive_seed(seed, "screen"))
+    screened = rival.coordinates.sample(
+        search.num_screened, seed=derive_seed(seed, "screen")
+    )
     squares = (whiten(rival.residual(screened)[0]) ** 2).sum(1)
     u[-search.num_best :] = screened[np.argsort(squares)[: search.num_best]]
     u[:, fixed] = 0.0

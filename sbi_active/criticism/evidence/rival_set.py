@@ -22,8 +22,15 @@ from sbi_active.criticism.evidence.importance import (
     importance_sample,
 )
 from sbi_active.criticism.evidence.jumps import look_for_jumps
-from sbi_active.criticism.evidence.least_squares import ROUGH, THOROUGH, find_modes
+from sbi_active.criticism.evidence.laplace import laplace_sample
+from sbi_active.criticism.evidence.least_squares import (
+    NESTED,
+    ROUGH,
+    THOROUGH,
+    find_modes,
+)
 from sbi_active.criticism.evidence.outliers import OneOutlier
+from sbi_active.criticism.evidence.predicted_before import predicted_before
 from sbi_active.criticism.evidence.proposals import regressions, ridges
 from sbi_active.criticism.evidence.starts import starts_near_parents
 from sbi_active.criticism.evidence.tempering import temper
@@ -46,21 +53,21 @@ FEW_TRIALS = 5
 #: Below this effective sample size importance sampling is not trusted.
 TOO_FEW = 20.0
 #: Nats by which a largest likelihood stays below another model's evidence, so that its
-#: own evidence need not be precise.
+#: own need not be precise.
 HOPELESS = 30.0
+#: Nats by which Laplace's evidence stays below another's, so that nobody samples.
+FAR_BEHIND = 15.0
 #: The same, so that its evidence is worth no tempering.
 UNLIKELY = 10.0
 #: Particles and moves of the first cross-check by tempering, and the standard errors
 #: by which it may exceed the evidence before the full number runs.
-FEW_PARTICLES, FEW_MOVES, TOLERATED = 100, 2, 2.0
-#: Nats by which an evidence is behind another, so that it need not be precise where
-#: the simulator jumps and precision is dear.
+FEW_PARTICLES, FEW_MOVES, TOLERATED = 50, 2, 2.0
+#: Nats by which an evidence is behind another, so that it need not be precise.
 BEHIND = 5.0
 #: Effective sample size that is enough where the simulator jumps, and the one below
 #: which importance sampling is not trusted there: tempering, which climbs over the same
 #: jumps, would have to do better.
 ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
-NUM_SPREAD = 200
 #: Factors on the declared noise where every model misses by more.
 NUM_FACTORS = 14
 #: Ranges of the action space between two trials whose actions are labels.
@@ -95,6 +102,8 @@ class RivalSet:
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
+        warm_up: Time from its first sample in which a trial that was not fitted tells
+            of its nuisances, and is not scored.
     """
 
     def __init__(
@@ -120,6 +129,7 @@ class RivalSet:
             augmented, trials, seed=derive_seed(seed, "trials")
         )
         self.measurements = self.simulator.measurements
+        self.warm_up = 0.0
         self._factors: tuple[Array, Array] | None = None
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
@@ -276,12 +286,19 @@ class RivalSet:
 
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
         near = starts_near_parents(self.fits, rival, seed)
-        search = THOROUGH if self.is_smooth else ROUGH
+        search = ROUGH
+        if self.is_smooth:
+            search = THOROUGH if near is None else NESTED
         modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
         rng = np.random.default_rng(seed)
         behind = self._behind(rival, modes.u)
+        if self.is_smooth and rival.key != ModelKey() and behind > 0:
+            sample = laplace_sample(rival, modes, rng)
+            if sample.log_evidence < self._best_evidence() - FAR_BEHIND:
+                return sample, "linear"
         if self.is_smooth:
-            better, options = ridges, {}
+            better = ridges
+            options: dict[str, Any] = {"dismissed": self._best_evidence() - BEHIND}
             enough, too_few = ENOUGH, TOO_FEW
         else:
             better = regressions
@@ -317,8 +334,7 @@ class RivalSet:
     def _behind(self, rival: Rival, modes: Array) -> float:
         """Return how far even the largest likelihood is below a known evidence, nats.
 
-        An evidence is an average of likelihoods, so that no precision of it matters
-        where it is much.
+        An evidence is an average of likelihoods.
         """
         if rival.has_noise_effect:  # whose coordinates the search leaves alone
             return -np.inf
@@ -339,6 +355,8 @@ class RivalSet:
     ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
         best = sample.u[np.argsort(sample.weights)[-NUM_TOP:]]
+        if engine == "linear":
+            best = sample.u[:1]  # its mode, before draws that nobody simulated
         own = sum(rival.coordinates.joint.sizes)
         residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
@@ -376,20 +394,7 @@ class RivalSet:
         )
         key = tuple(None if a is None else np.asarray(a).tobytes() for a in asked)
         if key not in self._predictives:
-            self._predictives[key] = self._prior_predictive(simulator)
+            seed = derive_seed(self.seed, "spread")
+            c = SearchCoordinates(self.prior, (), self.nuisances, len(trials))
+            self._predictives[key] = predicted_before(simulator, c, seed=seed)
         return self._predictives[key]
-
-    def _prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
-        c = SearchCoordinates(self.prior, (), self.nuisances, len(simulator.trials))
-        u = c.sample(NUM_SPREAD, seed=derive_seed(self.seed, "spread"))
-        mean, _, _ = simulator.predict(*c.split(u))
-        finite = np.isfinite(mean).any(0)
-        center, spread = np.zeros((2, mean.shape[1]))
-        center[finite] = np.nanmean(mean[:, finite], axis=0)
-        spread[finite] = np.nanstd(mean[:, finite], axis=0)
-        typical = np.median(spread[spread > 0]) if (spread > 0).any() else 1.0
-        if finite.any() and not finite.all():
-            # No draw gives a number there: any that the others give is as good.
-            center[~finite] = np.mean(center[finite])
-            spread[~finite] = np.hypot(typical, np.std(center[finite]))
-        return center, np.maximum(spread, 1e-3 * typical)

@@ -54,24 +54,35 @@ def _prediction(misfit: Misfit, key: ModelKey, fold: int, place: int) -> Predict
     posterior = errors.posterior(candidate.model, candidate.grams, use)
     seed = derive_seed(misfit.rivals.seed, "left out", str(key), fold)
     rng = np.random.default_rng(seed)
-    at = np.flatnonzero(errors.fold == fold)
-    rows, unit = candidate.model.rows[at], search.unit[at]
-    values, vectors = np.linalg.eigh(posterior.cov)
+    whole = np.flatnonzero(errors.fold == fold)
+    rest = errors.is_scored[whole]
+    rows, mean, cov = candidate.model.rows[whole], posterior.mean, posterior.cov
+    noise = _covariance(m.time[whole], m.channel[whole], posterior)
+    if not rest.all():  # the first samples tell of the trial's nuisances
+        first = rows[~rest]
+        gain = cov @ first[:, 1:].T
+        inside = first[:, 1:] @ gain + noise[np.ix_(~rest, ~rest)]
+        gain = np.linalg.solve(inside, gain.T).T
+        mean = mean + gain @ (first[:, 0] - first[:, 1:] @ mean)
+        cov = cov - gain @ first[:, 1:] @ cov
+    at, rows = whole[rest], rows[rest]
+    unit = search.unit[at]
+    values, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = posterior.mean + rng.normal(size=(NUM_DRAWS, len(root))) @ root.T
+    u = mean + rng.normal(size=(NUM_DRAWS, len(root))) @ root.T
     u = np.clip(u, candidate.model.low, candidate.model.high)
     residual = rows[:, 0] - u @ rows[:, 1:].T
-    factor = _factor(m.time[at], m.channel[at], posterior)
+    factor = np.linalg.cholesky(noise[np.ix_(rest, rest)])
     error = rng.normal(size=residual.shape) @ factor.T
     white = np.linalg.solve(factor, residual.T)
     density = -0.5 * (white**2).sum(0) - np.log(np.diag(factor) * unit).sum()
-    mean = m.x[at] - unit * residual
+    predicted = m.x[at] - unit * residual
     size = int(np.prod(m.shape[1:]))
     valid = np.ones((NUM_DRAWS, 1))
     return Prediction(
-        mean,
-        np.broadcast_to(unit * np.sqrt((factor**2).sum(1)), mean.shape),
-        mean + unit * error,
+        predicted,
+        np.broadcast_to(unit * np.sqrt((factor**2).sum(1)), predicted.shape),
+        predicted + unit * error,
         (density - 0.5 * len(at) * LOG_2PI)[:, None],
         np.zeros(len(at), dtype=np.int64),
         m.position[at] - place * size,
@@ -80,9 +91,8 @@ def _prediction(misfit: Misfit, key: ModelKey, fold: int, place: int) -> Predict
     )
 
 
-def _factor(time: Array, channel: Array, posterior: Posterior) -> Array:
-    """Return a Cholesky factor of the sensor's error and the process beside it."""
+def _covariance(time: Array, channel: Array, posterior: Posterior) -> Array:
+    """Return the sensor's error with the process beside it, in sensor variances."""
     apart = np.abs(time[:, None] - time) / posterior.time_scale
     process = np.exp(-apart) * (channel[:, None] == channel)
-    cov = np.eye(len(time)) + posterior.size**2 * process
-    return np.linalg.cholesky(cov)
+    return np.eye(len(time)) + posterior.size**2 * process

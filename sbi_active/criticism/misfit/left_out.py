@@ -28,7 +28,8 @@ class LeftOut:
     Attributes:
         square: Mean squared error of each part, in sensor variances, shape (f,); NaN
             for parts that do not count.
-        error: Of each number by the fit without its part, sensor deviations, (N,).
+        error: Of each number by the fit without its part, sensor deviations, (N,); NaN
+            where it told of the part's nuisances.
         refits: Coordinates without each part, shape (f, d).
         fit: With all of them, shape (d,).
     """
@@ -78,15 +79,36 @@ def leave_out(
     fit = np.linalg.solve(total[1:, 1:] + prior, total[1:, 0])
     low, high = model.low - model.center, model.high - model.center
     refits, fit = np.clip(refits, low, high), np.clip(fit, low, high)
+    if not errors.is_scored.all():
+        refits = _with_nuisances(refits, scaled, prior, model, errors)
     error = rows[:, 0] - (rows[:, 1:] * refits[errors.fold]).sum(1)
-    count = np.bincount(errors.fold, minlength=f)
-    square = np.bincount(errors.fold, error**2, f) / count
+    kept = errors.is_scored
+    error = np.where(kept, error, np.nan)
+    count = np.bincount(errors.fold[kept], minlength=f)
+    square = np.bincount(errors.fold[kept], error[kept] ** 2, f) / count
     return LeftOut(
         np.where(use, square, np.nan),
         error,
         refits + model.center,
         fit + model.center,
     )
+
+
+def _with_nuisances(
+    refits: Array, rows: Array, prior: Array, model: LinearModel, errors: Errors
+) -> Array:
+    """Return the refits with each part's own nuisances, from its first samples."""
+    refits = refits.copy()
+    trials = np.unique(errors.measurements.trial)
+    for fold, trial in enumerate(trials):
+        own = np.flatnonzero(model.trial_of == trial)
+        some = rows[(errors.fold == fold) & ~errors.is_scored]
+        rest = some[:, 0] - some[:, 1:] @ refits[fold]
+        part = some[:, 1 + own]
+        precision = prior[np.ix_(own, own)]
+        # From the prior's center, where the refit without the part left them.
+        refits[fold, own] += np.linalg.solve(part.T @ part + precision, part.T @ rest)
+    return refits
 
 
 def _gram(rows: Array) -> Array:

@@ -34,6 +34,7 @@ class LinearModel:
         low: Bounds, shape (d,).
         high: Bounds, shape (d,).
         own: Coordinates of theta and phi; those of the trials' nuisances follow.
+        trial_of: The trial that each coordinate belongs to, -1 for all, shape (d,).
     """
 
     key: ModelKey
@@ -46,6 +47,7 @@ class LinearModel:
     low: Array
     high: Array
     own: int
+    trial_of: NDArray[np.int64]
 
     @property
     def rows(self) -> Array:
@@ -99,6 +101,7 @@ def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> Line
         low=c.low,
         high=c.high,
         own=sum(c.joint.sizes),
+        trial_of=c.trial_of(),
     )
 
 

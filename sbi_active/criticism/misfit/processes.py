@@ -28,6 +28,7 @@ from scipy.special import log_ndtr
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
+from sbi_active.criticism.steps.nuisances import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -103,12 +104,15 @@ class Errors:
         cells: The sensor's error, with what is unknown of its correlation.
         largest: Root mean square of the residual of a model that misses, in sensor
             deviations: the process may be twice as large.
+        warm_up: Time from its first sample in which a left-out trial tells of its
+            nuisances, and is not scored.
 
     Attributes:
         fold: Part that each number belongs to, shape (N,): trials, or with fewer than
             six the parts of trials, which are then left out in their place.
         num_folds: f.
         is_by_trial: Whether the parts are trials.
+        is_scored: Numbers that are predicted where their part is left out, bool, (N,).
     """
 
     def __init__(
@@ -118,11 +122,15 @@ class Errors:
         cells: list[NoiseCell],
         *,
         largest: float,
+        warm_up: float = 0.0,
     ) -> None:
         m = self.measurements = measurements
         self.unit = unit
         self.fold, self.is_by_trial = _folds(m)
         self.num_folds = int(self.fold.max()) + 1
+        self.is_scored = np.ones(len(m), dtype=bool)
+        if self.is_by_trial:
+            self.is_scored = ~is_first_part(m, warm_up)
         top = max(LARGEST, 2 * largest)
         num = 1 + round(np.log(top / SMALLEST) / np.log(FACTOR))
         self.sizes = np.geomspace(SMALLEST, top, num)

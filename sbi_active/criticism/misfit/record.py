@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import ImportanceSample
@@ -23,8 +24,8 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
+from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
@@ -157,7 +158,8 @@ def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelErro
     left, bare = (leave_out(search.found[k].model, errors) for k in (key, ModelKey()))
     excess = max(left.mean_square - 1, 0.0) / max(bare.mean_square - 1, 1e-2)
     m = rivals.measurements
-    own = _by_channel((left.error * search.unit) ** 2, m.channel)
+    kept = errors.is_scored
+    own = _by_channel((left.error * search.unit)[kept] ** 2, m.channel[kept])
     return ModelError(
         name=str(key),
         probability=misfit.choice.probabilities.get(key, 0.0),
@@ -169,19 +171,13 @@ def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelErro
 
 def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
-    rivals = misfit.rivals
-    simulator = TrialSimulator(
-        rivals.simulator.model, held_out, seed=derive_seed(rivals.seed, "predicted")
-    )
-    m = simulator.measurements
-    fit = rivals.fit(key)
-    u = fit.sample.u.mean(0, keepdims=True)
-    theta, phi = fit.rival.coordinates.split(u)
-    for effect in rivals.nuisances:
-        middle = effect.sample(NUM_DRAWS).double().mean(0)
-        phi[effect.name] = middle.expand(1, len(held_out), -1)
-    mean = simulator.predict(theta, phi)[0][0]
-    return np.sqrt(_by_channel((m.x - mean) ** 2, m.channel))
+    prediction = predict(misfit.rivals, held_out, key=key)
+    m = Measurements.of(held_out, is_sequence=True)
+    channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
+    channel[m.position] = m.channel
+    x = held_out.x.double().numpy().ravel()[prediction.position]
+    error = x - prediction.mean.mean(0)
+    return np.sqrt(_by_channel(error**2, channel[prediction.position]))
 
 
 def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:

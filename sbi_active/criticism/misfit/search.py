@@ -105,6 +105,7 @@ class Search:
             self.unit,
             self.cells,
             largest=bare.rms,
+            warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
         )
         self.keep(bare)
 

@@ -41,7 +41,8 @@ def plot_residuals(
     Args:
         before: Of the bare model, the upper row.
         after: Of the augmented one, the lower row; None where nothing was added.
-        action_labels: One an entry of the action, with its unit.
+        action_labels: One an entry of the action, with its unit; none where the action
+            is only the trial's number.
         channel_names: One an entry of x without a time axis.
         added: What the augmented model has more, in words.
 
@@ -51,7 +52,9 @@ def plot_residuals(
     rows = [(before, "bare model", BEFORE)]
     if after is not None:
         rows.append((after, f"with {added}", AFTER))
-    labels = action_labels or [f"action {i + 1}" for i in range(before.action.shape[1])]
+    labels = action_labels
+    if labels is None:
+        labels = [f"action {i + 1}" for i in range(before.action.shape[1])]
     shown = min(len(labels), MAX_ACTION_PANELS)
     several = before.x[0].size > 1
     columns = shown + 1 + several
@@ -158,7 +161,9 @@ def _by_entry(
         length = residuals.x.shape[1]
         times = np.broadcast_to(residuals.times, (len(each), length))
         for time, z in zip(times, residuals.refitted, strict=True):
-            ax.plot(time, z.reshape(length, -1), color=color, lw=0.8, alpha=0.6)
+            for channel in z.reshape(length, -1).T:
+                seen = np.isfinite(channel)  # through samples that are not used
+                ax.plot(time[seen], channel[seen], color=color, lw=0.8, alpha=0.6)
         ax.set_xlabel("time [s]")
         return
     num = each.shape[1]

@@ -58,7 +58,7 @@ def figures(report: Contents) -> dict[str, Figure]:
         "residuals": plot_residuals(
             report.residuals,
             report.residuals_after,
-            action_labels=report.action_labels,
+            action_labels=() if report.action_is_label else report.action_labels,
             channel_names=report.channel_names,
             added=added(report),
         ),

@@ -13,6 +13,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.progress import stage
 
 Array = NDArray[Any]
 #: The models fitted to some trials, and what was traced in them.
@@ -48,24 +49,32 @@ def evaluate_held_out(
     )
 
 
-def evaluate_left_out(trials: Trials, fold: Fold) -> Evaluation:
+def evaluate_left_out(
+    trials: Trials, fold: Fold, *, show_progress: bool = False
+) -> Evaluation:
     """Return the error on each trial of models chosen and fitted without it.
 
     Args:
         trials: Those that may be fitted.
         fold: Fits and traces some trials; called once a trial.
+        show_progress: Draw a bar of the trials.
     """
     valid = np.flatnonzero(trials.valid.numpy())
     before, after, selected = [], [], []
-    for i in valid:
-        rest = [j for j in range(len(trials)) if j != i]
-        rivals, tracing = fold(trials.select(rest))
-        one = trials.select([int(i)])
-        for kept, prediction in zip(
-            (before, after), _predictions(rivals, tracing, one), strict=True
-        ):
-            kept.append(scores(prediction, one))
-        selected.append(tracing.verdict)
+    with stage(
+        "error before and after, a verdict without each trial",
+        show_progress=show_progress,
+        count=lambda: (len(selected), len(valid)),
+    ):
+        for i in valid:
+            rest = [j for j in range(len(trials)) if j != i]
+            rivals, tracing = fold(trials.select(rest))
+            one = trials.select([int(i)])
+            for kept, prediction in zip(
+                (before, after), _predictions(rivals, tracing, one), strict=True
+            ):
+                kept.append(scores(prediction, one))
+            selected.append(tracing.verdict)
     names = tuple(trials.names[i] for i in valid)
     return summary(
         "leave one out", valid, joined(before), joined(after), (*selected,), names

@@ -15,6 +15,7 @@ from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGr
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
+from sbi_active.criticism.steps.nuisances import conditioned, is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -73,8 +74,9 @@ def predict(
 
     Args:
         rivals: The models; the rival is fitted to their trials.
-        trials: Trials to predict, taken as unseen; None takes those that were fitted,
-            with the residual process of "unexplained" conditioned on them.
+        trials: Trials to predict, taken as unseen but for the first part that their
+            nuisances are known from, which is left out; None takes those that were
+            fitted, with the residual process of "unexplained" conditioned on them.
         key: Which of the models.
         num_draws: From the posterior, n.
         seed: Of the draws; None is that of the models.
@@ -91,7 +93,11 @@ def predict(
     )
     m = simulator.measurements
     theta, phi = rival.coordinates.split(u)
-    if trials is not None:
+    drops = np.zeros(len(m), dtype=bool)
+    if trials is not None and rivals.nuisances and rivals.warm_up > 0:
+        theta, phi = conditioned(rivals, key, u, simulator, rng)
+        drops = is_first_part(m, rivals.warm_up) if scored else drops
+    elif trials is not None:
         with forked_generators(seed, "fresh nuisances"):
             for effect in rivals.nuisances:  # an unseen trial draws its own
                 fresh = effect.sample(num_draws * len(target))
@@ -126,7 +132,7 @@ def predict(
     errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
     for t in range(each.shape[1]):
-        at = m.trial == t
+        at = (m.trial == t) & ~drops
         residual = (m.x - mean)[:, at]
         if extra[at].any():
             each[:, t] = _independent(residual, sd[:, at])
@@ -136,12 +142,12 @@ def predict(
             each[:, t] = _log_density(noise, cells, scales, e, at) - log_scale
         each[:, t] += flags[t]
     return Prediction(
-        mean,
-        sd,
-        mean + errors,
+        mean[:, ~drops],
+        sd[:, ~drops],
+        (mean + errors)[:, ~drops],
         each,
-        m.trial,
-        m.position,
+        m.trial[~drops],
+        m.position[~drops],
         rng.uniform(size=probability.shape) < probability,
         probability,
     )

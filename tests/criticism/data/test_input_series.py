@@ -59,6 +59,14 @@ def test_values_are_held_on_the_finest_grid():
     assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
 
 
+def test_trials_that_begin_later_are_noted():
+    late = torch.stack([FINE, FINE + 0.3])
+    with pytest.warns(UserWarning, match="trials .1. begin up to 0.3 after the"):
+        found = trials(torch.randn(2, 11), late, sample_times=late[:, [0, 5, 10]])
+    assert found.input_times is not None
+    assert len(found.input_times) == 14
+
+
 def test_values_are_drawn_as_lines_where_asked():
     found = trials(
         [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
@@ -68,6 +76,20 @@ def test_values_are_drawn_as_lines_where_asked():
     assert found.inputs is not None
     expected = [[1, 1.5, 2, 2.5, 3, 3], [5, 5, 6, 7, 8, 9]]
     assert torch.allclose(found.inputs["input"], torch.tensor(expected).double())
+
+
+def test_inputs_may_have_clocks_of_their_own():
+    found = trials(
+        {"u": [1.0, 2.0, 3.0], "v": torch.arange(5.0).expand(2, -1)},
+        {"u": [0.0, 0.5, 1.0], "v": torch.linspace(0, 1, 5)},
+    )
+    assert found.input_times is not None
+    assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1]
+    assert found.inputs is not None
+    assert found.inputs["u"].tolist() == [[1, 1, 2, 2, 3]] * 2
+    assert found.inputs["v"].tolist() == [[0, 1, 2, 3, 4]] * 2
+    with pytest.raises(ValueError, match="input_times of u; got those of v"):
+        trials({"u": [1.0, 2.0, 3.0]}, {"v": [0.0, 0.5, 1.0]})
 
 
 def test_jitter_does_not_move_values():
@@ -125,22 +147,25 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"inputs": NAN}, "of input 'input' .* NaN in trial 1, value 4; fill it in"),
+        ({"inputs": NAN}, "NaN for input 'input' of trial 1, value 4; fill it in"),
         ({"inputs": {"u": torch.zeros(3, 11)}}, "input 'u' of shape .2, m."),
-        ({"inputs": torch.zeros(2, 11), "input_times": BACK}, "increase.* trial 0"),
+        (
+            {"inputs": torch.zeros(2, 11), "input_times": BACK},
+            "increase; got 0.1 after 0.2 for input 'input' of trial 0",
+        ),
         (
             {
                 "inputs": torch.zeros(2, 4),
                 "input_times": [[0, 0.1, 0.2, 1.0], [0.0, 0.1, 0.2, 0.3]],
             },
-            "without gaps; got none from 0.2 to 1 in trial 0",
+            "without gaps; got no value from 0.2 to 1 for input 'input' of trial 0",
         ),
         ({"inputs": torch.zeros(2, 11), "input_times": None}, "expected input_times"),
         ({"inputs": None, "input_times": FINE, "action": [1.0, 2.0]}, "got none; pass"),
         ({"inputs": None}, "expected actions, or inputs"),
         (
             {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
-            "x of trial 0 measured within the time of its inputs input, 0 to 0.001",
+            "x of trial 0 measured within the time of its input 'input', 0 to 0.001",
         ),
         (
             {
@@ -148,7 +173,7 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
                 "input_times": torch.stack([FINE, 5000 + FINE]),
                 "sample_times": torch.stack([TIMES, 5000 + TIMES]),
             },
-            "similar times; .* from its own begin",
+            "begin at similar times; got trial 1 of 1 .* 5000 after .* its own begin",
         ),
         ({"inputs": torch.zeros(2, 11), "input_hold": "cubic"}, "'previous' or"),
         ({"inputs": torch.zeros(2, 11), "start": [1.0]}, "start states of shape"),

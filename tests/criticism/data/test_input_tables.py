@@ -59,6 +59,20 @@ def test_rows_of_x_alone_hold_the_input():
     assert trials.x.shape == (2, 4)
 
 
+def test_each_input_may_have_rows_of_its_own():
+    """As in a log of several topics, merged by time."""
+    rows = ["a,0,1,,", "a,0.1,,5,", "a,0.5,,,7", "a,1,2,,", "a,1.1,,6,", "a,1.5,,,8"]
+    with pytest.warns(UserWarning, match="2 rows of trials.csv have a measurement"):
+        trials = read(rows, "trial,time,input_u,input_v,x_y")
+    assert trials.inputs is not None
+    assert trials.input_times is not None
+    assert trials.input_times.tolist() == [0, 1, 2]
+    assert trials.inputs["u"].tolist() == [[1, 2, 2]]
+    assert trials.inputs["v"].tolist() == [[5, 5, 6]]
+    assert trials.x.tolist() == [[7, 8]]
+    assert trials.sample_times.tolist() == [[0.5, 1.5]]
+
+
 def test_inputs_come_from_another_file_on_their_own_grid():
     trials = beside()
     assert trials.inputs is not None
@@ -106,24 +120,24 @@ def test_columns_of_another_file_may_have_names_of_their_own():
         ),
         (["1,2"], "input_u,x_y", "columns trial and time with inputs over time"),
         (
-            ["a,0,1,,5", "a,1,2,3,5", "a,2,3,4,5"],
-            "trial,time,input_u,input_v,x_y",
-            "all inputs in a row.* input v, row 1 .trial a.",
-        ),
-        (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
             "trial,time,input_u,x_y",
-            "none from 2 to 9 s between row 3 .trial a. and row 4 .* fill in",
+            "no u from 2 to 9 s between row 3 .trial a. and row 4 .* fill in",
         ),
         (
             ["a,0,1,5", "b,0,1,5", "b,1,1,5"],
             "trial,time,input_u,x_y",
-            "two or more rows of inputs of trial a; got 1 .* as action_",
+            "two or more values of input u in trial a; got 1 .* as action_",
         ),
         (
             ["a,0,1,5,0", "a,1,1,5,1"],
             "trial,time,input_u,x_y,start_w",
             "one value of start_w in each trial; .* value at the start in each row",
+        ),
+        (
+            ["a,0,1,5", "a,1,2,5", "b,2,1,6", "b,3,1,7"],
+            "trial,time,input_u,x_y",
+            "similar times; got 2 s in row 3 .trial b. .* from its own begin",
         ),
         (
             ["a,0,1 V,5", "a,1,1,5"],

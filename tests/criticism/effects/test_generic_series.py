@@ -5,8 +5,14 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Trials, generic_effects
+from sbi_active.criticism import (
+    AugmentedSimulator,
+    Criticism,
+    Trials,
+    generic_effects,
+)
 from sbi_active.criticism.effects.series import delayed_input, played
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 
 ACTUATOR = {
@@ -115,3 +121,58 @@ def test_a_required_time_of_the_trials_is_enough():
     trials = Trials(torch.ones(3), torch.zeros(3, 5), sample_times=times)
     names = {e.name for e in generic_effects(model, trials, prior=prior)}
     assert {"action gain", "sensor lag", "drift in time"} <= names
+
+
+def test_a_small_effect_changes_x_in_proportion():
+    """By 1e-4 and 2e-4 of its prior's deviation; a limit at infinity has no such."""
+    trials = measured(0, {}, held_out=0)
+    effects = generic_effects(MODEL, trials, prior=PRIOR)
+    simulator = TrialSimulator(AugmentedSimulator(MODEL, effects), trials)
+    theta = torch.tensor([[3.0, 0.3]]).double()
+    bare, _, _ = simulator.predict(theta, {})
+    for effect in effects:
+        if not bool(effect.null_phi(1).isfinite().all()):
+            continue
+        scale = effect.declared_draws().square().mean(0).sqrt()[None]
+        one, two = (
+            (simulator.predict(theta, {effect.name: k * 1e-4 * scale})[0] - bare) / k
+            for k in (1, 2)
+        )
+        size = abs(one).max() / 1e-4
+        assert size > 1e-3, effect.name
+        if effect.name != "sensor quantum":  # which rounds up or down
+            assert abs(one - two).max() / 1e-4 < 0.02 * size, effect.name
+
+
+def two_sensors(theta, action, *, inputs, times):
+    """An angle and its rate, which follow the input at once."""
+    u = inputs["u"]
+    x = torch.stack([theta * u, 10 * theta * u.diff(dim=1, prepend=u[:, :1])], -1)
+    return x[:, : times.shape[1]]
+
+
+def test_sensors_have_effects_each_for_itself():
+    prior = BoxUniform(torch.ones(1), 3 * torch.ones(1))
+    model = SimulatorModel(two_sensors, noise=GaussianNoise([0.05, 0.2]))
+    gen = torch.Generator().manual_seed(0)
+    u = torch.randn(6, 20, generator=gen).double().cumsum(1)
+    times = torch.arange(20).double()
+    x = two_sensors(
+        torch.tensor([[2.0]]).double(), None, inputs={"u": u}, times=times[None]
+    )
+    x = x + torch.tensor([0.05, 0.2]) * torch.randn(x.shape, generator=gen)
+    x[..., 1] += 0.6
+    trials = Trials(
+        None,
+        x,
+        sample_times=times,
+        inputs={"u": u},
+        channel_labels=["angle [rad]", "rate [rad/s]"],
+    )
+    effects = {e.name: e for e in generic_effects(model, trials, prior=prior)}
+    assert {"angle bias", "rate bias", "rate sensor lag"} <= {*effects}
+    assert "bias" not in effects
+    sd = [effects[f"{n} bias"].declared_draws().std() for n in ("angle", "rate")]
+    assert 3 < float(sd[1] / sd[0]) < 5
+    loop = Criticism(model, prior, trials, effects=[*effects.values()])
+    assert loop.trace().verdict == "rate bias"

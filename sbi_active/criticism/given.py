@@ -1,0 +1,48 @@
+"""What a comparison was made given, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from sbi_active.criticism.data.sampling import Sampling
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.thinning import in_words
+
+
+def made_given(
+    trials: Trials,
+    *,
+    num_summaries: int,
+    sampling: Sampling | None,
+    left_out: Sequence[str],
+    nuisances: Sequence[str],
+    warm_up: float,
+) -> Iterator[str]:
+    """Yield what was not looked at, and why, a sentence each.
+
+    Args:
+        trials: That were compared.
+        num_summaries: That stand for x; 0 for none.
+        sampling: What was found of it; None where nobody looked.
+        left_out: Names of effects of an order that is unknown.
+        nuisances: Names of those that each trial has anew.
+        warm_up: In which trials that were not fitted tell of theirs.
+    """
+    if num_summaries:
+        yield (
+            f"given {num_summaries} summaries of the {trials.x[0].numel()} numbers of "
+            "a trial: what they leave out was not looked at"
+        )
+    if sampling is not None and sampling.every > 1:
+        yield in_words(sampling)
+    if left_out:
+        yield (
+            "the order of the trials is unknown: what grows from trial to trial was "
+            f"not looked for ({', '.join(left_out)})"
+        )
+    if nuisances and warm_up == 0:
+        yield (
+            f"trials that were not fitted draw {', '.join(nuisances)} from the prior, "
+            "which is part of their error; pass warm_up, the time in which their first "
+            "samples tell of it"
+        )

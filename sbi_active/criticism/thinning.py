@@ -1,0 +1,84 @@
+"""Trials without the samples that say again what others say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from torch.distributions import Distribution
+
+from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.evidence.least_squares import ROUGH, find_modes
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import ModelKey
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation import SimulatorModel
+
+
+def thinned_to_need(
+    model: SimulatorModel,
+    prior: Distribution,
+    trials: Trials,
+    effects: Sequence[Effect],
+    *,
+    seed: int,
+) -> tuple[Trials, Sampling | None]:
+    """Return trials without samples that the bare model's fit shows to be redundant.
+
+    Only where the sensor's error is declared by ``measurement_sd``: errors beyond it
+    are the simulator's, and smooth.
+
+    Args:
+        model: The bare simulator.
+        prior: Of its parameters.
+        trials: All of them; those that may be fitted are.
+        effects: Of which those of scope "trial" belong to the bare model.
+        seed: Of the fit.
+
+    Returns:
+        The trials, as they are where nothing is to be left out; and what was found of
+        their sampling, None where it was not looked at.
+    """
+    fit = trials.fit
+    own = fit.sample_times is not None
+    times = fit.sample_times if own else model.sample_times
+    declared = getattr(model.noise, "measurement_sd", None) is not None
+    if not declared or times is None:
+        return trials, None
+    nuisances = [effect for effect in effects if effect.scope == "trial"]
+    seed = derive_seed(seed, "thinning")
+    rivals = RivalSet(model, prior, fit, nuisances, seed=seed)
+    rival = rivals.rival(ModelKey())
+    modes = find_modes(rival, step=rivals.step, seed=seed, search=ROUGH)
+    left = np.full(fit.x.numel(), np.nan)
+    left[rivals.measurements.position] = rival.residual(modes.u[:1])[0][0]
+    found = suggested_sampling(fit, left.reshape(fit.x.shape), times)
+    if found.every == 1:
+        return trials, found
+    return thinned(trials, found, trials.sample_times if own else times), found
+
+
+def in_words(found: Sampling) -> str:
+    """Return what was left out and why."""
+    return (
+        f"of {1 / found.step:.3g} samples a second every {_ordinal(found.every)} is "
+        f"used ({1 / found.suggested_step:.3g} a second; inputs as given): of what the "
+        "bare model leaves, neighboring innovations of an autocorrelated error have a "
+        f"correlation of up to {found.before:.2f} at higher rates, so that evidence "
+        f"would count the same motion several times, and of {found.after:.2f} at this "
+        "one; thin=False uses all"
+    )
+
+
+def _ordinal(number: int) -> str:
+    """Return a number in order.
+
+    Example:
+        >>> [_ordinal(n) for n in (2, 3, 11, 21)]
+        ['2nd', '3rd', '11th', '21st']
+    """
+    ends = {1: "st", 2: "nd", 3: "rd"}
+    teens = 10 < number % 100 < 14
+    return f"{number}{'th' if teens else ends.get(number % 10, 'th')}"

@@ -1,0 +1,134 @@
+"""The rate from which samples say nothing of their own, from known processes."""
+
+import numpy as np
+import pytest
+import torch
+
+from sbi_active.criticism import Trials
+from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
+
+STEP = 0.02
+
+
+def trials_of(x, step=STEP):
+    times = step * torch.arange(1, x.shape[1] + 1).double()
+    return Trials(torch.arange(len(x)).double(), x, sample_times=times)
+
+
+def chain(num, length, rho, rng):
+    """Return an autocorrelated error of unit size."""
+    e = rng.normal(size=(num, length))
+    for k in range(1, length):
+        e[:, k] = rho * e[:, k - 1] + np.sqrt(1 - rho**2) * e[:, k]
+    return e
+
+
+def smooth(num, length, width, rng):
+    """Return a process that is correlated as a Gaussian of a width in samples."""
+    at = np.arange(-4 * width, 4 * width + 1)
+    kernel = np.exp(-((at / width) ** 2))
+    kernel /= np.sqrt((kernel**2).sum())
+    white = rng.normal(size=(num, length + len(at) - 1))
+    return np.stack([np.convolve(row, kernel, "valid") for row in white])
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.95])
+def test_errors_as_assumed_are_kept_all(rho):
+    x = chain(8, 300, rho, np.random.default_rng(0))
+    found = suggested_sampling(trials_of(x), x)
+    assert found.every == 1
+    assert abs(found.before) < 0.1
+    assert found.suggested_step == pytest.approx(STEP)
+
+
+@pytest.mark.parametrize("width", [5, 10])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_smooth_errors_are_thinned_to_about_their_width(width, seed):
+    x = smooth(8, 500, width, np.random.default_rng(seed))
+    found = suggested_sampling(trials_of(x), x)
+    assert 1.0 * width <= found.every <= 2.5 * width
+    assert found.before > 0.9
+    assert found.after <= 0.2
+    # Their correlation is exp(-d^2 / (2 width^2)): as far apart, less than .61.
+    other = suggested_sampling(trials_of(x, step=1.0), x)
+    assert other.every == found.every
+    assert other.suggested_step == pytest.approx(found.every)
+
+
+def test_the_sensor_s_error_on_top_needs_no_thinning_where_it_is_larger():
+    rng = np.random.default_rng(0)
+    x = 0.3 * smooth(8, 300, 6, rng) + rng.normal(size=(8, 300))
+    assert suggested_sampling(trials_of(x), x).every == 1
+
+
+def test_a_smooth_error_that_the_sensor_s_hides_at_the_full_rate_is_found():
+    rng = np.random.default_rng(0)
+    x = smooth(8, 2_000, 40, rng) + 0.05 * rng.normal(size=(8, 2_000))
+    # From sample to sample the smooth one moves by .025, half of the sensor's error.
+    assert 40 <= suggested_sampling(trials_of(x), x).every <= 100
+
+
+def test_at_least_eight_samples_are_left():
+    x = np.sin(np.arange(40) / 30 + np.arange(6)[:, None])
+    assert suggested_sampling(trials_of(x), x).every <= 5
+    short = x[:, :7]
+    assert suggested_sampling(trials_of(short), short).every == 1
+
+
+def test_gaps_several_channels_and_ragged_trials():
+    rng = np.random.default_rng(2)
+    x = np.stack([smooth(6, 400, 5, rng), 1e3 * smooth(6, 400, 5, rng)], -1)
+    x[:, 350:] = np.nan
+    x[2, 100:120, 0] = np.nan
+    times = STEP * (1 + np.arange(400)) + 0.002 * rng.random((6, 400))
+    trials = Trials(torch.arange(6.0), x, sample_times=times)
+    assert 5 <= suggested_sampling(trials, x).every <= 13
+    by_model = Trials(torch.arange(6.0), x)
+    assert suggested_sampling(by_model, x, times).every <= 13
+    with pytest.raises(ValueError, match="expected sample times of trajectories"):
+        suggested_sampling(by_model, x)
+    with pytest.raises(ValueError, match="expected residuals of the shape of x"):
+        suggested_sampling(trials, x[:, :3])
+
+
+def sampling(every, step=1.0):
+    return Sampling(step=step, every=every, before=0.9, after=0.1)
+
+
+def test_thinning_masks_and_changes_nothing_else():
+    x = torch.arange(24.0).reshape(2, 6, 2)
+    times = torch.arange(6.0)
+    trials = Trials(
+        [1.0, 2.0], x, sample_times=times, role=["fit", "held out"], names=["a", "b"]
+    )
+    few = thinned(trials, sampling(3))
+    assert few.mask[0, :, 0].tolist() == [False, False, True, False, False, True]
+    assert few.x[1, 5].tolist() == [22, 23]
+    assert few.sample_times.tolist() == times.tolist()
+    assert (few.names, few.role) == (trials.names, trials.role)
+    assert trials.mask.all()
+    assert torch.equal(thinned(trials, sampling(1)).x, trials.x)
+    with pytest.raises(ValueError, match="expected sample times of trajectories"):
+        thinned(Trials([1.0, 2.0], x), sampling(3))
+
+
+def test_channels_of_other_rates_and_short_trials_keep_their_own():
+    x = torch.full((2, 12, 2), torch.nan)
+    x[0, :, 0] = 1.0
+    x[0, 1::4, 1] = 2.0  # a slow sensor, between the other's samples
+    x[1, :2] = 3.0  # a trial that ended early
+    trials = Trials([1.0, 2.0], x, sample_times=torch.arange(12.0))
+    few = thinned(trials, sampling(3)).mask
+    assert few[0, :, 0].nonzero()[:, 0].tolist() == [2, 5, 8, 11]
+    assert few[0, :, 1].nonzero()[:, 0].tolist() == [5, 9]
+    assert few[1].nonzero()[:, 0].tolist() == [1, 1]
+
+
+def test_a_slow_channel_beside_a_fast_one_does_not_hide_it():
+    rng = np.random.default_rng(0)
+    x = np.full((6, 600, 2), np.nan)
+    x[:, :, 0] = smooth(6, 600, 10, rng)
+    x[:, 3::50, 1] = rng.normal(size=(6, 12))
+    assert 8 <= suggested_sampling(trials_of(x), x).every <= 25
+    x[:, 3::5, 1] = smooth(6, 600, 10, rng)[:, 3::5]
+    assert 4 <= suggested_sampling(trials_of(x), x).every <= 25
