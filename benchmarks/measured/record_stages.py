@@ -84,10 +84,9 @@ def run_stages(
         rows[name] = row
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(rows, indent=1) + "\n")
-        print(
-            f"{name}: {row.get('verdict', '')}, {row.get('cpu_seconds', 0):.0f} CPU s",
-            flush=True,
-        )
+        if "line" in row:
+            text = f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s"
+            print(text, flush=True)
 
     stages: dict[str, tuple[tuple[str, ...], int | None]] = {"recorded": ((), None)}
     stages |= {f"without {' + '.join(gone)}": (gone, None) for gone in bench.removals}
@@ -178,8 +177,11 @@ def table(rows: dict[str, Any], unit: str) -> str:
             continue
         likely = {n: p for n, p in row["cause"].items() if p > 0.05 and row["alarm"]}
         causes = ", ".join(f"{n} {p:.2f}" for n, p in likely.items())
+        verdict = row["verdict"]
+        if row["helps"] and not row["named"]:
+            verdict += f", {' + '.join(row['helps'])} helps"
         lines.append(
-            f"| {name} | {row['verdict']} | {causes} | {_errors(row.get('before'))} | "
+            f"| {name} | {verdict} | {causes} | {_errors(row.get('before'))} | "
             f"{_errors(row.get('after'))} | {row['trial_simulations']:,} | "
             f"{row['cpu_seconds']:.0f} |"
         )
