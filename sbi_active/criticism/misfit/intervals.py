@@ -1,14 +1,15 @@
 r"""Intervals of parameters where every model is wrong.
 
 A posterior given one error model is too narrow: it takes what the simulator gets wrong
-for independent from trial to trial. The center is that of generalized least squares
-with a residual process of which a part is shared by the trials, and the deviation
+for independent from trial to trial. The deviation is
 
 .. math::
     s^2 = \max(s_{GLS}, s_J)^2 + (\hat u_{LSQ} - \hat u_{GLS})^2
 
-with the jackknife's over trials, :math:`s_J`: what weighting the same residuals
-differently moves a parameter by is an error of it too.
+with that of generalized least squares given a residual process of which a part is
+shared by the trials, and the jackknife's over trials, :math:`s_J`: what weighting the
+same residuals differently moves a parameter by is an error of it too. The center is
+that of least squares, which predicts new trials better.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ SHARES, LENGTHS = (0.5, 0.9), (0.7, 1e3)
 THINNED = 2
 
 
-def intervals(
+def covariance(
     model: LinearModel, posterior: Posterior, errors: Errors, action: Array
-) -> tuple[Array, Array]:
-    """Return the mean and covariance of a model's coordinates, (d,) and (d, d).
+) -> Array:
+    """Return the covariance of a model's coordinates about its best fit, (d, d).
 
     Args:
         model: Linear.
@@ -45,11 +46,12 @@ def intervals(
     """
     found = shared_process(model, errors, action)
     mean, cov = (posterior.mean, posterior.cov) if found is None else found
+    mean = np.clip(mean, model.low, model.high)
     left = leave_out(model, errors)
     own = np.sqrt(np.maximum(np.diag(cov), 1e-300))
-    sd = np.hypot(np.maximum(own, left.jackknife()), left.fit - mean)
+    sd = np.hypot(np.maximum(own, left.jackknife()), model.u - mean)
     sd = np.minimum(sd, model.widened(WIDTHS[-1]))  # no wider than before the trials
-    return mean, cov * np.outer(sd / own, sd / own)
+    return cov * np.outer(sd / own, sd / own)
 
 
 def shared_process(

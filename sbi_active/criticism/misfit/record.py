@@ -108,11 +108,11 @@ def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     if key in rivals.fits:
         return rivals.fits[key].evidence
     before = rivals.simulator.num_simulations if key.effects else 0
-    model, mean, cov = misfit.posterior(key)
+    model, cov = misfit.model(key), misfit.covariance(key)
     rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(key)))
     values, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = mean + rng.normal(size=(NUM_DRAWS, len(mean))) @ root.T
+    u = model.u + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
     u = np.clip(u, model.low, model.high)
     log_z = misfit.search.found[key].posterior.log_process
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.intervals import intervals
+from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.left_out import leave_out
-from sbi_active.criticism.misfit.linear import LinearModel, linearize
+from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Posterior
 from sbi_active.criticism.misfit.rule import PASSES, Choice, Scored, admitted, choose
 from sbi_active.criticism.misfit.search import Candidate, Search, parts
@@ -31,8 +31,6 @@ Array = NDArray[Any]
 
 #: Trials with the largest error, each of which alone may be what no model fits.
 NUM_SUSPECTS = 3
-#: Times that a model is linearized again where its posterior is.
-AGAIN = 2
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
 
@@ -64,23 +62,12 @@ class Misfit:
         """Return whether a model's chi-square passes against the sensor."""
         return passes(self.model(key))
 
-    def posterior(self, key: ModelKey) -> tuple[LinearModel, Array, Array]:
-        """Return a model linearized at its posterior, with mean and covariance."""
-        errors, rival = self.search.errors, self.rivals.rival(key)
+    def covariance(self, key: ModelKey) -> Array:
+        """Return the covariance of a model's coordinates about its best fit."""
         found = self.search.found[key]
-        model, posterior = found.model, found.posterior
         action = self.rivals.trials.action.numpy()
         action = action[np.unique(self.rivals.measurements.trial)]
-        mean, cov = intervals(model, posterior, errors, action)
-        for _ in range(AGAIN):
-            u = np.clip(mean, model.low, model.high)
-            new = linearize(rival, u, self.search.unit, self.rivals.step)
-            if not new.rms < 2 * model.rms:
-                break
-            model = new
-            posterior = errors.posterior(model, errors.grams(model.rows))
-            mean, cov = intervals(model, posterior, errors, action)
-        return model, np.clip(mean, model.low, model.high), cov
+        return covariance(found.model, found.posterior, self.search.errors, action)
 
     def selected_without(self, fold: int) -> ModelKey:
         """Return the model that is chosen without one part of the trials."""

@@ -35,6 +35,7 @@ def problem(*, low=-np.inf, ragged=False, num=NUM):
         low=np.array([-np.inf, low]),
         high=np.array([np.inf, np.inf]),
         own=2,
+        trial_of=np.array([-1, -1]),
     )
     unit = np.full(len(m), 0.5)
     errors = Errors(m, unit, [NoiseCell.of(m, sd=unit)], largest=2.0)
