@@ -48,10 +48,13 @@ def covariance(
     mean, cov = (posterior.mean, posterior.cov) if found is None else found
     mean = np.clip(mean, model.low, model.high)
     left = leave_out(model, errors)
-    own = np.sqrt(np.maximum(np.diag(cov), 1e-300))
-    sd = np.hypot(np.maximum(own, left.jackknife()), model.u - mean)
-    sd = np.minimum(sd, model.widened(WIDTHS[-1]))  # no wider than before the trials
-    return cov * np.outer(sd / own, sd / own)
+    jackknife, apart = left.jackknife(), model.u - mean
+    variance = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
+    # Parameters move together as in any of the three, whose sum is hardly wider.
+    total = cov + jackknife + np.outer(apart, apart)
+    sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))  # that of the prior
+    scale = sd / np.sqrt(np.maximum(np.diag(total), 1e-300))
+    return total * np.outer(scale, scale)
 
 
 def shared_process(

@@ -45,14 +45,15 @@ class LeftOut:
         return float(np.nanmean(self.square))
 
     def jackknife(self) -> Array:
-        """Return standard deviations of the coordinates, shape (d,).
+        """Return the covariance of the coordinates, shape (d, d).
 
         References:
             Efron & Stein, Annals of Statistics 9 (1981).
         """
         own = self.refits[np.isfinite(self.square)]
         n = len(own)
-        return np.sqrt((n - 1) / n * ((own - own.mean(0)) ** 2).sum(0))
+        off = own - own.mean(0)
+        return (n - 1) / n * off.T @ off
 
 
 def leave_out(
