@@ -69,7 +69,12 @@ def find_warnings(
         designed: Actions were chosen for their information.
     """
     return (
-        *_of_trials(trials.fit, residuals, designed=designed),
+        *_of_trials(
+            trials.fit,
+            residuals,
+            designed=designed,
+            has_sensor=tracing.misfit is not None,
+        ),
         *_of_errors(residuals, residuals_after, tracing),
         *_of_evidence(tracing, detection),
         *of_noise(detection),
@@ -79,9 +84,9 @@ def find_warnings(
 
 
 def _of_trials(
-    trials: Trials, residuals: Residuals, *, designed: bool
+    trials: Trials, residuals: Residuals, *, designed: bool, has_sensor: bool
 ) -> Iterator[str]:
-    if residuals.noise == "estimated":
+    if residuals.noise == "estimated" and not has_sensor:
         yield (
             "noise undeclared: its size has a prior or is estimated from repeated "
             "trials, which show scatter and no bias, and what differs from repeat to "
