@@ -146,8 +146,8 @@ def choose_action(
         return found
     groups = [g & {*named} for g in tracing.equivalent]
     if action is None:
-        groups = [frozenset(named)]
-    groups = [g for g in groups if len(g) > 1]
+        groups.append(frozenset(named))
+    groups = [g for g in dict.fromkeys(groups) if len(g) > 1]
     found = replace(found, inseparable=(*groups,))
     if not beyond or not groups:
         return found
