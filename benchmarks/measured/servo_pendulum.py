@@ -84,6 +84,8 @@ def judge(
         "fitted": [*fitted],
         "held_out": [*held_out],
         "verdict": tracing.verdict,
+        "model": tracing.model,
+        "cause": {} if tracing.misfit is None else dict(tracing.misfit.cause),
         "alarm": detection.alarm,
         "log_bayes_factor": detection.log_bayes_factor,
         "robust": tracing.robust,
@@ -91,9 +93,7 @@ def judge(
         "credible_set": [*tracing.credible_set],
         "near": [sorted(group) for group in tracing.near],
         "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
-        "parameters": {
-            name: _summary(tracing, name) for name in {NONE, tracing.verdict}
-        },
+        "parameters": {name: _summary(tracing, name) for name in {NONE, tracing.model}},
         "singles": {n: _summary(tracing, n) for n in loop.rivals.effects},
         "warnings": [*report.warnings],
         "seconds": time.process_time() - begin,
@@ -160,10 +160,9 @@ def _predicted(loop: Criticism, held_out: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     tracing = loop.trace()
     x = held_out.x.numpy()
-    error = tracing.verdict if tracing.verdict in CATCH_ALLS[1:] else None
-    kinds = {"before": ((), None), "after": (tracing.chosen, error)}
-    for when, (names, err) in kinds.items():
-        p = predict(loop.rivals, held_out, key=ModelKey(names, err))
+    kinds = {"before": ModelKey(), "after": tracing.key}
+    for when, key in kinds.items():
+        p = predict(loop.rivals, held_out, key=key)
         mean = p.mean.reshape(len(p.mean), *x.shape)
         rmse = np.sqrt(((mean - x) ** 2).mean((1, 2)))
         found[when] = {
@@ -178,8 +177,8 @@ def _least_squares(
 ) -> dict[str, Any]:
     """Return training and held-out RMSE of plain fits on the split of a stage."""
     sets = [(), *((name,) for name in FRICTIONS)]
-    if row["verdict"] not in CATCH_ALLS:
-        sets.append((*row["verdict"].split(" + "),))
+    if row["model"] not in (NONE, *CATCH_ALLS):
+        sets.append((*row["model"].split(" + "),))
     found = {}
     for names in dict.fromkeys(sets):
         one = fit(task, row["fitted"], names, seed=seed)
@@ -264,8 +263,8 @@ def _stages(task: ServoPendulumTask, rows: dict[str, Any], arguments: Any) -> An
         row["rates"] = by_rate(fine, on, fits)
         yield "motor off", row
     if arguments.replay == "clean":
-        verdict = rows["motor off"]["verdict"]
-        names = () if verdict in CATCH_ALLS else (*verdict.split(" + "),)
+        model = rows["motor off"]["model"]
+        names = () if model in (NONE, *CATCH_ALLS) else (*model.split(" + "),)
         wanted = [i for i in range(arguments.clean) if f"clean {i}" not in rows]
         if wanted:
             bare, full = fit(task, split, seed=seed), fit(task, split, names, seed=seed)

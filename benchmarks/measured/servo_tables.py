@@ -35,17 +35,16 @@ def tables(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
 
 def _stages(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
     lines = [
-        "| stage | trials | verdict | P | 90 % set | log BF | power | next trial "
+        "| stage | trials | verdict | P(cause) | 90 % set | log BF | next trial "
         "| CPU s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
+        cause = ", ".join(f"{n} {p:.2f}" for n, p in row["cause"].items())
         lines.append(
-            f"| {name} | {len(row['fitted'])} | {row['verdict']} | "
-            f"{_probability(row['probabilities'][row['verdict']])} | "
+            f"| {name} | {len(row['fitted'])} | {row['verdict']} | {cause} | "
             f"{', '.join(row['credible_set'])} | {row['log_bayes_factor']:.1f} | "
-            f"{row['coarsening']:.2g} | {_next(row, recordings)} | "
-            f"{row['seconds']:.0f} |"
+            f"{_next(row, recordings)} | {row['seconds']:.0f} |"
         )
     return "\n".join(lines)
 
@@ -91,7 +90,7 @@ def _errors(row: dict[str, Any], recordings: Recordings) -> str:
         zip(row["before_after"]["metric"], _pairs(row["before_after"]), strict=True)
     )["RMSE" if "RMSE" in row["before_after"]["metric"] else "rmse"]
     for i, (when, what) in enumerate(
-        (("before", "bare model"), ("after", row["verdict"]))
+        (("before", "bare model"), ("after", row["model"]))
     ):
         low, _, high = row["draws"][when]["rmse"]
         own = " | ".join(f"{v:.3f}" for v in row["rmse"][when])
@@ -114,7 +113,7 @@ def _pairs(table: dict[str, list[float]]) -> list[tuple[float, float]]:
 
 def _parameters(row: dict[str, Any]) -> str:
     before, after = row["parameters"]["none"], row["parameters"].get(row["verdict"], {})
-    lines = ["| parameter | bare model | " + row["verdict"] + " |", "|---|---|---|"]
+    lines = ["| parameter | bare model | " + row["model"] + " |", "|---|---|---|"]
     for name in dict.fromkeys([*before, *after]):
         cells = [
             f"{found[name][0]:.4g} +- {found[name][1]:.2g}" if name in found else ""
@@ -139,7 +138,7 @@ def _independent(rows: Mapping[str, dict[str, Any]]) -> str:
             factors = " / ".join(f"{z[n] - z['none']:.0f}" for n in row["singles"])
             lines.append(
                 f"| {stage} | {errors} | {row['verdict']} | "
-                f"{_probability(row['probabilities'][row['verdict']])} | {factors} |"
+                f"{_probability(row['probabilities'].get(row['model'], 0.0))} | {factors} |"
             )
     return "\n".join(lines)
 
