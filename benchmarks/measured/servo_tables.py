@@ -136,10 +136,8 @@ def _independent(rows: Mapping[str, dict[str, Any]]) -> str:
             row = rows[name]
             z = row["log_evidence"]
             factors = " / ".join(f"{z[n] - z['none']:.0f}" for n in row["singles"])
-            lines.append(
-                f"| {stage} | {errors} | {row['verdict']} | "
-                f"{_probability(row['probabilities'].get(row['model'], 0.0))} | {factors} |"
-            )
+            p = _probability(row["probabilities"].get(row["model"], 0.0))
+            lines.append(f"| {stage} | {errors} | {row['verdict']} | {p} | {factors} |")
     return "\n".join(lines)
 
 
