@@ -41,5 +41,8 @@ def laplace_sample(
     normal = rng.normal(size=(NUM_DRAWS, dim))
     draws = np.clip(modes.u[0] + normal @ factors[0].T, c.low, c.high)
     u: Array = np.concatenate([modes.u[:1], draws])
+    inside = np.isfinite(rival.log_prior(u))  # a bound itself may round to beyond
+    inside[0] = True
+    u = u[inside]
     equal = np.full(len(u), 1 / len(u))
     return ImportanceSample(u, equal, float(log_z), 0.0, float(len(u)))

@@ -294,7 +294,7 @@ class RivalSet:
         behind = self._behind(rival, modes.u)
         if self.is_smooth and rival.key != ModelKey() and behind > 0:
             sample = laplace_sample(rival, modes, rng)
-            if sample.log_evidence < self._best_evidence() - FAR_BEHIND:
+            if -np.inf < sample.log_evidence < self._best_evidence() - FAR_BEHIND:
                 return sample, "linear"
         if self.is_smooth:
             better = ridges

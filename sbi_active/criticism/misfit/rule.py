@@ -3,8 +3,7 @@ r"""What helps, and what is the cause, when every model is wrong.
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
    smallest; the most probable of them by the shared evidence is the top.
 2. An effect of the top *helps* if it is more likely there than not, and predicts a
-   left-out trial better with a probability of .9, or the error is twice as large
-   without it; others are dropped, those first without which it is smallest.
+   left-out trial better with a probability of .9; others are dropped.
 3. The probability that it is the *cause* is its inclusion probability times
    :math:`.85 (1 - u)`, with u the share of the excess error that remains,
 
@@ -35,7 +34,6 @@ Array = NDArray[Any]
 
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 INCLUDED, BETTER = 0.5, 0.9
-NEEDED = 2.0  # times the error on left-out trials without an effect
 CERTAIN = 0.85  # probability of a cause that leaves nothing
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
@@ -119,18 +117,10 @@ def choose(
             n: predicts_better(models[key].square, models[_without(key, n)].square)
             for n in key.effects
         }
-        without = {n: models[_without(key, n)].error for n in key.effects}
-        failing = [
-            n
-            for n in key.effects
-            if pooled[n] < INCLUDED
-            # A trial that is badly predicted without an effect hides in the t test of
-            # a few trials how much the effect is needed.
-            or (better[n] < BETTER and without[n] < NEEDED**2 * models[key].error)
-        ]
-        if not failing:
+        worst = min(better, key=lambda n: (pooled[n] >= INCLUDED, better[n]))
+        if pooled[worst] >= INCLUDED and better[worst] >= BETTER:
             break
-        key = _without(key, min(failing, key=without.__getitem__))
+        key = _without(key, worst)
     own, bare = models[key], models[ModelKey()]
     remains, cause = {}, {}
     for n in key.effects:

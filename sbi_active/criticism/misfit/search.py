@@ -152,15 +152,8 @@ class Search:
         return self.found[key]
 
     def _best(self, size: int) -> list[ModelKey]:
-        """Return the sets to add to: the likeliest, and those that fit best.
-
-        Evidence along an autocorrelated error is for what is fast; what leaves the
-        smallest residual may be slow, and half of what is missing.
-        """
         keys = [k for k in self.found if len(k.effects) == size]
-        likeliest = sorted(keys, key=lambda k: -self.found[k].log_p)[:NUM_BASES]
-        closest = sorted(keys, key=lambda k: self.found[k].model.rms)[:NUM_BASES]
-        return [*dict.fromkeys([*likeliest, *closest])]
+        return sorted(keys, key=lambda k: -self.found[k].log_p)[:NUM_BASES]
 
     def _rival(self, key: ModelKey) -> Rival:
         if key not in self._rivals:
