@@ -46,6 +46,15 @@ class ModelKey:
             return cls(error=name)
         return cls(() if name == NONE else (name,))
 
+    def without(self, name: str) -> ModelKey:
+        """Return the same without one effect."""
+        return ModelKey(tuple(n for n in self.effects if n != name), self.error)
+
+    @property
+    def parts(self) -> list[ModelKey]:
+        """The sets with one effect less."""
+        return [self.without(name) for name in self.effects]
+
     def __str__(self) -> str:
         error = () if self.error is None else (self.error,)
         return " + ".join((*self.effects, *error)) or NONE

@@ -34,9 +34,8 @@ def starts_near_parents(
     Returns:
         Shape (k, dim); None without a parent.
     """
-    names = [e.name for e in rival.effects]
-    parents = [tuple(n for n in names if n != left) for left in names] or [()]
-    known = [ModelKey(p) for p in parents if ModelKey(p) in fits]
+    parents = ModelKey(rival.key.effects).parts or [ModelKey()]
+    known = [key for key in parents if key in fits]
     if not known or rival.key == ModelKey():
         return None
     rng = np.random.default_rng(seed)

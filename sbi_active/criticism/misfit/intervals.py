@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.misfit.left_out import leave_out
+from sbi_active.criticism.misfit.left_out import LeftOut
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import WIDTHS, Errors, Posterior, integrated
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -34,20 +34,24 @@ THINNED = 2
 
 
 def covariance(
-    model: LinearModel, posterior: Posterior, errors: Errors, action: Array
+    model: LinearModel,
+    posterior: Posterior,
+    left: LeftOut,
+    errors: Errors,
+    action: Array,
 ) -> Array:
     """Return the covariance of a model's coordinates about its best fit, (d, d).
 
     Args:
         model: Linear.
         posterior: Given a process that is independent in each trial.
+        left: Refits without each part of the trials.
         errors: Shared by all models.
         action: Of each trial, shape (t, action_dim).
     """
     found = shared_process(model, errors, action)
     mean, cov = (posterior.mean, posterior.cov) if found is None else found
     mean = np.clip(mean, model.low, model.high)
-    left = leave_out(model, errors)
     jackknife, apart = left.jackknife(), model.u - mean
     variance = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
     # Parameters move together as in any of the three, whose sum is hardly wider.

@@ -13,8 +13,6 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import ImportanceSample
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
-from sbi_active.criticism.misfit.left_out import leave_out
-from sbi_active.criticism.misfit.processes import Errors
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.results import (
     UNEXPLAINED,
@@ -154,11 +152,10 @@ def _found(misfit: Misfit, models: tuple[ModelError, ...]) -> Found:
 def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelError:
     """Return a model's errors on trials that it was not fitted to."""
     search, rivals = misfit.search, misfit.rivals
-    errors: Errors = search.errors
-    left, bare = (leave_out(search.found[k].model, errors) for k in (key, ModelKey()))
+    left, bare = (search.found[k].left for k in (key, ModelKey()))
     excess = max(left.mean_square - 1, 0.0) / max(bare.mean_square - 1, 1e-2)
     m = rivals.measurements
-    kept = errors.is_scored
+    kept = search.errors.is_scored
     own = _by_channel((left.error * search.unit)[kept] ** 2, m.channel[kept])
     return ModelError(
         name=str(key),

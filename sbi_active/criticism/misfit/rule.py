@@ -114,17 +114,17 @@ def choose(
     better: dict[str, float] = {}
     while key.effects:
         better = {
-            n: predicts_better(models[key].square, models[_without(key, n)].square)
+            n: predicts_better(models[key].square, models[key.without(n)].square)
             for n in key.effects
         }
         worst = min(better, key=lambda n: (pooled[n] >= INCLUDED, better[n]))
         if pooled[worst] >= INCLUDED and better[worst] >= BETTER:
             break
-        key = _without(key, worst)
+        key = key.without(worst)
     own, bare = models[key], models[ModelKey()]
     remains, cause = {}, {}
     for n in key.effects:
-        other = models[_without(key, n)]
+        other = models[key.without(n)]
         u = max(own.excess / other.excess, own.excess / bare.excess)
         remains[n] = float(np.clip(u, 0.0, 1.0))
         share = 1.0 if own.passes else CERTAIN * (1 - remains[n])
@@ -159,7 +159,3 @@ def predicts_better(one: Array, other: Array) -> float:
     n = len(ratio)
     error = ratio.std(ddof=1) / np.sqrt(n) + 1e-9
     return float(stats.t.cdf(-ratio.mean() / error, n - 1))
-
-
-def _without(key: ModelKey, name: str) -> ModelKey:
-    return ModelKey(tuple(n for n in key.effects if n != name))

@@ -8,7 +8,7 @@ simulations of the trials.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.least_squares import descend
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.left_out import LeftOut, leave_out
 from sbi_active.criticism.misfit.linear import LinearModel, enlarged, linearize
 from sbi_active.criticism.misfit.processes import Errors, Grams, Posterior
 from sbi_active.criticism.results import ModelKey
@@ -44,12 +45,6 @@ NUM_BASES, NUM_PAIRS, NUM_LARGER = 3, 10, 3
 MAX_EFFECTS = 4
 
 
-def parts(key: ModelKey) -> list[ModelKey]:
-    """Return the sets with one effect less."""
-    names = key.effects
-    return [ModelKey(tuple(n for n in names if n != left)) for left in names]
-
-
 @dataclass
 class Candidate:
     """A model that was fitted.
@@ -58,12 +53,14 @@ class Candidate:
         model: Linearized at its best fit.
         grams: Of its rows.
         posterior: Under the shared errors.
+        left: Its errors on left-out parts of the trials.
         log_prior: Probability of its set of effects, nats.
     """
 
     model: LinearModel
     grams: Grams
     posterior: Posterior
+    left: LeftOut
     log_prior: float
 
     @property
@@ -90,7 +87,7 @@ class Search:
 
     rivals: RivalSet
     unit: Array
-    prior: Mapping[str, float]
+    prior: dict[str, float]
     cells: list[NoiseCell]
     found: dict[ModelKey, Candidate] = field(default_factory=dict)
 
@@ -114,8 +111,9 @@ class Search:
         grams = self.errors.grams(model.rows)
         posterior = self.errors.posterior(model, grams)
         names = model.key.effects
-        prior = log_prior(names, dict(self.prior)) if names else self.prior["none"]
-        self.found[model.key] = Candidate(model, grams, posterior, prior)
+        prior = log_prior(names, self.prior) if names else self.prior["none"]
+        left = leave_out(model, self.errors)
+        self.found[model.key] = Candidate(model, grams, posterior, left, prior)
         return self.found[model.key]
 
     def fit_singles(self) -> None:
@@ -147,7 +145,7 @@ class Search:
     def fit_set(self, key: ModelKey) -> Candidate:
         """Fit one set of effects from its parts, once."""
         if key not in self.found:
-            known = [p for p in parts(key) if p in self.found]
+            known = [p for p in key.parts if p in self.found]
             self.keep(self._fit(key, known))
         return self.found[key]
 
@@ -191,7 +189,6 @@ class Search:
         starts, columns = [], rival.columns()
         for parent in parents:
             model, own = self.found[parent].model, self._rival(parent)
-            new = [n for n in key.effects if n not in parent.effects]
             for k in range(-1, NUM_DRAWN if not parent.effects else 0):
                 u = drawn[max(k, 0)].copy()
                 rest = np.ones(rival.dim, dtype=bool)
@@ -202,7 +199,6 @@ class Search:
                         u[place] = model.u[own.columns()[name]]
                     elif k < 0:
                         u[place] = self._near_null(name)
-                assert new
                 u[rest] = model.u[self._shared(parent)]
                 starts.append(u)
         c = rival.coordinates
@@ -241,8 +237,8 @@ class Search:
         """Return the largest linear log posterior of each set, over the bases."""
         scores: dict[ModelKey, float] = {}
         for base in bases:
-            columns = {n: self._column(base, n) for n in self.names}
             rest = [n for n in self.names if n not in base.effects]
+            columns = {n: self._column(base, n) for n in rest}
             for new in combinations(rest, size - len(base.effects)):
                 names = tuple(n for n in self.names if n in (*base.effects, *new))
                 key = ModelKey(names)
@@ -258,7 +254,7 @@ class Search:
                 model = enlarged(self.found[base].model, rival, changes)
                 grams = self.errors.grams(model.rows)
                 posterior = self.errors.posterior(model, grams)
-                value = posterior.log_process + log_prior(names, dict(self.prior))
+                value = posterior.log_process + log_prior(names, self.prior)
                 scores[key] = max(value, scores.get(key, -np.inf))
         return scores
 
@@ -267,8 +263,6 @@ class Search:
 
         A chord and no tangent: many effects are flat at their null.
         """
-        if name in base.effects:
-            return np.empty(0), np.empty(0)
         key = ModelKey(tuple(n for n in self.names if n in (*base.effects, name)))
         rival, model = self._rival(key), self.found[base].model
         place, columns = rival.columns(), self._rival(base).columns()
@@ -293,7 +287,7 @@ class Search:
         c, place = rival.coordinates, rival.columns()[name]
         effect = self.rivals.effects[name]
         null = effect.null_phi(1).double().numpy()
-        z = np.tile(c.to_z(np.clip(np.zeros((1, rival.dim)), c.low, c.high)), (1, 1))
+        z = c.to_z(np.clip(np.zeros((1, rival.dim)), c.low, c.high))
         low, high = c.low[place], c.high[place]
         if np.isfinite(null).all():
             z[:, place] = null

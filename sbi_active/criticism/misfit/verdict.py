@@ -20,19 +20,17 @@ from sbi_active.criticism.misfit.left_out import leave_out
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Posterior
 from sbi_active.criticism.misfit.rule import PASSES, Choice, Scored, admitted, choose
-from sbi_active.criticism.misfit.search import Candidate, Search, parts
+from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.tracing import log_priors
+from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
 #: Trials with the largest error, each of which alone may be what no model fits.
 NUM_SUSPECTS = 3
-#: Factors on the scale of the effects' priors under which a verdict should stand.
-RESCALED = (1 / 3, 3.0)
 
 
 @dataclass
@@ -67,7 +65,9 @@ class Misfit:
         found = self.search.found[key]
         action = self.rivals.trials.action.numpy()
         action = action[np.unique(self.rivals.measurements.trial)]
-        return covariance(found.model, found.posterior, self.search.errors, action)
+        return covariance(
+            found.model, found.posterior, found.left, self.search.errors, action
+        )
 
     def selected_without(self, fold: int) -> ModelKey:
         """Return the model that is chosen without one part of the trials."""
@@ -89,10 +89,8 @@ class Misfit:
 
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
-                square = leave_out(c.model, errors).square
-                return Scored(
-                    c.log_prior + posterior.log_process, square, passes(c.model)
-                )
+                log_p = c.log_prior + posterior.log_process
+                return Scored(log_p, c.left.square, passes(c.model))
 
             if settled(self.search, score, self.equivalent).key != self.choice.key:
                 return False
@@ -136,8 +134,7 @@ def find_misfit(
         return None
 
     def score(c: Candidate) -> Scored:
-        square = leave_out(c.model, search.errors).square
-        return Scored(c.log_p, square, passes(c.model))
+        return Scored(c.log_p, c.left.square, passes(c.model))
 
     choice = settled(search, score, equivalent)
     log_p = [c.log_p for c in search.found.values()]
@@ -164,19 +161,19 @@ def settled(
             if key not in scored:
                 scored[key] = score(candidate)
         top = max(admitted(scored), key=lambda key: scored[key].log_p)
-        missing = _missing(search, [top])
+        missing = _missing(search, top)
         if not missing:
             return choose(scored, search.names, equivalent)
         for key in missing:
             search.fit_set(key)
 
 
-def _missing(search: Search, keys: list[ModelKey]) -> list[ModelKey]:
-    """Return the subsets of some sets that were not fitted, smaller ones first."""
+def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
+    """Return the subsets of a set that were not fitted, smaller ones first."""
     wanted: list[ModelKey] = []
-    todo = [*keys]
+    todo = [key]
     while todo:
-        for part in parts(todo.pop()):
+        for part in todo.pop().parts:
             if part not in wanted:
                 wanted.append(part)
                 todo.append(part)

@@ -97,7 +97,7 @@ def _is_far(rivals: RivalSet, names: tuple[str, ...]) -> bool:
 
 def _best_part(rivals: RivalSet, names: tuple[str, ...]) -> float:
     """Return the largest evidence among a set's parts with one effect less."""
-    parts = [ModelKey(tuple(n for n in names if n != left)) for left in names]
+    parts = ModelKey(names).parts
     return max(log_evidence(rivals, p)[0] for p in parts if p in rivals.fits)
 
 
