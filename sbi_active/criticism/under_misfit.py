@@ -48,7 +48,8 @@ class Misfit:
         sensor: Its standard deviation by channel, units of x, (c,).
         passes: Whether the chi-square of the verdict passes against the sensor.
         size: Of the residual process beside the verdict's model, in sensor deviations.
-        time_scale: Of that process, in the unit of the sample times.
+        time_scale: Of that process, in the unit of the sample times; inf where x has no
+            time axis and it follows the trials.
         left_out: What was left out: "trials" or "parts of trials".
     """
 

@@ -3,7 +3,8 @@ r"""What helps, and what is the cause, when every model is wrong.
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
    smallest; the most probable of them by the shared evidence is the top.
 2. An effect of the top *helps* if it is more likely there than not, and predicts a
-   left-out trial better with a probability of .9; others are dropped.
+   left-out trial better with a probability of .8, or the error is twice as large
+   without it; others are dropped, those first without which it is smallest.
 3. The probability that it is the *cause* is its inclusion probability times
    :math:`.85 (1 - u)`, with u the share of the excess error that remains,
 
@@ -33,7 +34,8 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
-INCLUDED, BETTER = 0.5, 0.9
+INCLUDED, BETTER = 0.5, 0.8
+NEEDED = 2.0  # times the error on left-out trials without an effect
 CERTAIN = 0.85  # probability of a cause that leaves nothing
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
@@ -117,10 +119,18 @@ def choose(
             n: predicts_better(models[key].square, models[key.without(n)].square)
             for n in key.effects
         }
-        worst = min(better, key=lambda n: (pooled[n] >= INCLUDED, better[n]))
-        if pooled[worst] >= INCLUDED and better[worst] >= BETTER:
+        without = {n: models[key.without(n)].error for n in key.effects}
+        # Few trials that are badly predicted without an effect hide from a t test how
+        # much it is needed.
+        most = NEEDED**2 * models[key].error
+        failing = [
+            n
+            for n in key.effects
+            if pooled[n] < INCLUDED or (better[n] < BETTER and without[n] < most)
+        ]
+        if not failing:
             break
-        key = key.without(worst)
+        key = key.without(min(failing, key=without.__getitem__))
     own, bare = models[key], models[ModelKey()]
     remains, cause = {}, {}
     for n in key.effects:

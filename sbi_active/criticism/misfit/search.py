@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.least_squares import descend
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.across_trials import AcrossTrials
 from sbi_active.criticism.misfit.left_out import LeftOut, leave_out
 from sbi_active.criticism.misfit.linear import LinearModel, enlarged, linearize
 from sbi_active.criticism.misfit.processes import Errors, Grams, Posterior
+from sbi_active.criticism.misfit.sensor import has_time_axis
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 from sbi_active.criticism.rivals.rival import Rival
@@ -97,13 +99,19 @@ class Search:
         self._rivals: dict[ModelKey, Rival] = {}
         self._seed = derive_seed(self.rivals.seed, "misfit")
         bare = self._fit_bare()
-        self.errors = Errors(
-            self.rivals.measurements,
-            self.unit,
-            self.cells,
-            largest=bare.rms,
-            warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
-        )
+        self.errors: Errors
+        if has_time_axis(self.rivals.measurements):
+            self.errors = Errors(
+                self.rivals.measurements,
+                self.unit,
+                self.cells,
+                largest=bare.rms,
+                warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
+            )
+        else:
+            self.errors = AcrossTrials(
+                self.rivals, self.unit, self.cells, largest=bare.rms
+            )
         self.keep(bare)
 
     def keep(self, model: LinearModel) -> Candidate:
@@ -150,8 +158,15 @@ class Search:
         return self.found[key]
 
     def _best(self, size: int) -> list[ModelKey]:
+        """Return the sets to add to: the likeliest, and those that fit best.
+
+        Evidence along an autocorrelated error is for what is fast; what leaves the
+        smallest residual may be slow, and half of what is missing.
+        """
         keys = [k for k in self.found if len(k.effects) == size]
-        return sorted(keys, key=lambda k: -self.found[k].log_p)[:NUM_BASES]
+        likeliest = sorted(keys, key=lambda k: -self.found[k].log_p)[:NUM_BASES]
+        closest = sorted(keys, key=lambda k: self.found[k].model.rms)[:NUM_BASES]
+        return [*dict.fromkeys([*likeliest, *closest])]
 
     def _rival(self, key: ModelKey) -> Rival:
         if key not in self._rivals:

@@ -75,3 +75,33 @@ def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
     assert predicts_better(one, other) == pytest.approx(1 - predicts_better(other, one))
     few = predicts_better(np.append(one, np.nan), np.append(other, 1.0))
     assert few == pytest.approx(predicts_better(one, other))
+
+
+def test_what_is_missed_least_is_dropped_first():
+    """Beside a useless c, b looks useless by a t test, for one trial tells of it."""
+    several = models(none=(0.0, 90.0), a=(1.0, 60.0), b=(1.0, 70.0), a_b=(20.0, 10.0))
+    even = np.full(8, 10.0)
+    uneven, one = even.copy(), 0.75 * even
+    uneven[:4] *= 1.1
+    one[0] = 200.0
+    several |= {
+        ModelKey(("c",)): scored(0.0, 88.0),
+        ModelKey(("b", "c")): scored(0.0, 66.0),
+        ModelKey(("a", "b", "c")): Scored(25.0, even, False),
+        ModelKey(("a", "b")): Scored(20.0, uneven / 1.04, False),
+        ModelKey(("a", "c")): Scored(0.0, one, False),
+    }
+    better_b = predicts_better(even, one)
+    assert better_b < predicts_better(even, uneven / 1.04) < 0.8
+    assert choose(several, "abc").key == ModelKey(("a", "b"))
+
+
+def test_what_doubles_the_error_helps_whatever_a_t_test_says():
+    """One trial of four tells of the effect, by a hundred times the error."""
+    with_it = Scored(20.0, np.array([10.0, 10.0, 10.0, 10.0]), False)
+    without = Scored(0.0, np.array([9.0, 9.5, 9.0, 1000.0]), False)
+    several = {ModelKey(): without, ModelKey(("a",)): with_it}
+    assert predicts_better(with_it.square, without.square) < 0.8
+    assert choose(several, "a").key == ModelKey(("a",))
+    mild = Scored(0.0, np.array([9.0, 9.5, 9.0, 30.0]), False)
+    assert choose({**several, ModelKey(): mild}, "a").key == ModelKey()
