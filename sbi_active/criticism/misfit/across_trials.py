@@ -1,4 +1,4 @@
-r"""The errors that all models share where x has no time axis: a process over the trials.
+r"""The errors that all models share where x has no time axis, over the trials.
 
 .. math::
     C = \sigma^2 (I + s^2 D K D)
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import (
     FEWEST,
@@ -40,7 +40,7 @@ LEAST = 3
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The numbers of each channel among some trials, with the bases of its processes."""
+    """The numbers of one channel, with the bases of its processes."""
 
     at: NDArray[np.intp]
     bases: list[tuple[Array, Array]] = field(repr=False)
@@ -50,17 +50,28 @@ class AcrossTrials(Errors):
     """The grid of errors over measurements without a time axis.
 
     Args:
-        rivals: The models and their trials, six or more.
+        measurements: Of six trials or more, without a time axis.
         unit: Standard deviation of the sensor, shape (N,).
         cells: The sensor's error.
         largest: Root mean square of the residual of a model that misses, in sensor
             deviations.
+        action: Of each trial, in ranges of the action space, shape (t, action_dim).
+        order: Of each trial, in their span, shape (t,); None for no process over it.
+        spread: Deviation of the prior predictive, shape (N,).
     """
 
     def __init__(
-        self, rivals: RivalSet, unit: Array, cells: list[NoiseCell], *, largest: float
+        self,
+        measurements: Measurements,
+        unit: Array,
+        cells: list[NoiseCell],
+        *,
+        largest: float,
+        action: Array,
+        order: Array | None,
+        spread: Array,
     ) -> None:
-        m = self.measurements = rivals.measurements
+        m = self.measurements = measurements
         self.unit = unit
         trials, fold = np.unique(m.trial, return_inverse=True)
         self.fold, self.num_folds = fold.astype(np.int64), len(trials)
@@ -71,23 +82,26 @@ class AcrossTrials(Errors):
         #: Trials whose errors are compared together, by turns.
         self.piece = np.arange(self.num_folds) % max(self.num_folds // each, FEWEST)
         self._declare(cells)
-        self._kernels = _kernels(rivals, trials)
-        spread = rivals.spread / unit
-        self._spreads = [np.ones(len(m)), spread / np.median(spread)]
+        order = None if order is None else order[trials]
+        #: What trials have in common by each process, shape (t, t).
+        self.kernels = _kernels(action[trials], order)
+        relative = spread / unit
+        #: D by each process, shape (N,).
+        self.spreads = [np.ones(len(m)), relative / np.median(relative)]
         self._blocks_of: dict[bytes, list[_Blocks]] = {}
 
     @property
     @override
     def num_processes(self) -> int:
-        return len(self._spreads) * len(self._kernels) * len(self.sizes)
+        return len(self.spreads) * len(self.kernels) * len(self.sizes)
 
     @override
     def pieces(self, square: Array) -> Array:
         """Return the mean squared error of each group of trials, (g,)."""
-        some = np.isfinite(square)
-        count = np.bincount(self.piece[some])
+        some, num = np.isfinite(square), int(self.piece.max()) + 1
+        count = np.bincount(self.piece[some], minlength=num)
         with np.errstate(invalid="ignore"):
-            return np.bincount(self.piece[some], square[some]) / count
+            return np.bincount(self.piece[some], square[some], num) / count
 
     @override
     def grams(self, rows: Array) -> Grams:
@@ -138,22 +152,20 @@ class AcrossTrials(Errors):
 
     def _block(self, at: NDArray[np.intp]) -> _Blocks:
         bases, trial = [], self.fold[at]
-        for spread in self._spreads:
+        for spread in self.spreads:
             d = spread[at]
-            for kernel in self._kernels:
+            for kernel in self.kernels:
                 own = d[:, None] * kernel[np.ix_(trial, trial)] * d
                 values, vectors = np.linalg.eigh(own)
                 bases.append((np.clip(values, 0, None), vectors))
         return _Blocks(at, bases)
 
 
-def _kernels(rivals: RivalSet, trials: Array) -> list[Array]:
-    """Return what trials have in common by each process, shape (t, t)."""
-    action, order = rivals.scaled_actions()[trials], rivals.scaled_order()
+def _kernels(action: Array, order: Array | None) -> list[Array]:
     places = [action / length for length in LENGTHS]
     if order is not None:
-        places.append(order[trials, None] / ORDER_LENGTH)
-    found = [np.eye(len(trials))]
+        places.append(order[:, None] / ORDER_LENGTH)
+    found = [np.eye(len(action))]
     for place in places:
         square = ((place[:, None] - place) ** 2).sum(-1)
         found.append(np.exp(-0.5 * square))

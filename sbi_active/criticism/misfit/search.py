@@ -99,20 +99,22 @@ class Search:
         self._rivals: dict[ModelKey, Rival] = {}
         self._seed = derive_seed(self.rivals.seed, "misfit")
         bare = self._fit_bare()
-        self.errors: Errors
-        if has_time_axis(self.rivals.measurements):
-            self.errors = Errors(
-                self.rivals.measurements,
-                self.unit,
-                self.cells,
-                largest=bare.rms,
-                warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
-            )
-        else:
-            self.errors = AcrossTrials(
-                self.rivals, self.unit, self.cells, largest=bare.rms
-            )
+        self.errors = self._errors(bare.rms)
         self.keep(bare)
+
+    def _errors(self, largest: float) -> Errors:
+        """Return the errors that all models share, given the bare model's residual."""
+        rivals, m = self.rivals, self.rivals.measurements
+        if not has_time_axis(m):
+            return AcrossTrials(
+                *(m, self.unit, self.cells),
+                largest=largest,
+                action=rivals.scaled_actions(),
+                order=rivals.scaled_order(),
+                spread=rivals.spread,
+            )
+        warm_up = rivals.warm_up if rivals.nuisances else 0.0
+        return Errors(m, self.unit, self.cells, largest=largest, warm_up=warm_up)
 
     def keep(self, model: LinearModel) -> Candidate:
         """Record a fitted model with its evidence."""
