@@ -27,6 +27,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.given import made_given
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.screening import worth_fitting
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
@@ -128,8 +129,7 @@ class Criticism:
         self.show_progress = show_progress
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
-        self.model, self.prior, self.trials = model, prior, trials
-        self.seed = seed
+        self.model, self.prior, self.seed = model, prior, seed
         unordered = trials.order == "unknown"
         #: Names of effects of the order of the trials where that is unknown.
         self.left_out = [e.name for e in effects if unordered and e.needs_order]
@@ -142,10 +142,10 @@ class Criticism:
         self.sampling: Sampling | None = None
         if thin:
             with stage("rate of sampling", show_progress=show_progress):
-                self.trials, self.sampling = thinned_to_need(
+                trials, self.sampling = thinned_to_need(
                     model, prior, trials, self.effects, seed=seed
                 )
-            trials = self.trials
+        self.trials = trials
         self._parts = model, trials, self.effects
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
@@ -165,8 +165,9 @@ class Criticism:
             self.num_summaries = len(short.weight)
         own, measured, some = self._parts
         with stage("a look at the simulator", show_progress=show_progress):
-            self.rivals = RivalSet(
-                own, prior, measured.fit, some, actions=actions, seed=seed
+            #: Effects that linear evidence set aside; None where all are fitted.
+            self.rivals, self.screening = worth_fitting(
+                RivalSet(own, prior, measured.fit, some, actions=actions, seed=seed)
             )
         self.rivals.warm_up = require_warm_up(warm_up, measured, some)
         #: Hash of the noise, the effects and all priors, as they were declared.
@@ -261,9 +262,8 @@ class Criticism:
                 f"got {', '.join(unknown)}; declare them in Criticism(effects=...)"
             )
         declared = {e.name: e for e in self.effects}  # acting on x, not its summaries
-        every = [*names, *[e.name for e in self.rivals.nuisances]]
-        added = [declared[n] for n in every]
-        if not added:
+        every = (*names, *[e.name for e in self.rivals.nuisances])
+        if not (added := [declared[n] for n in every]):
             return self.model, self.prior
         index = int(self.trials.index.max()) + 1
         model = AugmentedSimulator(self.model, added, next_index=index)
@@ -371,6 +371,15 @@ class Criticism:
                 after = find_residuals(self.rivals, tracing.key)
             left_out = () if tracing.misfit else leave_one_out(self.rivals, tracing)
             tests = () if space is None else severe_tests(self.rivals, tracing, space)
+        given = made_given(
+            self.trials,
+            num_summaries=self.num_summaries,
+            sampling=self.sampling,
+            left_out=self.left_out,
+            screening=self.screening,
+            nuisances=[e.name for e in self.rivals.nuisances],
+            warm_up=self.rivals.warm_up,
+        )
         return build_report(
             trials=self.trials,
             residuals=residuals,
@@ -387,14 +396,5 @@ class Criticism:
             exploratory=exploratory,
             leave_one_out=left_out,
             severe_tests=tests,
-            warnings=(
-                *made_given(
-                    self.trials,
-                    num_summaries=self.num_summaries,
-                    sampling=self.sampling,
-                    left_out=self.left_out,
-                    nuisances=[e.name for e in self.rivals.nuisances],
-                    warm_up=self.rivals.warm_up,
-                ),
-            ),
+            warnings=(*given,),
         )

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.misfit.screening import Screening
 from sbi_active.criticism.thinning import in_words
 
 
@@ -15,6 +16,7 @@ def made_given(
     num_summaries: int,
     sampling: Sampling | None,
     left_out: Sequence[str],
+    screening: Screening | None,
     nuisances: Sequence[str],
     warm_up: float,
 ) -> Iterator[str]:
@@ -25,6 +27,7 @@ def made_given(
         num_summaries: That stand for x; 0 for none.
         sampling: What was found of it; None where nobody looked.
         left_out: Names of effects of an order that is unknown.
+        screening: What linear evidence set aside; None where all were fitted.
         nuisances: Names of those that each trial has anew.
         warm_up: In which trials that were not fitted tell of theirs.
     """
@@ -39,6 +42,14 @@ def made_given(
         yield (
             "the order of the trials is unknown: what grows from trial to trial was "
             f"not looked for ({', '.join(left_out)})"
+        )
+    if screening is not None:
+        nearest, behind = next(iter(screening.behind.items()))
+        num = len(screening.behind)
+        yield (
+            f"of {num + len(screening.kept)} effects {len(screening.kept)} were "
+            f"fitted: linear evidence puts the others behind, the nearest ({nearest}) "
+            f"by {behind:.1f} nats"
         )
     if nuisances and warm_up == 0:
         yield (

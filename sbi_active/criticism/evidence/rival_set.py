@@ -93,6 +93,7 @@ class RivalSet:
 
     Attributes:
         effects: Effects of scope "campaign", by name.
+        library: Those that were declared, of which priors tell.
         noise: Distribution of the errors of the bare model.
         center: Mean of the prior predictive, shape (N,).
         spread: Its deviation, shape (N,).
@@ -121,13 +122,12 @@ class RivalSet:
         self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
         self.actions = actions
         self.effects = {e.name: e for e in effects if e.scope == "campaign"}
+        self.library = [*self.effects.values()]
         self.nuisances = [e for e in effects if e.scope == "trial"]
-        augmented = AugmentedSimulator(
-            model, effects, next_index=int(trials.index.max()) + 1
-        )
-        self.simulator = TrialSimulator(
-            augmented, trials, seed=derive_seed(seed, "trials")
-        )
+        index = int(trials.index.max()) + 1
+        augmented = AugmentedSimulator(model, effects, next_index=index)
+        seed_of_trials = derive_seed(seed, "trials")
+        self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
         self.warm_up = 0.0
         self._factors: tuple[Array, Array] | None = None

@@ -275,6 +275,23 @@ class Search:
                 scores[key] = max(value, scores.get(key, -np.inf))
         return scores
 
+    def beside(
+        self, base: ModelKey, name: str
+    ) -> tuple[LinearModel, NDArray[np.bool_]]:
+        """Return a model with a further effect where it vanishes, and its columns."""
+        key = ModelKey(tuple(n for n in self.names if n in (*base.effects, name)))
+        rival = self._rival(key)
+        at = np.arange(rival.dim)[rival.columns()[name]]
+        value, column = self._column(base, name)
+        change = np.stack([at, value]), column
+        own = np.isin(np.arange(rival.dim), at)
+        return enlarged(self.found[base].model, rival, [change]), own
+
+    def rms(self, key: ModelKey, u: Array) -> float:
+        """Return the rms residual of a model anywhere, in sensor deviations."""
+        r = self._rival(key).residual(u[None])[0] / self.unit
+        return float(np.sqrt(np.mean(r**2)))
+
     def _column(self, base: ModelKey, name: str) -> tuple[Array, Array]:
         """Return phi near its null, and what a change of it does beside a model.
 

@@ -124,7 +124,7 @@ def find_misfit(
     if sensor is None:
         return None
     unit, cells = sensor
-    prior = log_priors([*rivals.effects.values()], ())
+    prior = log_priors(rivals.library, ())
     search = Search(rivals, unit, prior, cells)
     search.fit_singles()
     if not is_known and not _misses(search):

@@ -48,7 +48,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     """
     null = rivals.fit().evidence
     # First what can explain anything: beside it, a hopeless effect is soon dismissed.
-    weights = alternatives([*rivals.effects], equivalent)
+    weights = alternatives([e.name for e in rivals.library], equivalent)
     found = {
         name: log_evidence(rivals, ModelKey.of(name))
         for name in (UNEXPLAINED, SCATTER, *rivals.effects)
@@ -56,6 +56,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     others = [
         (found[name][0] + float(np.log(w)), found[name][1])
         for name, w in weights.items()
+        if name in found  # what was screened out has no evidence to speak of
     ]
     first = null.log_evidence
     log_b, error = bayes_factor(others, log_evidence(rivals))

@@ -96,7 +96,7 @@ def trace(
     """
     # Without an alarm there is no trial to set aside.
     catch_alls = CATCH_ALLS if detection.alarm else (UNEXPLAINED, SCATTER)
-    prior = log_priors([*rivals.effects.values()], catch_alls)
+    prior = log_priors(rivals.library, catch_alls)
     names = (NONE, *catch_alls, *rivals.effects)
     log_prior = {ModelKey.of(name): prior[name] for name in names}
     log_z = {key: log_evidence(rivals, key)[0] for key in log_prior}
@@ -235,7 +235,8 @@ def _is_robust(
     verdict: ModelKey,
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
-    weights = alternatives([*rivals.effects], equivalent)
+    every = alternatives([e.name for e in rivals.library], equivalent)
+    weights = {k: w for k, w in every.items() if ModelKey.of(k) in log_z}
     for factor in RESCALED:
         scaled = {
             key: log_evidence(rivals, key, factor=factor)[0] if key.effects else value

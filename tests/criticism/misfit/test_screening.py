@@ -1,0 +1,71 @@
+"""Large libraries are screened by linear evidence before anything is fitted."""
+
+import pytest
+import torch
+from torch.distributions import Normal
+
+from sbi_active.criticism import Criticism, Effect
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.screening import MANY, screen
+from sbi_active.criticism.steps.tracing import log_priors
+from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, TIMES, trials
+
+
+def ripple(k):
+    """A wave in the reading, of a frequency of its own."""
+    wave = 0.05 * torch.sin((2.0 + 0.7 * k) * TIMES + k)
+
+    def apply(x, phi, action, context):
+        return x + phi * wave
+
+    return Effect(
+        f"ripple {k}",
+        hook="observation",
+        prior=Normal(0.0, 1.0),
+        null=0.0,
+        apply=apply,
+        family="ripple",
+    )
+
+
+LIBRARY = [*EFFECTS, *[ripple(k) for k in range(MANY)]]
+
+
+def rivals(own, library=LIBRARY):
+    return RivalSet(MODEL, PRIOR, own, library, seed=0)
+
+
+@pytest.fixture(scope="module")
+def screened():
+    models = rivals(trials(lag=0.1, friction=0.1))
+    before = models.simulator.num_simulations
+    return screen(models), models.simulator.num_simulations - before
+
+
+def test_members_of_the_true_pair_are_kept(screened):
+    found, num = screened
+    assert {"lag", "friction"} <= {*found.kept}
+    assert len(found.kept) <= MANY
+    assert {*found.kept} | {*found.behind} == {e.name for e in LIBRARY}
+    assert not {*found.kept} & {*found.behind}
+    assert list(found.behind.values()) == sorted(found.behind.values())
+    assert num < 8_000  # one bare fit and a column each
+
+
+def test_what_was_set_aside_counts_in_the_prior_and_is_said():
+    loop = Criticism(MODEL, PRIOR, trials(bias=0.05), effects=LIBRARY, seed=0)
+    assert loop.trace().verdict == "bias"
+    assert len(loop.rivals.effects) < len(LIBRARY)
+    whole = log_priors(LIBRARY)
+    assert log_priors(loop.rivals.library)["ripple 3"] == whole["ripple 3"]
+    report = " ".join(str(loop.report(evaluate=False)).split())
+    assert f"of {len(LIBRARY)} effects {len(loop.rivals.effects)} were fitted" in report
+
+
+def test_a_small_library_is_fitted_as_a_whole():
+    assert screen(rivals(trials(), EFFECTS)) is None
+
+
+def test_clean_trials_of_a_large_library_say_none():
+    loop = Criticism(MODEL, PRIOR, trials(seed=3), effects=LIBRARY, seed=0)
+    assert loop.trace().verdict == "none"
