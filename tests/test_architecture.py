@@ -49,6 +49,7 @@ FLOORS = (
     "criticism.data",
     "criticism.effects",
     "criticism.rivals",
+    "criticism.forces",
     "criticism.evidence",
     "criticism.steps",
     "criticism.misfit",

@@ -41,8 +41,8 @@ class Screening:
 
     Attributes:
         kept: Names of the effects that are worth a fit, in the library's order.
-        behind: Nats by which each effect that was set aside is behind the best, alone
-            or in its best pair, nearest first.
+        behind: Nats by which each effect that was set aside is behind the best set,
+            alone or in a pair that is better than either member, nearest first.
     """
 
     kept: tuple[str, ...]
@@ -69,12 +69,15 @@ def screen(rivals: RivalSet) -> Screening | None:
     singles = {n: linear.score((n,)) for n in linear.names}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     best = dict(singles)
-    pairs, paired = {}, [n for n in linear.names if n in ranked[:PAIRED]]
+    pairs: dict[tuple[str, ...], float] = {}
+    paired = [n for n in linear.names if n in ranked[:PAIRED]]
     linear.prepare(paired)
     for pair in combinations(paired, 2):
-        value = pairs[pair] = linear.score(pair)
-        for name in pair:
-            best[name] = max(best[name], value)
+        value = linear.score(pair)
+        if value > max(singles[name] for name in pair):
+            pairs[pair] = value
+            for name in pair:
+                best[name] = max(best[name], value)
     kept = {*ranked[:BEST]}
     for pair in sorted(pairs, key=pairs.__getitem__)[::-1][:NUM_PAIRS]:
         kept.update(pair)

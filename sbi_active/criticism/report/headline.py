@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from sbi_active.criticism.forces.library import FAMILY
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.numbers import number, stated
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
 from sbi_active.criticism.report.under_misfit import misfit_line, misfit_sentences
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+
+#: Probability from which a form of a force is named, and one from which it is listed.
+CERTAIN, SHOWN = 0.9, 0.01
 
 
 def verdict_line(report: Contents) -> str:
@@ -16,6 +20,8 @@ def verdict_line(report: Contents) -> str:
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
     if tracing.misfit is not None and not tracing.instead_of:
         line = misfit_line(report, tracing.misfit)
+    elif (family := open_form(report)) is not None:
+        line = f"Verdict: {family}"
     line += verdict_clause(tracing)
     if tracing.beside and tracing.misfit is None:
         line += f", beside {ModelKey(tracing.beside)}"
@@ -29,6 +35,32 @@ def verdict_line(report: Contents) -> str:
     if same:
         line += f"; no permitted action tells it from {', '.join(same)}"
     return line
+
+
+def open_form(report: Contents) -> str | None:
+    """Return the family of forces that is certain where none of its forms is."""
+    tracing = report.tracing
+    families = {e.name: e.family for e in tracing.estimates}
+    if len(tracing.chosen) != 1 or tracing.inclusion[tracing.verdict] >= CERTAIN:
+        return None
+    family = families[tracing.verdict]
+    if not family.startswith(FAMILY):
+        return None
+    shares = {
+        key: p
+        for key, p in tracing.probabilities.items()
+        if any(families.get(name) == family for name in key.split(" + "))
+    }
+    total = sum(shares.values())
+    if total < CERTAIN:
+        return None
+    alone = {n: p for n, p in shares.items() if n in families and p >= SHOWN}
+    forms = [f"{n} ({stated(p)})" for n, p in sorted(alone.items(), key=_by_share)]
+    return f"{family} ({stated(total)}), form open: {', '.join(forms)}"
+
+
+def _by_share(item: tuple[str, float]) -> float:
+    return -item[1]
 
 
 def added(report: Contents) -> str:

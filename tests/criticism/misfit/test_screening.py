@@ -66,6 +66,7 @@ def test_a_small_library_is_fitted_as_a_whole():
     assert screen(rivals(trials(), EFFECTS)) is None
 
 
+@pytest.mark.slow
 def test_clean_trials_of_a_large_library_say_none():
     loop = Criticism(MODEL, PRIOR, trials(seed=3), effects=LIBRARY, seed=0)
     assert loop.trace().verdict == "none"

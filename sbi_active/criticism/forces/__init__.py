@@ -1,0 +1,10 @@
+"""Generalized forces that nobody declared: a dictionary of what a joint may lack.
+
+Here live the forces, their sizes along nominal trajectories, and the effects made of
+them. Whether one explains trials is found elsewhere.
+"""
+
+from sbi_active.criticism.forces.force import Force, total_force
+from sbi_active.criticism.forces.library import force_effects
+
+__all__ = ["Force", "force_effects", "total_force"]

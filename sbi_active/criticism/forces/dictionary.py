@@ -1,0 +1,153 @@
+r"""Functions of position, velocity, time and trial that a joint's force may be.
+
+In units of the joint: q of half the range it moves in on a slide (radians on a hinge),
+v of the root of its mean square, t of the longest trial, the trial's number from -1 to
+1. Each is in the family of what it depends on, since trials tell that with certainty
+long before they tell the form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Basis = Callable[[Array, Array, float, Array], Array]
+
+#: Speed below which dry friction turns over, in units of v.
+TURNING = 0.05
+#: Numbers of a free shape, and the length over which it is smooth, in its range.
+NUM_SHAPES, SMOOTH = 7, 0.2
+#: Points on which a free shape is laid.
+GRID = np.linspace(0.0, 1.0, 101)
+
+
+def _sign(v: Array) -> Array:
+    return np.tanh(v / TURNING)
+
+
+#: Family and function of each form, of (q, v, t, trial).
+FORMS: dict[str, tuple[str, Basis]] = {
+    "constant": ("q", lambda q, v, t, k: np.ones_like(q)),
+    "q": ("q", lambda q, v, t, k: q),
+    "q|q|": ("q", lambda q, v, t, k: q * np.abs(q)),
+    "q^3": ("q", lambda q, v, t, k: q**3),
+    "sin q": ("q", lambda q, v, t, k: np.sin(q)),
+    "cos q": ("q", lambda q, v, t, k: np.cos(q)),
+    "sin 2q": ("q", lambda q, v, t, k: np.sin(2 * q)),
+    "cos 2q": ("q", lambda q, v, t, k: np.cos(2 * q)),
+    "sin 3q": ("q", lambda q, v, t, k: np.sin(3 * q)),
+    "stop beyond .5": ("q", lambda q, v, t, k: q - np.clip(q, -0.5, 0.5)),
+    "stop beyond 1": ("q", lambda q, v, t, k: q - np.clip(q, -1.0, 1.0)),
+    "sign v": ("v", lambda q, v, t, k: _sign(v)),
+    "v": ("v", lambda q, v, t, k: v),
+    "v|v|": ("v", lambda q, v, t, k: v * np.abs(v)),
+    "v^3": ("v", lambda q, v, t, k: v**3),
+    "Stribeck .1": ("v", lambda q, v, t, k: _sign(v) * np.exp(-np.abs(v) / 0.1)),
+    "Stribeck .3": ("v", lambda q, v, t, k: _sign(v) * np.exp(-np.abs(v) / 0.3)),
+    "q v": ("q and v", lambda q, v, t, k: q * v),
+    "|q| v": ("q and v", lambda q, v, t, k: np.abs(q) * v),
+    "q^2 v": ("q and v", lambda q, v, t, k: q**2 * v),
+    "q^2 sign v": ("q and v", lambda q, v, t, k: q**2 * _sign(v)),
+    "t": ("t", lambda q, v, t, k: t + 0 * q),
+    "t v": ("t", lambda q, v, t, k: t * v),
+    "sin 2 pi t": ("t", lambda q, v, t, k: np.sin(2 * np.pi * t) + 0 * q),
+    "cos 2 pi t": ("t", lambda q, v, t, k: np.cos(2 * np.pi * t) + 0 * q),
+    "sin 6 pi t": ("t", lambda q, v, t, k: np.sin(6 * np.pi * t) + 0 * q),
+    "cos 6 pi t": ("t", lambda q, v, t, k: np.cos(6 * np.pi * t) + 0 * q),
+    "trial": ("trial", lambda q, v, t, k: k + 0 * q),
+    "trial v": ("trial", lambda q, v, t, k: k * v),
+}
+#: What free shapes are functions of.
+FREE = ("q", "v", "t", "q times v")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One degree of freedom, and how large things are on it.
+
+    Attributes:
+        name: What reports call it.
+        place: Among the positions.
+        dof: Among the velocities.
+        unit: Of a force on it, "N" or "N m".
+        position: Unit of q.
+        velocity: Unit of v.
+        low: Of q and v in their units, along nominal trajectories.
+        high: The same.
+    """
+
+    name: str
+    place: int
+    dof: int
+    unit: str
+    position: float
+    velocity: float
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FormForce:
+    """A force of a known form on one joint, phi times its size.
+
+    Attributes:
+        joint: On which it acts.
+        form: Name in the dictionary, or "free f(...)" of what stands in brackets.
+        size: Factor that gives the form a root mean square of one.
+        horizon: Unit of t, s.
+        other: The joint whose q or v the form takes in place of its own.
+    """
+
+    joint: Joint
+    form: str
+    size: float
+    horizon: float
+    other: Joint | None = None
+
+    def __call__(self, q: Array, v: Array, t: float, phi: Array) -> Array:
+        """Return the force, shape (n, nv).
+
+        Args:
+            q: Shape (n, nq).
+            v: Shape (n, nv).
+            t: Since the start of the trial, s.
+            phi: Strengths, and the trial's place from -1 to 1 as the last column.
+        """
+        force = np.zeros_like(v)
+        with np.errstate(all="ignore"):  # of rows that diverge
+            values = self.values(q, v, t, phi[:, -1])
+            force[:, self.joint.dof] = self.size * (phi[:, :-1] * values).sum(1)
+        return force
+
+    def values(self, q: Array, v: Array, t: float, trial: Array) -> Array:
+        """Return the form's functions, shape (n, k)."""
+        own = self.other or self.joint
+        at = q[:, own.place] / own.position
+        speed = v[:, own.dof] / own.velocity
+        time = t / self.horizon
+        if not self.form.startswith("free"):
+            return FORMS[self.form][1](at, speed, time, trial)[:, None]
+        kind = self.form.removeprefix("free f(").removesuffix(")")
+        k = int(kind == "v")
+        place = speed if kind == "v" else at
+        share = (place - own.low[k]) / (own.high[k] - own.low[k])
+        if kind == "t":
+            share = np.full(len(q), time)
+        shapes = np.stack([np.interp(share, GRID, shape) for shape in _SHAPES], 1)
+        return shapes * speed[:, None] if kind == "q times v" else shapes
+
+
+def _shapes() -> Array:
+    """Return the largest eigenfunctions of a smooth kernel, times their deviations."""
+    apart = (GRID[:, None] - GRID) / SMOOTH
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * apart**2))
+    largest = np.argsort(-values)[:NUM_SHAPES]
+    return (vectors[:, largest] * np.sqrt(values[largest])).T
+
+
+_SHAPES = _shapes()

@@ -1,0 +1,247 @@
+"""Effects that are generalized forces of the dictionary, on every joint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.forces.dictionary import (
+    FORMS,
+    FREE,
+    NUM_SHAPES,
+    FormForce,
+    Joint,
+)
+from sbi_active.criticism.forces.trajectories import Trajectories, trajectories
+from sbi_active.simulation import SimulatorModel
+
+#: How families of forces begin: their forms are alternatives of one cause.
+FAMILY = "force in "
+#: Prior deviation of a force, in root mean squares of what the motion takes.
+SHARE = 0.2
+#: On a slide the unit of q is what 90 % of the time lies within, by this.
+REACH = 1.5
+#: Root mean square of a form along nominal trajectories below which it does not act.
+SMALLEST = 1e-6
+#: Share of the range of q and v by which free shapes reach beyond it.
+MARGIN = 0.1
+
+
+def force_effects(
+    simulator: SimulatorModel,
+    prior: Distribution,
+    trials: Trials,
+    *,
+    joints: Sequence[str] | None = None,
+    slides: Sequence[str] = (),
+    include: str | Sequence[str] = "*",
+    exclude: str | Sequence[str] = (),
+    free: bool = True,
+    seed: int = 0,
+) -> list[Effect]:
+    r"""Return generalized forces that a simulator may lack, on each of its joints.
+
+    .. math::
+        \tau_j \mathrel{+}= \phi\, b(q, v, t, \text{trial})
+
+    with b of a dictionary, each scaled to a root mean square of a fifth of the force
+    that nominal motion takes, so that phi is about one. Every form is in the family of
+    what it depends on ("force in q of hinge"): trials tell the family first, and the
+    form within it only where they reach far enough.
+
+    The simulator takes ``force=`` and adds ``total_force(force, q, v, t)`` in each
+    step. MuJoCo models of ``sbi_active.mujoco`` do.
+
+    Args:
+        simulator: As above.
+        prior: Of its parameters, at draws of which nominal trajectories are simulated.
+        trials: Those to be explained, whose actions are taken.
+        joints: Names, one a degree of freedom, in the order of v; None takes those of a
+            MuJoCo model, or "joint 1", "joint 2", ...
+        slides: Joints that slide, whose forms are in units of their range: a sine of q
+            in metres means nothing.
+        include: Patterns of names of effects, as in "*of hinge" or "sin*".
+        exclude: The same, taken out.
+        free: Also free shapes f(q), f(v), f(t) and f(q) v, smooth forms that are in no
+            dictionary.
+        seed: Of the draws.
+
+    Raises:
+        ValueError: If the simulator never asks for forces, the names are not one a
+            degree of freedom, or a pattern matches nothing.
+
+    Example:
+        >>> from sbi_active import GaussianNoise
+        >>> from sbi_active.criticism.forces import total_force
+        >>> def fall(theta, action, *, force=None):
+        ...     q, v, out = action.clone(), torch.zeros_like(action), []
+        ...     for k in range(20):
+        ...         tau = total_force(force, q, v, 0.05 * k)
+        ...         v = v + 0.05 * (tau - 9.81 * q / theta)
+        ...         q = q + 0.05 * v
+        ...         out.append(q[:, 0])
+        ...     return torch.stack(out, 1)
+        >>> model = SimulatorModel(fall, noise=GaussianNoise(0.01), batched=True)
+        >>> lengths = Independent(Normal(torch.ones(1), 0.1 * torch.ones(1)), 1)
+        >>> swings = torch.linspace(0.2, 1.0, 4)[:, None]
+        >>> trials = Trials(swings, fall(torch.ones(4, 1), swings))
+        >>> found = force_effects(model, lengths, trials, joints=["hinge"])
+        >>> len(found), found[6].name, found[6].family
+        (33, 'sin 2q of hinge', 'force in q of hinge')
+    """
+    nominal = trajectories(simulator, prior, trials, seed=seed)
+    known = _joints(simulator, nominal, joints, slides)
+    center, span = _range_of(trials.index)
+    found: list[Effect] = []
+    for joint in known:
+        scale = SHARE * nominal.force[joint.dof]
+        for name, family, force in _forces(joint, known, nominal, free=free):
+            sized = _sized(force, nominal, scale)
+            if sized is not None:
+                found.append(_effect(name, family, sized, center, span))
+    return _picked(found, include, exclude)
+
+
+def _forces(
+    joint: Joint, joints: Sequence[Joint], nominal: Trajectories, *, free: bool
+) -> Iterator[tuple[str, str, FormForce]]:
+    """Yield name, family and force of all forms on a joint."""
+    horizon = float(np.ptp(nominal.time))
+    for form, (what, _) in FORMS.items():
+        family = f"{FAMILY}{what} of {joint.name}"
+        yield f"{form} of {joint.name}", family, FormForce(joint, form, 1.0, horizon)
+    for other in joints:
+        if other is joint:
+            continue
+        for form in ("q", "v"):
+            name = f"{form} of {other.name} on {joint.name}"
+            force = FormForce(joint, form, 1.0, horizon, other)
+            yield name, f"coupling with {joint.name}", force
+    if free:
+        for what in FREE:
+            depends = "q and v" if what == "q times v" else what
+            form = f"free f({what})"
+            family = f"{FAMILY}{depends} of {joint.name}"
+            yield f"{form} of {joint.name}", family, FormForce(joint, form, 1, horizon)
+
+
+def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce | None:
+    """Return the force of size one at phi = 1; None where it does nothing."""
+    begin = float(nominal.time[0])
+    squares = []
+    for k, t in enumerate(nominal.time):
+        q, v = nominal.q[:, k], nominal.v[:, k]
+        values = force.values(q, v, float(t) - begin, np.ones(len(q)))
+        squares.append((values**2).sum(1).mean())
+    size = float(np.sqrt(np.mean(squares)))
+    return None if size < SMALLEST else replace(force, size=scale / size)
+
+
+def _effect(
+    name: str, family: str, force: FormForce, center: float, span: float
+) -> Effect:
+    dim = NUM_SHAPES if force.form.startswith("free") else 1
+    return Effect(
+        name,
+        hook="dynamics",
+        prior=Independent(Normal(torch.zeros(dim), torch.ones(dim)), 1),
+        null=0.0,
+        apply=_Adds(force, center, span),
+        units=f"times {force.size:.3g} {force.joint.unit}",
+        family=family,
+        describe=f"a generalized force, {name}",
+        needs_order=force.form.startswith("trial"),
+    )
+
+
+@dataclass(frozen=True)
+class _Adds:
+    """Adds a force to those of the simulator, with the place of the trial."""
+
+    force: FormForce
+    center: float
+    span: float
+
+    def __call__(
+        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
+    ) -> dict[str, Any]:
+        place = (context.index.to(phi) - self.center) / self.span
+        others = value.get("force") or {}
+        given = torch.cat([phi, place[:, None]], 1)
+        return {**value, "force": {**others, self.force: given}}
+
+
+def _range_of(index: Tensor) -> tuple[float, float]:
+    low, high = float(index.min()), float(index.max())
+    return 0.5 * (low + high), max(0.5 * (high - low), 0.5)
+
+
+def _joints(
+    simulator: SimulatorModel,
+    nominal: Trajectories,
+    names: Sequence[str] | None,
+    slides: Sequence[str],
+) -> list[Joint]:
+    num = nominal.v.shape[2]
+    if nominal.q.shape[2] != num:
+        raise ValueError(
+            f"expected a position for each velocity; got {nominal.q.shape[2]} and "
+            f"{num}; leave free and ball joints out of what forces see"
+        )
+    own = getattr(simulator.fn, "joints", None)
+    if names is None and own is not None:
+        names, slides = own
+    if names is None:
+        names = [f"joint {k + 1}" for k in range(num)]
+    if len(names) != num:
+        raise ValueError(
+            f"expected {num} names of joints; got {', '.join(names)}; name each degree "
+            "of freedom in the order of v"
+        )
+    found = []
+    for k, name in enumerate(names):
+        q, v = nominal.q[..., k], nominal.v[..., k]
+        away = np.percentile(np.abs(q), 90) / REACH if name in slides else 1.0
+        position = float(max(away, 1e-12))
+        velocity = float(max(np.sqrt(np.mean(v**2)), 1e-12))
+        low, high = zip(_ends(q / position), _ends(v / velocity), strict=True)
+        unit = "N" if name in slides else "N m"
+        found.append(Joint(name, k, k, unit, position, velocity, low, high))
+    return found
+
+
+def _ends(values: Any) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    margin = MARGIN * max(high - low, 1e-6)
+    return low - margin, high + margin
+
+
+def _picked(
+    effects: list[Effect], include: str | Sequence[str], exclude: str | Sequence[str]
+) -> list[Effect]:
+    wanted, without = (
+        [patterns] if isinstance(patterns, str) else [*patterns]
+        for patterns in (include, exclude)
+    )
+    names = [e.name for e in effects]
+    for pattern in (*wanted, *without):
+        if not any(fnmatch(name, pattern) for name in names):
+            raise ValueError(
+                f"expected patterns of names as in {names[0]!r}; got {pattern!r}, "
+                "which matches none; correct it"
+            )
+    return [
+        e
+        for e in effects
+        if any(fnmatch(e.name, p) for p in wanted)
+        and not any(fnmatch(e.name, p) for p in without)
+    ]

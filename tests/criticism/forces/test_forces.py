@@ -1,0 +1,156 @@
+"""Forces that nobody declared, on a pendulum whose simulator takes ``force=``."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism.forces import force_effects, total_force
+from sbi_active.criticism.forces.dictionary import FORMS, FREE
+from sbi_active.criticism.forces.trajectories import trajectories
+
+TIMES = torch.linspace(0.1, 2.0, 20, dtype=torch.float64)
+STEP, SD, MASS = 0.02, 0.003, 2.0
+PRIOR = BoxUniform(torch.tensor([5.0, 0.0]), torch.tensor([15.0, 1.0]))
+
+
+def swing(theta, action, *, force=None):
+    """A pendulum of inertia 2 under a torque of 3 rad/s, (n, 20) angles."""
+    g, c = theta.double().T[..., None]
+    q, u = action[:, :1].double().clone(), action[:, 1:].double()
+    v, found = torch.zeros_like(q), []
+    for k in range(100):
+        t = k * STEP
+        drive = u * np.sin(3 * t) - g * torch.sin(q) - c * v
+        v = v + STEP * (drive + total_force(force, q, v, t)) / MASS
+        q = q + STEP * v
+        if (k + 1) % 5 == 0:
+            found.append(q[:, 0])
+    return torch.stack(found, 1).to(theta.dtype)
+
+
+MODEL = SimulatorModel(swing, noise=GaussianNoise(SD), batched=True, sample_times=TIMES)
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A force of an angle, which the truth has."""
+
+    form: str
+
+    def __call__(self, q, v, t, phi):
+        return phi[:, :1] * FORMS[self.form][1](q, v, t, phi)
+
+
+def measured(form="", size=0.0, seed=0):
+    gen = torch.Generator().manual_seed(seed)
+    start = torch.linspace(-1.2, 1.2, 10, dtype=torch.float64)
+    start = start[torch.randperm(10, generator=gen)]
+    push = 3 * torch.rand(10, generator=gen, dtype=torch.float64)
+    action = torch.stack([start, push], 1)
+    theta = torch.tensor([[9.0, 0.3]], dtype=torch.float64).expand(10, -1)
+    force = {Hidden(form): torch.full((10, 1), size)} if form else None
+    x = swing(theta, action, force=force)
+    x = x + SD * torch.randn(x.shape, generator=gen, dtype=torch.float64)
+    return Trials(action, x, sample_times=TIMES)
+
+
+@pytest.fixture(scope="module")
+def library():
+    return force_effects(MODEL, PRIOR, measured(), joints=["hinge"])
+
+
+def test_the_dictionary_covers_position_velocity_time_and_trial(library):
+    assert len(library) == len(FORMS) + len(FREE)
+    families = {e.family for e in library}
+    assert families == {
+        f"force in {what} of hinge" for what in ("q", "v", "q and v", "t", "trial")
+    }
+    assert [e.name for e in library if e.needs_order] == [
+        "trial of hinge",
+        "trial v of hinge",
+    ]
+
+
+def test_the_force_of_nominal_motion_is_that_of_newton():
+    found = trajectories(MODEL, PRIOR, measured())
+    acceleration = np.gradient(found.v, found.time, axis=1)
+    expected = MASS * np.sqrt(np.mean(acceleration**2))
+    assert found.force[0] == pytest.approx(expected, rel=0.05)
+
+
+def test_phi_of_one_is_a_fifth_of_the_force_of_nominal_motion(library):
+    found = trajectories(MODEL, PRIOR, measured())
+    for effect in library:
+        if not effect.name.startswith(("q^3", "v|v|", "sin 6 pi t")):
+            continue
+        force, squares = effect.apply.force, []
+        for k, t in enumerate(found.time):
+            q, v = found.q[:, k], found.v[:, k]
+            phi = np.tile([1.0, 0.5], (len(q), 1))
+            squares.append(force(q, v, float(t), phi) ** 2)
+        rms = np.sqrt(np.mean(squares))
+        assert rms == pytest.approx(0.2 * found.force[0], rel=0.02)
+
+
+def test_a_hidden_force_is_found_by_its_family(library):
+    loop = Criticism(
+        MODEL, PRIOR, measured("sin 2q", 0.5, seed=1), effects=library, seed=0
+    )
+    tracing = loop.trace()
+    families = {e.name: e.family for e in library}
+    assert len(tracing.chosen) == 1
+    assert families[tracing.verdict] == "force in q of hinge"
+    share = sum(
+        p
+        for key, p in tracing.probabilities.items()
+        if families.get(key) == "force in q of hinge"
+    )
+    assert share > 0.9
+    line = str(loop.report(evaluate=False, plan=False)).splitlines()[0]
+    if tracing.inclusion[tracing.verdict] >= 0.9:
+        assert line.startswith(f"Verdict: {tracing.verdict} (P")
+    else:
+        assert line.startswith("Verdict: force in q of hinge (P")
+        assert "form open: " in line
+
+
+@pytest.mark.slow
+def test_clean_trials_have_no_force(library):
+    tracing = Criticism(MODEL, PRIOR, measured(seed=2), effects=library).trace()
+    assert tracing.verdict == "none"
+
+
+def test_patterns_pick_effects():
+    some = force_effects(
+        MODEL,
+        PRIOR,
+        measured(),
+        joints=["hinge"],
+        include=("*v*", "t *"),
+        exclude="free*",
+    )
+    assert "v|v| of hinge" in [e.name for e in some]
+    assert not any(e.name.startswith("free") for e in some)
+    with pytest.raises(ValueError, match="which matches none; correct it"):
+        force_effects(MODEL, PRIOR, measured(), include="friction*")
+
+
+def test_a_simulator_that_never_asks_is_refused():
+    deaf = SimulatorModel(
+        lambda theta, action, *, force=None: swing(theta, action),
+        noise=GaussianNoise(SD),
+        batched=True,
+        sample_times=TIMES,
+    )
+    with pytest.raises(ValueError, match="call total_force"):
+        force_effects(deaf, PRIOR, measured())
+
+
+def test_names_are_one_a_degree_of_freedom():
+    with pytest.raises(ValueError, match="expected 1 names of joints; got a, b"):
+        force_effects(MODEL, PRIOR, measured(), joints=["a", "b"])
