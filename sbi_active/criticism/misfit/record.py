@@ -13,6 +13,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import ImportanceSample
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
+from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
@@ -100,6 +101,7 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
         estimates=_estimates(misfit, evidences),
         evidences=evidences,
         robust=misfit.is_robust(),
+        guesses=() if choice.key.effects else guess_residual(search),
         beside=tuple(n for n in choice.key.effects if n not in named),
         misfit=found,
     )
