@@ -240,9 +240,8 @@ def _imitates(
     for far in FAR:
         shift, scale = _small(other, far)
         start = _small(one, far)[0]
-        draws = torch.cat([shift, start]).isfinite().all()
-        outside = ~torch.cat([other.log_prob(shift), one.log_prob(start)]).isfinite()
-        if not draws or bool(outside.any()):
+        inside = torch.cat([other.log_prob(shift), one.log_prob(start)])
+        if not bool(inside.isfinite().all()):
             continue
         u = own.from_z(np.concatenate([theta, start.numpy()], 1))[0]
         near = _Neighborhood(simulator, own, u, unit, rivals)

@@ -12,7 +12,7 @@ SCALE = torch.tensor([0.2])
 PRIOR = LogNormal(torch.zeros(1), torch.tensor([0.3]))
 
 
-def respond(theta, action, *, delay=0.0, lag=0.0, clock=0.0):
+def respond(theta, action, *, delay=0.0, lag=0.0, clock=0.0, unused=0.0):
     """Return the answer to a sine of frequency action, late by a delay or by a lag."""
     late, tau, early = (
         (torch.as_tensor(v) + torch.zeros(len(theta))).double()[:, None]
@@ -33,6 +33,12 @@ LATE = {
     "lag": Independent(HalfNormal(SCALE), 1),
     "clock": normal(SCALE),
 }
+#: Late, and with a second strength that shows nowhere.
+TWO = Effect.keyword(
+    "two",
+    *("delay", "unused"),
+    prior=Independent(HalfNormal(torch.tensor([0.2, 1.0])), 1),
+)
 
 
 def groups(*names):
@@ -40,7 +46,9 @@ def groups(*names):
     gen = torch.Generator().manual_seed(0)
     action = FREQUENCIES.values
     x = respond(torch.ones(6, 1), action) + 0.02 * torch.randn(6, 31, generator=gen)
-    effects = [Effect.keyword(n, prior=LATE[n]) for n in names]
+    effects = [
+        n if isinstance(n, Effect) else Effect.keyword(n, prior=LATE[n]) for n in names
+    ]
     prior = Independent(PRIOR, 1)
     trials = Trials(action, x, sample_times=TIMES)
     return Criticism(
@@ -60,3 +68,8 @@ def test_a_delay_is_a_clock_of_another_scale_at_any_size():
 
 def test_of_three_the_two_are_left_that_are_alike_everywhere():
     assert groups("lag", "delay", "clock") == (frozenset({"delay", "clock"}),)
+
+
+def test_effects_may_have_strengths_of_other_numbers():
+    assert groups(TWO, "clock") == (frozenset({"two", "clock"}),)
+    assert groups("lag", TWO) == ()
