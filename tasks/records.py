@@ -98,17 +98,19 @@ class Pieces:
             "times": torch.from_numpy(self.times).repeat(num * len(self), 1),
         }
 
-    def trials(self, labels: Sequence[str]) -> Trials:
+    def trials(self, labels: Sequence[str], channel: str | None = None) -> Trials:
         """Return the pieces as trials with their inputs over time.
 
         Args:
             labels: What reports call the numbers of an action.
+            channel: What they call the output, with its unit.
         """
         return Trials(
             self.action,
             self.output,
             sample_times=self.times,
             action_labels=labels,
+            channel_labels=None if channel is None else [channel],
             inputs=self.inputs,
             input_times=self.input_times,
         )

@@ -17,6 +17,7 @@ MOST_LINES = 400  # of a file
 #: From the ground up. A room, or a file that lives on another floor than its room,
 #: imports from its own floor and from those before it; never from a later one.
 FLOORS = (
+    "callers",
     "seeding",
     "threads",
     "notebook",

@@ -61,6 +61,7 @@ from sbi_active.tasks.records import Record, cut  # pyright: ignore
 __all__ = ["main", "make_bench"]
 
 RESULT = Path(__file__).parent / "results" / "ball_and_hoop.json"
+CHANNEL = "speed [V]"
 LABELS = ("begin [s]", "start [V]")
 REMOVALS = (
     ("compression",),
@@ -104,14 +105,14 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         x = torch.cat([torch.from_numpy(whole.start), x])
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage[: FITTED + 1], output)
-        return cut(made, LENGTH, every=every).trials(LABELS)
+        return cut(made, LENGTH, every=every).trials(LABELS, CHANNEL)
 
     return Bench(
         model=make_simulator(),
         prior=make_prior(),
         effects=make_effects(),
         nuisances=[],
-        trials=pieces.trials(LABELS),
+        trials=pieces.trials(LABELS, CHANNEL),
         removals=REMOVALS,
         given=GIVEN,
         score=lambda draws, effects: free_run(draws, held, effects),

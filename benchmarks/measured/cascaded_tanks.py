@@ -55,6 +55,7 @@ from sbi_active.tasks.records import Record, cut  # pyright: ignore
 __all__ = ["main", "make_bench"]
 
 RESULT = Path(__file__).parent / "results" / "cascaded_tanks.json"
+CHANNEL = "level [V]"
 LABELS = ("begin [s]", "start [V]", "slope [V/s]")
 REMOVALS = (
     ("overflow",),
@@ -98,14 +99,14 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage, output)
         pieces = cut(made, LENGTH, every=every, slope=SLOPE, lead=LEAD)
-        return pieces.trials(LABELS)
+        return pieces.trials(LABELS, CHANNEL)
 
     return Bench(
         model=make_simulator(),
         prior=make_prior(),
         effects=make_effects(),
         nuisances=[],
-        trials=pieces.trials(LABELS),
+        trials=pieces.trials(LABELS, CHANNEL),
         removals=REMOVALS,
         given=GIVEN,
         score=lambda draws, effects: score(draws, scored, effects),

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.callers import stack_level
 from sbi_active.criticism.data.input_series import require_covered
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
@@ -183,7 +184,7 @@ def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
                 f"the trials have {name}, and the simulator's function takes no "
                 f"argument {name!r}: they are not used; write fn(theta, action, *, "
                 f"{name})",
-                stacklevel=5,
+                stacklevel=stack_level(),
             )
 
 
@@ -198,7 +199,7 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
         f"the executed action {trials.action[places[0]].tolist()} of trial "
         f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
         "is simulated where it was executed",
-        stacklevel=5,
+        stacklevel=stack_level(),
     )
 
 

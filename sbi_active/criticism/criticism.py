@@ -237,7 +237,7 @@ class Criticism:
                 self._residuals = None
                 self.rivals.fits.clear()
                 tracing = traced(self._misfit, self._parts[1].held_out)
-            if tracing.verdict == UNEXPLAINED and not tracing.chosen:
+            elif tracing.verdict == UNEXPLAINED and not tracing.chosen:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
         return self._tracing

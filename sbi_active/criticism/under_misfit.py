@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
@@ -51,6 +51,9 @@ class Misfit:
         time_scale: Of that process, in the unit of the sample times; inf where x has no
             time axis and it follows the trials.
         left_out: What was left out: "trials" or "parts of trials".
+        weights: Of models by their errors on left-out parts, where probabilities are
+            too sure; by name, largest first, without those that hardly count. A next
+            action is to tell these apart.
     """
 
     models: tuple[ModelError, ...]
@@ -63,6 +66,7 @@ class Misfit:
     size: float
     time_scale: float
     left_out: str = "trials"
+    weights: dict[str, float] = field(default_factory=dict)
 
     @property
     def named(self) -> tuple[str, ...]:

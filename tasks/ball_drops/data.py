@@ -104,4 +104,5 @@ def trials_of(drops: list[Drop], *, until: dict[int, float] | None = None) -> Tr
         [[drop.area_per_mass] for drop in drops],
         heights,
         sample_times=[drop.times for drop in drops],
+        channel_labels=["height [m]"],
     )

@@ -177,6 +177,7 @@ class ServoPendulumTask(Task):
             role=fitted + scored,
             index=rows,
             sample_times=self.recordings.times,
+            channel_labels=["angle [rad]"],
         )
 
     def _options(self) -> dict[str, Any]:

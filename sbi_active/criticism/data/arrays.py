@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.arrays import measured
+from sbi_active.callers import stack_level
 
 Role = Literal["fit", "held out"]
 
@@ -72,7 +73,7 @@ def without_inf(x: Tensor, names: Sequence[str]) -> Tensor:
         warnings.warn(
             f"x is inf in trial{'s' * (len(lost) > 1)} {which}: taken as not measured, "
             "as NaN is",
-            stacklevel=3,
+            stacklevel=stack_level(),
         )
     return x.where(x.isfinite(), torch.nan)
 

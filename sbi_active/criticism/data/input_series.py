@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import padded
 
 Array = NDArray[Any]
@@ -314,7 +315,7 @@ def _require_one_origin(ends: list[tuple[float, float]], low: float) -> None:
     warnings.warn(
         f"trials {[i for i, *_ in late]} begin up to {after:g} after the earliest, and "
         f"hold their first inputs until then: {remedy} where a simulator starts there",
-        stacklevel=6,
+        stacklevel=stack_level(),
     )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import Columns, bare, find_columns
 from sbi_active.criticism.data.table_inputs import InputRows
 from sbi_active.criticism.data.table_rows import Rows, read_frame
@@ -258,7 +259,7 @@ class _TrialRows(Rows):
                     f"{len(at)} of {len(rows)} cells of column {column} in "
                     f"{self.source} hold no number: {some}{more}; they count as not "
                     "measured",
-                    stacklevel=5,
+                    stacklevel=stack_level(),
                 )
 
     def _note_scales(self, sizes: Sequence[Array] | Array, column: str) -> None:
@@ -282,5 +283,5 @@ class _TrialRows(Rows):
             f"{column} of {'trials' if self.columns.trial else 'rows'} {which} in "
             f"{self.source} is about {factor:.0f} times {word} than that of the "
             "others: check that all are in one unit",
-            stacklevel=5,
+            stacklevel=stack_level(),
         )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.callers import stack_level
 from sbi_active.criticism.data.input_series import FAR, GAP
 
 Array = NDArray[Any]
@@ -70,7 +71,7 @@ class InputRows:
             warnings.warn(
                 f"{len(lost)} rows of {self.source} have a measurement and no input, "
                 f"the first in {self.place(lost[0])}; there the input before holds",
-                stacklevel=6,
+                stacklevel=stack_level(),
             )
 
     def of(self, trials: Sequence[str]) -> InputRows:

@@ -13,7 +13,9 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import ImportanceSample
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
+from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.verdict import Misfit
+from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
     UNEXPLAINED,
     Detection,
@@ -34,6 +36,9 @@ Array = NDArray[Any]
 #: Probability from which an admitted model is recorded with its errors and draws, and
 #: how many are at most.
 SHOWN, MOST_SHOWN = 0.01, 8
+#: Weight by the error on left-out parts from which a next action is to tell a model
+#: from others, and how many are at most: each costs some hundred trials a candidate.
+COUNTS, MOST_COUNTED = 0.05, 6
 #: Root mean square difference of two effects' fits, in sensor deviations, below which
 #: they are nearly the same.
 CLOSE = 1.0
@@ -72,11 +77,12 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
     singles = [ModelKey((name,)) for name in search.names]
     shown = [k for k, p in choice.probabilities.items() if p >= SHOWN][:MOST_SHOWN]
     tabled = [*dict.fromkeys([*shown, choice.key, ModelKey()])]
+    weights = _weights(misfit)
     evidences = {}
-    for key in dict.fromkeys([*tabled, *singles]):
+    for key in dict.fromkeys([*tabled, *singles, *weights]):
         evidences[str(key)] = _record(misfit, key)
     models = [_scored(misfit, key, held_out) for key in tabled]
-    found = _found(misfit, tuple(models))
+    found = _found(misfit, tuple(models), weights)
     named = found.named
     probabilities = {str(k): choice.probabilities.get(k, 0.0) for k in tabled}
     probabilities |= {
@@ -95,6 +101,7 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
         estimates=_estimates(misfit, evidences),
         evidences=evidences,
         robust=misfit.is_robust(),
+        guesses=() if choice.key.effects else guess_residual(search),
         beside=tuple(n for n in choice.key.effects if n not in named),
         misfit=found,
     )
@@ -131,7 +138,21 @@ def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     return evidence
 
 
-def _found(misfit: Misfit, models: tuple[ModelError, ...]) -> Found:
+def _weights(misfit: Misfit) -> dict[ModelKey, float]:
+    """Return the models that count, by their errors on left-out parts."""
+    found = misfit.search.found
+    weights = weights_by_error(
+        {key: candidate.left.square for key, candidate in found.items()},
+        {key: candidate.log_prior for key, candidate in found.items()},
+        derive_seed(misfit.rivals.seed, "weights"),
+    )
+    kept = [key for key, weight in weights.items() if weight >= COUNTS]
+    return {key: weights[key] for key in kept[:MOST_COUNTED]}
+
+
+def _found(
+    misfit: Misfit, models: tuple[ModelError, ...], weights: dict[ModelKey, float]
+) -> Found:
     choice, search = misfit.choice, misfit.search
     m = search.rivals.measurements
     last = search.found[choice.key]
@@ -146,6 +167,7 @@ def _found(misfit: Misfit, models: tuple[ModelError, ...]) -> Found:
         size=last.posterior.size,
         time_scale=last.posterior.time_scale,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
+        weights={str(key): weight for key, weight in weights.items()},
     )
 
 

@@ -32,6 +32,8 @@ NEGLIGIBLE = 0.01
 MAX_RIVALS = 8
 #: Information below which no action is worth a trial, nats.
 NOTHING = 0.02
+#: Information of another action that is worth a second choice, nats.
+SOMETHING = 0.1
 #: Candidates beyond the permitted range, where the best is not asked for.
 MAX_OUTSIDE = 24
 #: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
@@ -120,6 +122,9 @@ def choose_action(
     .02 nats for every permitted action, or some of the rivals are equivalent, actions
     beyond the permitted range are tried: one that separates them is named.
 
+    Where every model misses, rivals count by their errors on left-out trials: their
+    probabilities are too sure. What they leave is a part of their predictions.
+
     Args:
         rivals: The models.
         tracing: Their probabilities.
@@ -127,15 +132,14 @@ def choose_action(
         beyond: Whether to try others where these separate nothing.
     """
     candidates = permitted_candidates(rivals, actions)
-    named = [n for n, p in tracing.probabilities.items() if p > NEGLIGIBLE][:MAX_RIVALS]
+    misfit = tracing.misfit
+    shares = tracing.probabilities if misfit is None else misfit.weights
+    named = [n for n, p in shares.items() if p > NEGLIGIBLE][:MAX_RIVALS]
     gain = np.zeros(len(candidates))
     action = None
     if len(named) > 1:
-        p = np.array([tracing.probabilities[n] for n in named])
-        design = _select(rivals, tracing, named, p / p.sum(), candidates)
-        gain = design.expected_information_gain.clamp_min(0.0).numpy()
-        if gain[design.index] >= NOTHING:
-            action = design.action.double().numpy()
+        p = np.array([shares[n] for n in named])
+        action, gain = _most_telling(rivals, tracing, named, p / p.sum(), candidates)
     found = NextAction(
         action=action,
         candidates=candidates.double().numpy(),
@@ -153,6 +157,27 @@ def choose_action(
         return found
     others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
     return _look_outside(rivals, tracing, found, simulated(rivals, others))
+
+
+def _most_telling(
+    rivals: RivalSet,
+    tracing: Tracing,
+    names: Sequence[str],
+    p: Array,
+    candidates: Tensor,
+) -> tuple[Array | None, Array]:
+    """Return the best candidate, None where it tells nothing, and what each tells."""
+    design = _select(rivals, tracing, names, p, candidates)
+    gain = design.expected_information_gain.clamp_min(0.0).numpy()
+    told = gain[design.index]
+    others = np.flatnonzero(gain >= SOMETHING)
+    if told < NOTHING and len(others):
+        # The draws that chose it do not report: at some of them alone it tells much.
+        part = candidates[torch.from_numpy(others)]
+        design = _select(rivals, tracing, names, p, part, again=True)
+        gain[others] = design.expected_information_gain.clamp_min(0.0).numpy()
+        told = gain[others[design.index]]
+    return (design.action.double().numpy() if told >= NOTHING else None), gain
 
 
 def _look_outside(
@@ -181,6 +206,8 @@ def _select(
     names: Sequence[str],
     p: Array,
     candidates: Tensor,
+    *,
+    again: bool = False,
 ) -> Design:
     models = [
         PredictedRival(rivals, tracing.evidences[name].key, float(share), candidates)
@@ -191,5 +218,5 @@ def _select(
         num_samples=SAMPLES_PER_RIVAL * len(models),
         eliminate=False,  # a part of the samples would be too few for densities
     )
-    seed = derive_seed(rivals.seed, "next action", *names)
+    seed = derive_seed(rivals.seed, "next action", *names, *["again"] * again)
     return designer.select(models, target="model", seed=seed)

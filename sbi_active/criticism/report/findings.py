@@ -6,7 +6,13 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import added
-from sbi_active.criticism.report.numbers import number, probability, with_error
+from sbi_active.criticism.report.numbers import (
+    FEWEST_DRAWS,
+    estimated,
+    number,
+    probability,
+    with_error,
+)
 from sbi_active.criticism.report.section import (
     Section,
     called,
@@ -37,7 +43,8 @@ def effects(report: Contents) -> Section:
         if name in estimates:
             e = estimates[name]
             pairs = zip(e.mean, e.sd, strict=True)
-            phi = ", ".join(with_error(m, sd) for m, sd in pairs) + f" {e.units}"
+            ess = e.effective_sample_size
+            phi = ", ".join(estimated(m, sd, ess) for m, sd in pairs) + f" {e.units}"
             share = probability(tracing.inclusion.get(name, p))
             inclusion = (share,) * any_set
         if name in tracing.evidences:
@@ -58,8 +65,9 @@ def effects(report: Contents) -> Section:
     text = [
         "P: probability of the model given the trials. phi: strength of the effect "
         "if it alone is added. log BF: log Bayes factor against the bare model, nats. "
-        "ESS: effective samples behind it. 90 % set: the smallest set of models that "
-        "holds 90 % of the probability."
+        "ESS: effective samples behind it, below "
+        f"{FEWEST_DRAWS:.0f} too few for a deviation of phi. 90 % set: the smallest "
+        "set of models that holds 90 % of the probability."
     ]
     if any_set:
         text.append(

@@ -6,6 +6,8 @@ import numpy as np
 
 #: Digits of a number that any deviation leaves.
 MOST_DIGITS = 6
+#: Effective draws below which a deviation is none to print.
+FEWEST_DRAWS = 50.0
 
 
 def stated(value: float) -> str:
@@ -26,6 +28,23 @@ def number(value: float) -> str:
     if np.isnan(value):
         return ""
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def estimated(mean: float, sd: float, draws: float) -> str:
+    """Return a mean with its deviation, or alone where few draws are behind them.
+
+    Args:
+        mean: Of the draws.
+        sd: Of the draws.
+        draws: Their effective number.
+
+    Example:
+        >>> estimated(0.35992, 0.00071, 400), estimated(0.35992, 0.00071, 3)
+        ('0.35992 +- 0.00071', 'about 0.36')
+    """
+    if draws >= FEWEST_DRAWS:
+        return with_error(mean, sd)
+    return f"about {mean:.2g}"
 
 
 def with_error(mean: float, sd: float) -> str:

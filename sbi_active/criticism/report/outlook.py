@@ -7,7 +7,7 @@ import numpy as np
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import METRICS
 from sbi_active.criticism.report.headline import added
-from sbi_active.criticism.report.numbers import number, with_error
+from sbi_active.criticism.report.numbers import number, probability, with_error
 from sbi_active.criticism.report.section import Section, called, joined, setting
 from sbi_active.criticism.results import (
     NONE,
@@ -16,6 +16,7 @@ from sbi_active.criticism.results import (
     Evaluation,
     NextAction,
 )
+from sbi_active.criticism.under_misfit import Misfit
 
 SEVERE = (
     "The first paragraph names the actions that put the verdict to the test most. The "
@@ -117,6 +118,8 @@ def next_action(report: Contents) -> Section:
         text = [f"{action}: at least {best:.2f} nats{question} (a lower bound)."]
     else:
         text = [_nothing_to_tell(report, chosen, best)]
+    if report.tracing.misfit is not None and len(chosen.separates) > 1:
+        text.append(_by_error(report.tracing.misfit))
     if report.severe_tests:
         text.append(SEVERE)
     return Section(title, tuple(text), items=tuple(_inseparable(report, chosen)))
@@ -130,6 +133,11 @@ def _nothing_to_tell(report: Contents, chosen: NextAction, best: float) -> str:
     )
     if len(chosen.separates) == 1:
         found = f"of the declared models only {chosen.separates[0]} is left."
+    if len(chosen.separates) == 1 and report.tracing.misfit is not None:
+        found = (
+            f"of the declared models only {chosen.separates[0]} predicts left-out "
+            f"{report.tracing.misfit.left_out} so well."
+        )
     if report.verdict == NONE:
         return f"Stop: {found}"
     rest = {
@@ -137,6 +145,17 @@ def _nothing_to_tell(report: Contents, chosen: NextAction, best: float) -> str:
         SCATTER: " Repeat an action to see how large it is.",
     }
     return found[0].upper() + found[1:] + rest.get(report.verdict, "")
+
+
+def _by_error(misfit: Misfit) -> str:
+    """Return how rivals count where all of them are wrong."""
+    shares = ", ".join(f"{n} {probability(w)}" for n, w in misfit.weights.items())
+    return (
+        "Every model misses, so that probabilities among them are too sure. Here they "
+        f"count by their errors on left-out {misfit.left_out}: {shares}; what each "
+        "leaves is a part of its prediction. What nobody declared is not among them, "
+        "and the outcome may agree with none."
+    )
 
 
 def _inseparable(report: Contents, chosen: NextAction) -> list[str]:

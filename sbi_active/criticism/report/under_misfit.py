@@ -42,6 +42,7 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
         return (
             f"{begin}: {_size(report, own.left_out)} on left-out {misfit.left_out}. "
             "No declared effect helps to predict them."
+            f"{_guessed(report)}"
         )
     bare, model = misfit.of("none"), misfit.of(str(ModelKey(misfit.helps)))
     change = f"{_change(report, bare.left_out, model.left_out)}"
@@ -69,6 +70,16 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
         change = _change(report, bare.held_out, model.held_out)
         found.append(f"On held-out trials: {change}.")
     return " ".join(found)
+
+
+def _guessed(report: Contents) -> str:
+    if report.guess is None:
+        return ""
+    return (
+        f" What it leaves follows {report.guess}, with x the output, x' its slope, xi "
+        "the action and t the time in the trial: a guess, not declared. Declare what "
+        "it suggests."
+    )
 
 
 def admitted_models(report: Contents, misfit: Misfit) -> Section:

@@ -37,6 +37,10 @@ STEP = 1e-4
 FAR = (0.3, 1.0)
 #: Steps of a search for parameters that imitate such an effect.
 NUM_SEARCH = 6
+#: Share of the rest from which a step has not lowered it.
+ENDED = 0.99
+#: Parameters at which a pair that is alike near its null is compared far from it.
+NUM_FAR = 2
 
 
 def equivalent_effects(
@@ -51,7 +55,9 @@ def equivalent_effects(
 
     An effect that is flat at its null leaves nothing there and may leave much further
     off. It is equivalent to "none" only if at .3 and 1 deviations of its prior, too,
-    parameters are found that make up for all of it.
+    parameters are found that make up for all of it. Two effects that are alike at their
+    null, as a delay and a lag are, must be so there as well: parameters and a strength
+    of either are looked for that imitate the other.
 
     An effect with an infinite null has no derivative there: it is equivalent to "none"
     where its strongest draw shows nothing, and is not compared with others.
@@ -69,7 +75,8 @@ def equivalent_effects(
     votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
     coordinates = SearchCoordinates(rivals.prior, (), (), len(trials))
     local = [bool(e.null_phi(1).isfinite().all()) for e in effects]
-    for u in coordinates.sample(NUM_THETA, seed=derive_seed(rivals.seed, "theta")):
+    every_u = coordinates.sample(NUM_THETA, seed=derive_seed(rivals.seed, "theta"))
+    for u in every_u:
         left = _left_over(simulator, coordinates, u, effects, unit, rivals)
         vote = _alike(left, local)
         for i, effect in enumerate(effects, 1):
@@ -79,6 +86,14 @@ def equivalent_effects(
                 vote[0, 0, i] = vote[0, i, 0] = float(near.hides(effect, size))
         votes += vote
     same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
+    for i, j in zip(*np.nonzero(np.triu(same, 1)), strict=True):
+        pair = [effects[k - 1] for k in (i, j)]
+        if i > 0 and rivals.is_smooth:  # else a search would find the jumps
+            same[i, j] = same[j, i] = all(
+                _imitates(*some, simulator, rivals, coordinates.to_z(u[None]), unit)
+                for some in (pair, pair[::-1])
+                for u in every_u[:NUM_FAR]
+            )
     names = [NONE, *[e.name for e in effects]]
     return _groups(names, same)
 
@@ -154,22 +169,22 @@ class _Neighborhood:
             own = self._predict(self.u[None])[0]
             both = np.isfinite(moved) & np.isfinite(own)
             whole = float(np.linalg.norm((moved - own)[both])) / scale
-            rest, is_free = self._rest(moved, both)
+            rest, is_free, _ = self.rest(moved, both)
             left = float(np.linalg.norm(rest)) / scale
             nothing = left**2 < SAME and left < RELATIVE * whole
             if whole > 0 and is_free and not nothing:
                 return False
         return True
 
-    def _rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool]:
+    def rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool, bool]:
         """Return what parameters leave of some predictions, by Gauss-Newton steps.
 
         And whether they were free: at an edge of the prior, the edge may be what stands
-        against them.
+        against them. And whether the search has ended, so that no step promises more.
         """
         low, high = self.coordinates.low, self.coordinates.high
         v = self.u
-        rest = (aim - self._predict(v[None])[0])[both]
+        rest, has_ended = (aim - self._predict(v[None])[0])[both], False
         for _ in range(self.num_search):
             sign = np.where(v + self.step > high, -1.0, 1.0)
             points = np.concatenate([v[None], v + self.step * np.diag(sign)])
@@ -178,16 +193,21 @@ class _Neighborhood:
             slope = np.where(np.isfinite(slope), slope, 0.0)
             move = np.linalg.lstsq(slope, rest, rcond=1e-9)[0]
             if self.num_search == 1:  # to first order
-                return rest - slope @ move, True
+                return rest - slope @ move, True, True
             for share in (1.0, 0.5, 0.25, 0.125):
                 to = np.clip(v + share * move, low, high)
                 after = (aim - self._predict(to[None])[0])[both]
                 if np.linalg.norm(after) < np.linalg.norm(rest):
+                    has_ended = bool(
+                        np.linalg.norm(after) > ENDED * np.linalg.norm(rest)
+                    )
                     v, rest = to, after
                     break
             else:
+                promised = np.linalg.norm(rest - slope @ move)
+                has_ended = bool(promised > 0.5 * np.linalg.norm(rest))
                 break
-        return rest, bool(((v > low) & (v < high)).all())
+        return rest, bool(((v > low) & (v < high)).all()), has_ended
 
     def _predict(
         self, u: Array, effect: Effect | None = None, shift: Any = None
@@ -196,6 +216,46 @@ class _Neighborhood:
         if effect is not None:
             phi[effect.name] = shift
         return self.simulator.predict(theta, phi)[0] / self.unit
+
+
+def _imitates(
+    one: Effect,
+    other: Effect,
+    simulator: TrialSimulator,
+    rivals: RivalSet,
+    theta: Array,
+    unit: Array,
+) -> bool:
+    """Return whether an effect and parameters imitate another away from its null.
+
+    Args:
+        one: That imitates.
+        other: That is imitated.
+        simulator: Of the permitted actions.
+        rivals: The models.
+        theta: Parameters beside the other, shape (1, theta_dim).
+        unit: What counts as large in each number.
+    """
+    own = SearchCoordinates(rivals.prior, (one,), (), len(simulator))
+    for far in FAR:
+        shift, scale = _small(other, far)
+        start = _small(one, far)[0]
+        inside = torch.cat([other.log_prob(shift), one.log_prob(start)])
+        if not bool(inside.isfinite().all()):
+            continue
+        u = own.from_z(np.concatenate([theta, start.numpy()], 1))[0]
+        near = _Neighborhood(simulator, own, u, unit, rivals)
+        told = torch.from_numpy(theta)
+        aim = simulator.predict(told, {other.name: shift})[0][0] / unit
+        bare = simulator.predict(told, {})[0][0] / unit
+        both = np.isfinite(aim) & np.isfinite(bare)
+        whole = float(np.linalg.norm((aim - bare)[both])) / scale
+        rest, is_free, has_ended = near.rest(aim, both)
+        left = float(np.linalg.norm(rest)) / scale
+        nothing = left**2 < SAME and left < RELATIVE * whole
+        if whole > 0 and is_free and has_ended and not nothing:
+            return False
+    return True
 
 
 def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:

@@ -67,6 +67,7 @@ def test_what_is_wrong_is_said_with_its_file_and_row():
         Trials.from_csv("runs")
     (one,) = [str(note.message) for note in noted]
     assert "1 of 2 cells of column x_height[m] in runs/b.csv hold no number" in one
+    assert noted[0].filename == __file__
 
 
 def test_recordings_with_other_columns_or_the_same_numbers_are_refused():

@@ -91,8 +91,9 @@ def test_a_frame_is_read_as_its_file():
     assert same.x.nan_to_num(0).equal(trials.x.nan_to_num(0))
     assert same.action_labels == trials.action_labels
     frame.loc[1, "x_height[m]"] = np.nan
-    with pytest.warns(UserWarning, match=r"1 of 5 cells .* row 2 \(trial a\)"):
+    with pytest.warns(UserWarning, match=r"1 of 5 cells .* row 2 \(trial a\)") as noted:
         lost = Trials.from_dataframe(frame)
+    assert noted[0].filename == __file__
     assert lost.mask[0].tolist() == [True, False, False]
 
 

@@ -194,6 +194,16 @@ def test_tables_stand_in_columns():
     assert max(map(len, lines)) <= 88
 
 
+def test_a_deviation_of_phi_needs_draws_behind_it():
+    every = tracing().estimates
+    few = [replace(e, effective_sample_size=49.0) for e in every]
+    text = flat(report(tracing=replace(tracing(), estimates=(*few,))))
+    assert "0.123 +- 0.011 1/m" in flat(report())
+    assert "0.123 +- 0.011 1/m" not in text
+    assert "about 0.12 1/m" in text
+    assert "below 50 too few for a deviation of phi" in text
+
+
 def test_leaving_one_out_stands_beside_the_evidence():
     text = flat(report())
     assert "bare model -157.2 0.20 none with drag 18.8 0.20 none" in text

@@ -1,0 +1,19 @@
+"""Who called the package: warnings point at the user's line, from however deep."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+PACKAGE = f"{Path(__file__).parent}/"
+
+
+def stack_level() -> int:
+    """Return the ``stacklevel`` of a warning that points out of the package.
+
+    Call it where the warning is given.
+    """
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
+        frame, level = frame.f_back, level + 1
+    return level

@@ -1,0 +1,273 @@
+r"""Nuisances of each trial, centered on what its first samples show.
+
+A polynomial in time is fitted to the first samples of each trial by least squares. Its
+value and derivatives at the start are the center of the nuisance, and its deviation is
+a few of their standard errors, which are those of the sensor:
+
+.. math::
+    \hat\beta = (A^\top A)^{-1} A^\top x, \qquad
+    s_j = w\, \sigma\, j! \sqrt{\bigl[(A^\top A)^{-1}\bigr]_{jj}}, \qquad
+    A_{ij} = (t_i - t_0)^j .
+
+The factor w, three unless told, leaves room for what a polynomial misses. The samples
+are fitted as well: at w = 3 they count 1 + 1/9 times at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import factorial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Independent, Normal
+
+from sbi_active.criticism.data.arrays import repeated
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.effect import Context, Effect
+
+Array = NDArray[Any]
+
+#: Standard errors in a deviation of the nuisance.
+WIDTH = 3.0
+
+
+def start_from_first_samples(
+    trials: Trials,
+    start: Mapping[str, int | tuple[int, int]],
+    *,
+    within: float,
+    sd: float | Sequence[float],
+    at: float | None = None,
+    width: float = WIDTH,
+    name: str = "start",
+) -> tuple[Trials, Effect]:
+    """Return the trials with a start state, and the nuisance of each trial about it.
+
+    The simulator takes the start state as its keyword ``start``, {name: (n,)}, as it
+    does one that was measured.
+
+    Args:
+        trials: With sample times. Held-out trials start from their own first samples.
+        start: By name, an entry of x's last axis, or this and the order of the
+            derivative: {"angle": 0, "speed": (0, 1)}. The polynomial has the largest
+            of these orders, and at least one.
+        within: Time from its first sample in which a trial's motion is such a
+            polynomial, in the unit of the sample times.
+        sd: Standard deviation of the sensor, one for all entries of x or one each.
+        at: Time at which the simulator starts; None for each trial's first sample.
+        width: Standard errors in a deviation of the nuisance.
+        name: Of the nuisance.
+
+    Returns:
+        A copy of the trials with ``start``, beside what was measured of it, and an
+        effect of scope "trial" with an entry of phi for each name.
+
+    Raises:
+        ValueError: If there are no sample times, an entry of x is not there, a
+            deviation is not positive, or a trial has too few first samples.
+
+    Example:
+        >>> times = torch.linspace(0, 1, 11)
+        >>> trials = Trials([1.0, 2.0], torch.stack([3 + times, 4 - times]),
+        ...     sample_times=times)
+        >>> trials, nuisance = start_from_first_samples(
+        ...     trials, {"place": 0, "speed": (0, 1)}, within=0.35, sd=0.01)
+        >>> [round(v, 3) for v in trials.start["speed"].tolist()]
+        [1.0, -1.0]
+        >>> nuisance.scope, nuisance.phi_dim
+        ('trial', 2)
+    """
+    wanted = {
+        key: (value, 0) if isinstance(value, int) else value
+        for key, value in start.items()
+    }
+    degree = max([1, *[order for _, order in wanted.values()]])
+    channels = [channel for channel, _ in wanted.values()]
+    sds = _deviations(trials, sd, channels)
+    found: dict[str, list[float]] = {key: [] for key in wanted}
+    errors: dict[str, list[float]] = {key: [] for key in wanted}
+    for i in range(len(trials)):
+        for (key, (channel, order)), own in zip(wanted.items(), sds, strict=True):
+            t, x = _first(trials, i, channel, within, degree)
+            value, error = _polynomial(t - (t[0] if at is None else at), x, degree)
+            found[key].append(factorial(order) * value[order])
+            errors[key].append(factorial(order) * own * error[order])
+    if trials.start is not None and not isinstance(trials.start, dict):
+        raise ValueError(
+            "expected measured start states by name; got an array; pass "
+            "Trials(start={name: ...}), whose names the simulator tells apart"
+        )
+    copy = trials.select(slice(None))
+    shown = {key: torch.tensor(v, dtype=torch.float64) for key, v in found.items()}
+    copy.start = {**(trials.start or {}), **shown}
+    copy.repeat_of = repeated(copy.settings())
+    deviations = [width * max(errors[key]) for key in wanted]
+    nuisance = Effect(
+        name,
+        hook="dynamics",
+        prior=_about_zero(deviations),
+        null=0.0,
+        apply=_Shifted((*wanted,)),
+        scope="trial",
+    )
+    return copy, nuisance
+
+
+def zero_from_first_samples(
+    trials: Trials,
+    *,
+    within: float,
+    sd: float | Sequence[float],
+    channels: Sequence[int] = (0,),
+    width: float = WIDTH,
+    name: str = "zero",
+) -> tuple[Trials, Effect]:
+    """Return the trials less the mean of their first samples, and what is left of it.
+
+    For a sensor whose zero is another one in each trial and shows before anything
+    moves, as that of a load cell.
+
+    Args:
+        trials: With sample times.
+        within: Time from its first sample in which a trial is at rest, in the unit of
+            the sample times.
+        sd: Standard deviation of the sensor, one for all entries of x or one each.
+        channels: Entries of x's last axis that have such a zero.
+        width: Standard errors in a deviation of the nuisance.
+        name: Of the nuisance.
+
+    Returns:
+        A copy of the trials with other x, and an effect of scope "trial" with an entry
+        of phi for each channel.
+
+    Raises:
+        ValueError: As :func:`start_from_first_samples`.
+
+    Example:
+        >>> force = torch.tensor([[125.0, 125.0, 131.0], [90.0, 90.0, 97.0]])
+        >>> trials = Trials([1.0, 2.0], force, sample_times=[0.0, 0.1, 0.2])
+        >>> trials, nuisance = zero_from_first_samples(trials, within=0.15, sd=1.0)
+        >>> trials.x.tolist()
+        [[0.0, 0.0, 6.0], [0.0, 0.0, 7.0]]
+    """
+    copy, deviations = trials.select(slice(None)), []
+    sds = _deviations(trials, sd, channels)
+    copy.x = trials.x.clone()
+    for channel, own in zip(channels, sds, strict=True):
+        errors = []
+        for i in range(len(trials)):
+            t, x = _first(trials, i, channel, within, 0)
+            (value,), (error,) = _polynomial(t, x, 0)
+            errors.append(own * error)
+            whole = copy.x[i] if copy.x.ndim == 2 else copy.x[i, :, channel]
+            whole -= value
+        deviations.append(width * max(errors))
+    nuisance = Effect(
+        name,
+        hook="observation",
+        prior=_about_zero(deviations),
+        null=0.0,
+        apply=_Offset((*channels,)),
+        scope="trial",
+    )
+    return copy, nuisance
+
+
+@dataclass(frozen=True)
+class _Shifted:
+    """Adds phi to the start state that the simulator is told."""
+
+    names: tuple[str, ...]
+
+    def __call__(
+        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
+    ) -> dict[str, Any]:
+        start = value.get("start")
+        if start is None:  # the simulator starts where it will
+            return value
+        own = dict(zip(self.names, phi.unbind(-1), strict=True))
+        return {**value, "start": {k: v + own.get(k, 0) for k, v in start.items()}}
+
+
+@dataclass(frozen=True)
+class _Offset:
+    """Adds phi to some entries of x."""
+
+    channels: tuple[int, ...]
+
+    def __call__(
+        self, value: Tensor, phi: Tensor, action: Tensor, context: Context
+    ) -> Tensor:
+        if value.ndim == 2:
+            return value + phi
+        offset = torch.zeros_like(value)
+        offset[..., list(self.channels)] = phi.to(value.dtype)[:, None]
+        return value + offset
+
+
+def _about_zero(deviations: Sequence[float]) -> Independent:
+    scale = torch.tensor(deviations, dtype=torch.float64)
+    return Independent(Normal(torch.zeros_like(scale), scale), 1)
+
+
+def _deviations(
+    trials: Trials, sd: float | Sequence[float], channels: Sequence[int]
+) -> list[float]:
+    """Return the sensor's deviation at each of some entries of x, or raise."""
+    if trials.sample_times is None:
+        raise ValueError(
+            "expected trials with sample times, which say what is first; got none; "
+            "pass Trials(sample_times=...)"
+        )
+    if trials.x.ndim > 3:
+        raise ValueError(
+            "expected x of shape (n, k) or (n, k, channels); got "
+            f"{tuple(trials.x.shape)}; bring what a sample has onto one axis"
+        )
+    num = 1 if trials.x.ndim == 2 else trials.x.shape[-1]
+    wrong = [c for c in channels if not 0 <= c < num]
+    if wrong:
+        raise ValueError(
+            f"expected entries of x's last axis from 0 to {num - 1}; got {wrong[0]}; "
+            "number them from 0"
+        )
+    every = np.broadcast_to(np.asarray(sd, dtype=float), (num,))
+    if not (every > 0).all():
+        raise ValueError(
+            f"expected a standard deviation > 0 of the sensor; got {sd}; pass its error"
+        )
+    return [float(every[c]) for c in channels]
+
+
+def _first(
+    trials: Trials, i: int, channel: int, within: float, degree: int
+) -> tuple[Array, Array]:
+    """Return times and values of a trial's first samples, or raise if they are few."""
+    times = trials.sample_times
+    assert times is not None
+    t = (times if times.ndim == 1 else times[i]).double().numpy()
+    x = trials.x[i].double().numpy()
+    x = x if x.ndim == 1 else x[:, channel]
+    seen = np.isfinite(t) & np.isfinite(x)
+    t, x = t[seen], x[seen]
+    kept = t - t[:1] < within
+    if kept.sum() < degree + 1:
+        raise ValueError(
+            f"expected {degree + 1} or more samples within {within:g} of the first; "
+            f"got {int(kept.sum())} in {trials.called([i])}; pass a larger within"
+        )
+    return t[kept], x[kept]
+
+
+def _polynomial(t: Array, x: Array, degree: int) -> tuple[Array, Array]:
+    """Return coefficients by least squares, and their errors for a unit error of x."""
+    scale = max(float(np.abs(t).max()), 1e-300)
+    powers = scale ** np.arange(degree + 1.0)
+    a = np.vander(t / scale, degree + 1, increasing=True)
+    inverse = np.linalg.inv(a.T @ a)
+    return inverse @ a.T @ x / powers, np.sqrt(np.diag(inverse)) / powers

@@ -1,0 +1,134 @@
+r"""What the residual follows where every model misses and no declared effect helps.
+
+Each guess adds :math:`c\, g(v)` to the bare model's output, with g one elementary
+function of an entry of the action, an input, the output, its slope, or the time in the
+trial. It is printed if it removes a quarter of the excess error on left-out trials, and
+lowers the error on a new one with a probability of .9 beside all that were tried. No
+trial is simulated for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sbi_active.criticism.misfit.left_out import leave_out
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.misfit.rule import BETTER, predicts_better
+from sbi_active.criticism.misfit.search import Search
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.formulas import MARGIN, SAME, TERMS
+
+Array = NDArray[Any]
+
+#: Share of the excess error on left-out parts that a guess may leave.
+REMAINS = 0.75
+
+
+def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
+    """Return formulas that the bare model's residual follows, best first.
+
+    Args:
+        search: The models, with the bare one.
+
+    Returns:
+        Formulas and their log evidence above that of the bare model with its process,
+        nats; empty where there is none.
+    """
+    bare = search.found[ModelKey()]
+    terms = [*_terms(search)]
+    least = 1 - (1 - BETTER) / max(len(terms), 1)
+    excess = max(bare.left.mean_square - 1, 1e-2)
+    found = []
+    for name, term in terms:
+        model = _with_term(bare.model, term / search.unit)
+        left = leave_out(model, search.errors)
+        if predicts_better(left.square, bare.left.square) < least:
+            continue
+        remains = (left.mean_square - 1) / excess
+        posterior = search.errors.posterior(model, search.errors.grams(model.rows))
+        gain = posterior.log_process - bare.posterior.log_process
+        if remains <= REMAINS and gain > MARGIN:
+            found.append((name, float(gain)))
+    return (*sorted(found, key=lambda each: -each[1]),)
+
+
+def _with_term(model: LinearModel, term: Array) -> LinearModel:
+    """Return a model with one more coefficient, as large as its residual may be."""
+    size = float(np.sqrt(np.mean(term**2)))
+
+    def more(values: Array, value: float) -> Array:
+        return np.append(values, value)
+
+    return replace(
+        model,
+        key=ModelKey(("formula",)),
+        u=more(model.u, 0.0),
+        jacobian=np.concatenate([model.jacobian, -term[:, None]], 1),
+        center=more(model.center, 0.0),
+        sd=more(model.sd, max(model.rms, 1.0) / size),
+        scaled=np.append(model.scaled, True),
+        low=more(model.low, -np.inf),
+        high=more(model.high, np.inf),
+        trial_of=np.append(model.trial_of, -1),
+    )
+
+
+def _terms(search: Search) -> Iterator[tuple[str, Array]]:
+    """Yield formulas with their values, shape (N,), the simpler of two that are one."""
+    m = search.rivals.measurements
+    predicted = m.x - search.found[ModelKey()].model.residual * search.unit
+    several = int(m.channel.max()) > 0
+    labels = search.rivals.trials.channel_labels or ()
+    seen: list[Array] = []
+    for channel in range(int(m.channel.max()) + 1):
+        own = m.channel == channel
+        where = ""
+        if several:
+            where = labels[channel] if channel < len(labels) else f"channel {channel}"
+            where = f" in {where.partition(' [')[0]}"
+        for name, value in _variables(search, predicted, own):
+            for pattern, g in TERMS.items():
+                term = np.where(own, g(torch.from_numpy(value)).numpy(), 0.0)
+                size = float(np.linalg.norm(term))
+                if not np.isfinite(size) or size < 1e-9 * np.sqrt(len(term)):
+                    continue
+                if any(abs(other @ term) / size > 1 - SAME for other in seen):
+                    continue
+                seen.append(term / size)
+                yield pattern.format(name) + where, term
+
+
+def _variables(
+    search: Search, predicted: Array, own: NDArray[np.bool_]
+) -> Iterator[tuple[str, Array]]:
+    """Yield what a residual of one channel may follow, shape (N,)."""
+    trials, m = search.rivals.trials, search.rivals.measurements
+    action = trials.action.double().numpy()
+    if not trials.action_is_label:
+        names = ["xi"]
+        if action.shape[1] > 1:
+            names = [f"xi_{i + 1}" for i in range(action.shape[1])]
+        for j, name in enumerate(names):
+            yield name, action[m.trial, j]
+    yield "x", predicted
+    slope, since = np.zeros(len(m)), np.zeros(len(m))
+    for trial in np.unique(m.trial):
+        at = np.flatnonzero((m.trial == trial) & own)
+        if len(at) > 1:
+            slope[at] = np.gradient(predicted[at], m.time[at])
+            since[at] = m.time[at] - m.time[at].min()
+    yield "x'", slope
+    yield "t", since
+    if trials.inputs is None or trials.input_times is None:
+        return
+    grid = trials.input_times.double().numpy()
+    place = np.searchsorted(grid, m.time + 1e-9 * np.ptp(grid), side="right") - 1
+    for name, series in trials.inputs.items():
+        values = series.double().numpy()
+        yield name, values[m.trial, np.clip(place, 0, len(grid) - 1)]
