@@ -23,15 +23,13 @@ from sbi_active.criticism.misfit.search import Candidate, Search, parts
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.tracing import log_priors
+from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
 #: Trials with the largest error, each of which alone may be what no model fits.
 NUM_SUSPECTS = 3
-#: Factors on the scale of the effects' priors under which a verdict should stand.
-RESCALED = (1 / 3, 3.0)
 
 
 @dataclass

@@ -38,7 +38,7 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-PROBABILITY_OF_NONE = 0.5
+PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
 #: That what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set

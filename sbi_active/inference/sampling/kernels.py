@@ -20,11 +20,11 @@ from sbi_active.inference.sampling.student_mixture import (
 
 Array = NDArray[Any]
 
-NUM_KERNELS = 120
+NUM_KERNELS = 120  # a choice: the density of a draw costs one term each
 NEIGHBORS = 0.1  # share of the draws that shape one kernel
 WIDTH = 1.2  # of a kernel, in deviations of its neighbors
-SHARE_OF_BASE = 0.05
-BLOCK = 2_000
+SHARE_OF_BASE = 0.05  # a choice: weights are then below 20 times target over base
+BLOCK = 2_000  # draws at once, which bounds the memory
 
 
 class KernelMixture(StudentMixture):
