@@ -28,7 +28,6 @@ if TYPE_CHECKING:
         RefinementOptions,
         SeqBED,
         SeqBED_B,
-        SeqBED_C,
     )
     from sbi_active.simulation import (
         AutocorrelatedNoise,
@@ -60,7 +59,6 @@ __all__ = [
     "RefinementOptions",
     "SeqBED",
     "SeqBED_B",
-    "SeqBED_C",
     "SimulatorModel",
     "StopRules",
     "StudentTNoise",
@@ -76,8 +74,7 @@ _HOMES = {
     "criticism": "",
     "design": "InformationGainDesigner RandomDesigner",
     "export": "to_inference_data",
-    "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B "
-    "SeqBED_C",
+    "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B",
     "information_gain": "",
     "search": "",
     "simulation": "AutocorrelatedNoise Bank GaussianNoise SimulatorModel StudentTNoise "
@@ -96,6 +93,7 @@ _former = former_names(
         "ActiveInference": "sbi_active.inference:ActiveInference",
         "Design": "sbi_active.design:Design",
         "Refinement": "sbi_active:RefinementOptions",
+        "SeqBED_C": "sbi_active:SeqBED",
         "Simulations": "sbi_active.simulation:Simulations",
         "Trial": "sbi_active.campaign:Trial",
         "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",

@@ -26,7 +26,7 @@ import torch
 from scipy.special import ndtri
 from torch import Tensor
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: SplitMix64
 
 
 def derive_seed(seed: int, *key: int | str) -> int:

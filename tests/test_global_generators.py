@@ -22,7 +22,7 @@ from sbi_active import (
 )
 from sbi_active.actions import BoxActions, MixedActions
 from sbi_active.criticism import Trials, close_loop
-from sbi_active.inference import Observation, SeqBED_C, refine
+from sbi_active.inference import Observation, refine
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import check_simulator, estimate_noise
 from tests.campaign.test_corrections import OPTIONS, RATIOS
@@ -103,9 +103,9 @@ def trained(trainer):
     return trainer.append_simulations(THETA, X, action=ACTION, belief=PRIOR)
 
 
-@pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED_C])
+@pytest.mark.parametrize("make", [ASBI, ALHI, SeqBED])
 def test_a_trainer_after_training(kept, make):
-    network = RATIOS if make is SeqBED_C else OPTIONS.density_estimator
+    network = RATIOS if make is SeqBED else OPTIONS.density_estimator
     trainer = trained(make(PRIOR, network, show_progress_bars=False))
     trainer.train()
     model = kept("build_posterior", trainer.build_posterior)

@@ -46,7 +46,7 @@ from sbi_active import (
     InformationGainDesigner,
     MixtureDensity,
     RefinementOptions,
-    SeqBED_C,
+    SeqBED,
     SimulatorModel,
     simulate,
 )
@@ -117,8 +117,8 @@ def gain(estimator: str) -> list[Any]:
     trainers = {
         "likelihood": lambda: ALHI(BOX, network, show_progress_bars=False),
         "contrastive": lambda: ALHI(BOX, network, show_progress_bars=False),
-        "ratio": lambda: SeqBED_C(BOX, show_progress_bars=False),
-        "info_nce": lambda: SeqBED_C(BOX, show_progress_bars=False),
+        "ratio": lambda: SeqBED(BOX, show_progress_bars=False),
+        "info_nce": lambda: SeqBED(BOX, show_progress_bars=False),
     }
     model = None
     if estimator not in ("entropy", "nested"):

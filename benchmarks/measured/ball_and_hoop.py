@@ -25,7 +25,6 @@ of friction alone.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,19 +36,12 @@ from benchmarks.measured.hoop_least_squares import fit_hoop, free_run, run_piece
 from benchmarks.measured.record_stages import (
     Bench,
     as_row,
-    run_stages,
-    table,
+    run_command,
     with_error,
 )
 from sbi_active.criticism import Trials
-from sbi_active.tasks.ball_and_hoop import (  # pyright: ignore
-    DATA,
-    make_effects,
-    make_prior,
-    make_simulator,
-    read_recordings,
-    split,
-)
+from sbi_active.tasks import ball_and_hoop  # pyright: ignore
+from sbi_active.tasks.ball_and_hoop import split  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop.model import SENSOR_SD  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop.recordings import (  # pyright: ignore
     EVERY,
@@ -107,11 +99,8 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         made = Record("replay", fitted.step, fitted.voltage[: FITTED + 1], output)
         return cut(made, LENGTH, every=every).trials(LABELS, CHANNEL)
 
-    return Bench(
-        model=make_simulator(),
-        prior=make_prior(),
-        effects=make_effects(),
-        nuisances=[],
+    return Bench.of(
+        ball_and_hoop,
         trials=pieces.trials(LABELS, CHANNEL),
         removals=REMOVALS,
         given=GIVEN,
@@ -123,30 +112,7 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the stages that are missing from the results, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--every", type=int, default=EVERY, help="readings kept")
-    parser.add_argument("--clean", type=int, default=10, help="clean sets")
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--reports", type=Path, help="folder for whole reports")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
-    try:
-        records = read_recordings(arguments.data)
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
-    rows = run_stages(
-        make_bench(records, every=arguments.every),
-        arguments.out,
-        clean=arguments.clean,
-        seed=arguments.seed,
-        reports=arguments.reports,
-    )
-    print(table(rows, "V"))
-    return 0
+    return run_command(argv, __doc__, ball_and_hoop, make_bench, RESULT)
 
 
 if __name__ == "__main__":

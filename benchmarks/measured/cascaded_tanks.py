@@ -13,7 +13,6 @@ squares fits the same pieces, and beside them the first record as a whole.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,8 +23,7 @@ import torch
 from benchmarks.measured.record_stages import (
     Bench,
     as_row,
-    run_stages,
-    table,
+    run_command,
     with_error,
 )
 from benchmarks.measured.tanks_least_squares import (
@@ -35,14 +33,8 @@ from benchmarks.measured.tanks_least_squares import (
     score,
 )
 from sbi_active.criticism import Trials
-from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
-    DATA,
-    make_effects,
-    make_prior,
-    make_simulator,
-    read_recordings,
-    split,
-)
+from sbi_active.tasks import cascaded_tanks  # pyright: ignore
+from sbi_active.tasks.cascaded_tanks import split  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks.model import SENSOR_SD  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks.recordings import (  # pyright: ignore
     EVERY,
@@ -101,11 +93,8 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         pieces = cut(made, LENGTH, every=every, slope=SLOPE, lead=LEAD)
         return pieces.trials(LABELS, CHANNEL)
 
-    return Bench(
-        model=make_simulator(),
-        prior=make_prior(),
-        effects=make_effects(),
-        nuisances=[],
+    return Bench.of(
+        cascaded_tanks,
         trials=pieces.trials(LABELS, CHANNEL),
         removals=REMOVALS,
         given=GIVEN,
@@ -117,30 +106,7 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the stages that are missing from the results, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--every", type=int, default=EVERY, help="readings kept")
-    parser.add_argument("--clean", type=int, default=10, help="clean sets")
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--reports", type=Path, help="folder for whole reports")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
-    try:
-        records = read_recordings(arguments.data)
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
-    rows = run_stages(
-        make_bench(records, every=arguments.every),
-        arguments.out,
-        clean=arguments.clean,
-        seed=arguments.seed,
-        reports=arguments.reports,
-    )
-    print(table(rows, "V"))
-    return 0
+    return run_command(argv, __doc__, cascaded_tanks, make_bench, RESULT)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +12,9 @@ from benchmarks.measured.record_least_squares import (
     Fit,
     effect_bounds,
     fit_record,
+    run_rows,
 )
-from sbi_active.criticism import Context, Effect
+from sbi_active.criticism import Effect
 from sbi_active.tasks.ball_and_hoop import make_effects, spin  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop.model import DAMPING, DRIVE  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop.recordings import (  # pyright: ignore
@@ -39,16 +39,7 @@ def run_pieces(
         pieces: t of them.
         effects: Whose strengths they are, all of them keyword arguments.
     """
-    sizes = [3, *[effect.phi_dim for effect in effects]]
-    each = parameters.double().repeat_interleave(len(pieces), 0)
-    theta, *strengths = each.split(sizes, 1)
-    rows = pieces.rows(len(parameters))
-    context = Context(torch.arange(len(each)).double())
-    keywords: dict[str, Any] = {}
-    for effect, phi in zip(effects, strengths, strict=True):
-        keywords = effect.apply(keywords, phi, rows["action"], context)
-    x = spin(theta, **rows, **keywords)
-    return x.reshape(len(parameters), len(pieces), -1)
+    return run_rows(spin, parameters, pieces, effects, 3)
 
 
 def free_run(

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from torch import Tensor
 from torch.distributions import HalfNormal, Uniform
 
-from sbi_active.criticism import Effect
+from benchmarks.measured.box_search import Search
+from sbi_active.criticism import Context, Effect
+from sbi_active.tasks.records import Pieces  # pyright: ignore
 
-__all__ = ["Fit", "effect_bounds", "fit_record"]
+__all__ = ["Fit", "effect_bounds", "fit_record", "run_rows"]
 
 Array = NDArray[np.float64]
 
-DRAWS, STARTS, EVALUATIONS = 200, 6, 60
-DIFFERENCE = 1e-6  # of a parameter's range
+SEARCH = Search(draws=200, starts=6, evaluations=60, difference=1e-6)
 LARGEST = 3.0  # strengths of effects, in deviations of their priors
 LOST = 1e3  # reading in place of one that is not finite
 
@@ -36,6 +36,36 @@ class Fit:
 
     parameters: Array
     rmse: float
+
+
+def run_rows(
+    simulate: Callable[..., Tensor],
+    parameters: Tensor,
+    pieces: Pieces,
+    effects: Sequence[Effect],
+    dim: int,
+    **starts: Tensor,
+) -> Tensor:
+    """Return predictions of pieces, shape (n, t, k).
+
+    Args:
+        simulate: The simulator.
+        parameters: Theta and strengths, shape (n, dim + d), float64.
+        pieces: t of them.
+        effects: Whose strengths they are, all of them keyword arguments.
+        dim: Of theta.
+        starts: Further keyword arguments, shape (n t,).
+    """
+    sizes = [dim, *[effect.phi_dim for effect in effects]]
+    each = parameters.double().repeat_interleave(len(pieces), 0)
+    theta, *strengths = each.split(sizes, 1)
+    rows = pieces.rows(len(parameters))
+    context = Context(torch.arange(len(each)).double())
+    keywords: dict[str, Any] = {}
+    for effect, phi in zip(effects, strengths, strict=True):
+        keywords = effect.apply(keywords, phi, rows["action"], context)
+    x = simulate(theta, **rows, **starts, **keywords)
+    return x.reshape(len(parameters), len(pieces), -1)
 
 
 def effect_bounds(effects: Sequence[Effect]) -> tuple[list[float], list[float]]:
@@ -83,25 +113,5 @@ def fit_record(
         x = predict(torch.from_numpy(least + z * width))
         return (x - target).nan_to_num(LOST, LOST, -LOST).numpy()
 
-    def value(z: Array) -> Array:
-        return residual(z[None])[0]
-
-    def jacobian(z: Array) -> Array:
-        step = np.where(z + DIFFERENCE > 1, -DIFFERENCE, DIFFERENCE)
-        every = residual(np.concatenate([z[None], z + np.diag(step)]))
-        return ((every[1:] - every[0]) / step[:, None]).T
-
-    z = np.random.default_rng(seed).uniform(size=(DRAWS, len(least)))
-    cost = (residual(z) ** 2).sum(1)
-    found = [
-        least_squares(
-            value,
-            start,
-            jacobian,  # type: ignore[arg-type]  # SciPy's stub has the string alone
-            bounds=(0, 1),
-            max_nfev=EVALUATIONS,
-        )
-        for start in z[np.argsort(cost)[:STARTS]]
-    ]
-    best = min(found, key=lambda f: f.cost)
-    return Fit(least + best.x * width, float(np.sqrt(2 * best.cost / len(target))))
+    best, cost = SEARCH.best(residual, len(least), seed)
+    return Fit(least + best * width, float(np.sqrt(2 * cost / len(target))))

@@ -9,7 +9,9 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,7 +28,7 @@ from benchmarks.measured.record_verdicts import read_report
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 
-__all__ = ["Bench", "run_stages", "table"]
+__all__ = ["Bench", "run_command", "run_stages", "table"]
 
 Errors = dict[str, float]
 
@@ -39,7 +41,6 @@ class Bench:
         model: The bare simulator.
         prior: Of theta.
         effects: The declared library.
-        nuisances: Declared besides.
         trials: To fit.
         removals: Sets of effects to remove from the library, one stage each.
         given: Sets of effects that least squares is given in any case, each in the
@@ -47,18 +48,81 @@ class Bench:
         score: Theta and strengths (n, d), and effects, to errors by held-out record.
         least_squares: Names of effects to a fit's row.
         replay: Seed to trials that the bare model makes.
+        nuisances: Declared besides.
     """
 
     model: SimulatorModel
     prior: Any
     effects: Sequence[Effect]
-    nuisances: Sequence[Effect]
     trials: Trials
     removals: Sequence[tuple[str, ...]]
     given: Sequence[tuple[str, ...]]
     score: Callable[[Tensor, Sequence[Effect]], Errors]
     least_squares: Callable[[tuple[str, ...]], dict[str, Any]]
     replay: Callable[[int], Trials]
+    nuisances: Sequence[Effect] = ()
+
+    @classmethod
+    def of(cls, task: Any, **parts: Any) -> Bench:
+        """Return the bench of a task.
+
+        Args:
+            task: A package with ``make_simulator``, ``make_prior`` and
+                ``make_effects``.
+            parts: All that the task does not say.
+        """
+        return cls(
+            model=task.make_simulator(),
+            prior=task.make_prior(),
+            effects=task.make_effects(),
+            **parts,
+        )
+
+
+def run_command(
+    argv: Sequence[str] | None,
+    text: str | None,
+    task: Any,
+    make_bench: Callable[..., Bench],
+    out: Path,
+) -> int:
+    """Run the stages that are missing from a file of results, and print the tables.
+
+    Args:
+        argv: The command line; None is the process's own.
+        text: That ``--help`` shows.
+        task: A package with records.
+        make_bench: ``make_bench(records, every=)``.
+        out: The file, unless one is given.
+
+    Returns:
+        The process's exit status.
+    """
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=task.DATA)
+    every = task.recordings.EVERY
+    parser.add_argument("--every", type=int, default=every, help="readings kept")
+    parser.add_argument("--clean", type=int, default=10, help="clean sets")
+    parser.add_argument("--out", type=Path, default=out)
+    parser.add_argument("--reports", type=Path, help="folder for whole reports")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args(argv)
+    try:
+        records = task.read_recordings(arguments.data)
+    except FileNotFoundError as error:
+        print(f"{error}, as in --data DIR", file=sys.stderr)
+        return 2
+    rows = run_stages(
+        make_bench(records, every=arguments.every),
+        arguments.out,
+        clean=arguments.clean,
+        seed=arguments.seed,
+        reports=arguments.reports,
+    )
+    print(table(rows, "V"))
+    return 0
 
 
 def run_stages(

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
+from benchmarks.measured.box_search import Search
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.model import (  # pyright: ignore
     PRIOR_HIGH,
@@ -28,8 +28,7 @@ FRICTIONS = {
     "torque-dependent": ("torque", 1.0),
     "viscous": ("viscous", 0.1),
 }
-DRAWS, STARTS, EVALUATIONS = 200, 4, 30
-DIFFERENCE = 1e-5  # of a parameter's range
+SEARCH = Search(draws=200, starts=4, evaluations=30, difference=1e-5)
 
 
 @dataclass(frozen=True)
@@ -86,26 +85,8 @@ def fit(
         )
         return r.angle[[*rows]] - x.reshape(len(z), len(rows), -1)
 
-    def value(z: Array) -> Array:
-        return residual(z[None], trials).ravel()
+    def flat(z: Array) -> Array:
+        return residual(z, trials).reshape(len(z), -1)
 
-    def jacobian(z: Array) -> Array:
-        step = np.where(z + DIFFERENCE > 1, -DIFFERENCE, DIFFERENCE)
-        every = residual(np.concatenate([z[None], z + np.diag(step)]), trials)
-        flat = every.reshape(len(z) + 1, -1)
-        return ((flat[1:] - flat[0]) / step[:, None]).T
-
-    z = np.random.default_rng(seed).uniform(size=(DRAWS, len(low)))
-    cost = (residual(z, trials) ** 2).sum((1, 2))
-    found = [
-        least_squares(
-            value,
-            start,
-            jacobian,  # type: ignore[arg-type]  # SciPy's stub has the string alone
-            bounds=(0, 1),
-            max_nfev=EVALUATIONS,
-        )
-        for start in z[np.argsort(cost)[:STARTS]]
-    ]
-    best = min(found, key=lambda f: f.cost).x
-    return Fit(low + best * width, residual(best[None], range(num))[0])
+    z, _ = SEARCH.best(flat, len(low), seed)
+    return Fit(low + z * width, residual(z[None], range(num))[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,9 +12,10 @@ from benchmarks.measured.record_least_squares import (
     Fit,
     effect_bounds,
     fit_record,
+    run_rows,
 )
 from benchmarks.misfit.refit import least_squares
-from sbi_active.criticism import Context, Effect
+from sbi_active.criticism import Effect
 from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
     FOUND_ON,
     levels,
@@ -48,17 +48,9 @@ def run_pieces(
         pieces: t of them.
         effects: Whose strengths they are, all of them keyword arguments.
     """
-    sizes = [4, *[effect.phi_dim for effect in effects]]
-    each = parameters.double().repeat_interleave(len(pieces), 0)
-    theta, *strengths = each.split(sizes, 1)
-    rows = pieces.rows(len(parameters))
-    context = Context(torch.arange(len(each)).double())
-    keywords: dict[str, Any] = {}
-    for effect, phi in zip(effects, strengths, strict=True):
-        keywords = effect.apply(keywords, phi, rows["action"], context)
     upper, lower = starts.reshape(-1, 2).unbind(1)
-    x = levels(theta, **rows, upper_start=upper, lower_start=lower, **keywords)
-    return x.reshape(len(parameters), len(pieces), -1)
+    start = {"upper_start": upper, "lower_start": lower}
+    return run_rows(levels, parameters, pieces, effects, 4, **start)
 
 
 def score(

@@ -27,7 +27,7 @@ class CampaignOptions:
             half to choose and half to report.
         density_estimator: What is learned: as in :class:`.ASBI` and
             :class:`.ALHI`; for "seqbed" a classifier as in
-            :class:`.SeqBED_C`, or :class:`.LFIRE`.
+            :class:`.SeqBED`, or :class:`.LFIRE`.
         posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
             :class:`.ALHI`.
         bandwidth: Of kernels, where a belief has them.

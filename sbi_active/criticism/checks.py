@@ -29,7 +29,7 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.estimation import estimate_noise
 
-FEWEST_REPEATS = 3
+FEWEST_REPEATS = 3  # a choice: two degrees of freedom for the spread
 
 
 def with_noise(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 MOST_PANELS = 12  # of categories, those with the most information first
-MOST_BARS = 15
+MOST_BARS = 15  # a choice: labels of more run into each other
 FEWEST_FILLED = 12  # candidates from which the map is filled in between
 CHOSEN = "#c1432e"
 NOTES = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}

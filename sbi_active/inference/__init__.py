@@ -16,8 +16,8 @@ from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.alhi import ALHI
 from sbi_active.inference.trainers.asbi import ASBI
 from sbi_active.inference.trainers.base import ActiveInference
-from sbi_active.inference.trainers.ratio import SeqBED_B, SeqBED_C
-from sbi_active.inference.trainers.seqbed import SeqBED
+from sbi_active.inference.trainers.ratio import SeqBED, SeqBED_B
+from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 from sbi_active.renamed import former_names
 
 __all__ = [
@@ -34,7 +34,7 @@ __all__ = [
     "RefinementOptions",
     "SeqBED",
     "SeqBED_B",
-    "SeqBED_C",
+    "SeqBED_LFIRE",
     "refine",
 ]
 
@@ -48,6 +48,7 @@ __getattr__ = former_names(
         "MixtureDensityNetwork": "sbi_active.inference.networks:MixtureDensityNetwork",
         "RefinedBelief": "sbi_active.inference.refinement:LearnedBelief",
         "Refinement": "sbi_active:RefinementOptions",
+        "SeqBED_C": "sbi_active:SeqBED",
         "information_gained": "sbi_active.inference.beliefs:information_gained",
     },
 )

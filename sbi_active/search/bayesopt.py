@@ -18,9 +18,11 @@ from sbi_active.search.sequential import (
 )
 from sbi_active.seeding import derive_seed, forked_generators
 
+#: Choices: what one proposal costs. As in the gradient search, 64 points to start from
+#: and 50 steps.
 NUM_RESTARTS, RAW_SAMPLES, DRAWS, MAX_STEPS = 4, 64, 64, 50
 MOST_COMBINATIONS = 24  # of categories, each of which is optimized by itself
-APART_AT_LAST = 0.02
+APART_AT_LAST = 0.02  # in the unit cube, as in the gradient search
 
 
 class BayesianOptimization(SequentialSearch):

@@ -27,7 +27,7 @@ from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.simulator import outcome_tensor, require_noise
 from sbi_active.simulation.workers.engine import simulate
 
-MIN_ROWS = 16
+MIN_ROWS = 16  # a choice: of the first runs, which are timed
 RUNS = 6  # of all rows, beside one a parameter and one an entry of the action
 ROUNDING = 1e-5  # relative difference between batches that mixes no rows
 MANY = 0.5  # share of rows without a measurement that is worth a word

@@ -35,6 +35,7 @@ WHAT = {
     False: "changes x by less than a tenth of the noise in a prior deviation",
 }
 FEW = 3  # parameter sets that say anything about the others
+#: Choices: at most so many of the actions, and so many parameter sets at each of them.
 MAX_ACTIONS = 16
 MAX_THETA = 32
 MOST_NUMBERS = 8_000_000  # derivatives that are held in memory

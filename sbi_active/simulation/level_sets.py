@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 FEWEST_MOVED = 0.25  # prior deviations that places lie apart to be compared at all
 MOVES = (1.0, 0.6, 0.35, 0.2)  # sizes tried, in prior deviations
-NEWTON_STEPS = 30
+NEWTON_STEPS = 30  # a choice: Newton's method takes a handful where it converges
 
 
 def moved_along(

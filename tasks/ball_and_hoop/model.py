@@ -28,6 +28,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Normal, Uniform
 
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
+from sbi_active.tasks.bare import bare_simulator
 from sbi_active.tasks.product import Product
 from sbi_active.tasks.stepping import between, is_on, lagged, row
 
@@ -197,10 +198,5 @@ def make_noise() -> AutocorrelatedNoise:
 
 
 def make_simulator(**bound: Any) -> SimulatorModel:
-    """Return the bare simulator.
-
-    Args:
-        bound: Keyword arguments of :class:`SimulatorModel` in place of these.
-    """
-    options = {"noise": make_noise(), "parameter_names": PARAMETER_NAMES}
-    return SimulatorModel(spin, **{**options, **bound})
+    """Return the bare simulator, or with other arguments of :class:`SimulatorModel`."""
+    return bare_simulator(spin, PARAMETER_NAMES, make_noise(), bound)

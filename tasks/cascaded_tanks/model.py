@@ -40,6 +40,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
+from sbi_active.tasks.bare import bare_simulator
 from sbi_active.tasks.stepping import between, is_on, lagged, row
 
 __all__ = [
@@ -227,10 +228,5 @@ def make_noise() -> AutocorrelatedNoise:
 
 
 def make_simulator(**bound: Any) -> SimulatorModel:
-    """Return the bare simulator.
-
-    Args:
-        bound: Keyword arguments of :class:`SimulatorModel` in place of these.
-    """
-    options = {"noise": make_noise(), "parameter_names": PARAMETER_NAMES}
-    return SimulatorModel(levels, **{**options, **bound})
+    """Return the bare simulator, or with other arguments of :class:`SimulatorModel`."""
+    return bare_simulator(levels, PARAMETER_NAMES, make_noise(), bound)

@@ -14,6 +14,7 @@ from sbi_active import (
     MixtureDensity,
     SimulatorModel,
 )
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.1, 1.0, 3.0])
@@ -24,6 +25,7 @@ OPTIONS = CampaignOptions(
     density_estimator=MixtureDensity(
         hidden_features=(32,), num_components=2, num_iterations=400, learning_rate=3e-3
     ),
+    refinement=REFINEMENT,
 )
 
 

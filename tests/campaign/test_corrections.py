@@ -15,12 +15,12 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
-    RefinementOptions,
     SimulatorModel,
 )
 from sbi_active.campaign.checks import outlyingness
 from sbi_active.criticism import Effect
 from sbi_active.inference import RatioClassifier
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
@@ -30,7 +30,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=200,
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=RefinementOptions(num_histories=300, num_particles=1_000),
+    refinement=REFINEMENT,
 )
 RATIOS = RatioClassifier(hidden_features=(16,), num_iterations=50)
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6

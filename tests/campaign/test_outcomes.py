@@ -13,9 +13,9 @@ from sbi_active import (
     CampaignOptions,
     DiscreteActions,
     MixtureDensity,
-    RefinementOptions,
 )
 from sbi_active.seeding import row_normals
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.5, 1.0, 2.0])
@@ -24,7 +24,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=200,
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=150),
-    refinement=RefinementOptions(num_histories=400),
+    refinement=REFINEMENT,
 )
 
 
@@ -135,7 +135,7 @@ def test_a_faulty_simulator_completes_a_campaign(tmp_path):
         Faulty(tmp_path / "killed"),
         method="asbi",
         num_simulations=300,
-        refinement=RefinementOptions(num_histories=300),
+        refinement=REFINEMENT,
         num_workers=2,
         time_limit=0.05,
     )

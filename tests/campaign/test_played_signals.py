@@ -3,10 +3,17 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, GaussianNoise, SimulatorModel, simulate
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    GaussianNoise,
+    SimulatorModel,
+    simulate,
+)
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Criticism, Trials, generic_effects
+from tests.campaign.sizes import REFINEMENT
 
 GRID = torch.linspace(0, 1, 51)
 TIMES = torch.linspace(0.1, 1.0, 10)
@@ -20,6 +27,9 @@ SPACE = SignalActions(
 )
 PRIOR = BoxUniform(torch.tensor([1.0, 0.05]), torch.tensor([5.0, 0.5]))
 TRUTH = torch.tensor([[3.0, 0.2]])
+OPTIONS = CampaignOptions(
+    num_samples=200, num_scored=500, network="on demand", refinement=REFINEMENT
+)
 
 
 def speed(theta, action, *, inputs, times):
@@ -53,7 +63,7 @@ def motor(action, seed, *, dead=0.0):
 
 
 def test_a_campaign_asks_for_signals_and_learns():
-    campaign = Campaign(MODEL, PRIOR, SPACE, seed=0)
+    campaign = Campaign(MODEL, PRIOR, SPACE, options=OPTIONS, seed=0)
     for k in range(3):
         trial = campaign.ask()
         assert bool(SPACE.contains(trial.action))
@@ -73,7 +83,8 @@ def test_a_dead_zone_of_the_motor_is_found():
     names = {e.name for e in effects}
     assert {"input offset", "input lag", "sensor delay"} <= names
     assert not [e for e in effects if e.hook == "action"]
-    loop = Criticism(MODEL, PRIOR, Trials(action, x), effects=effects, actions=SPACE)
+    rivals = [e for e in effects if e.name in ("input offset", "input lag", "bias")]
+    loop = Criticism(MODEL, PRIOR, Trials(action, x), effects=rivals, actions=SPACE)
     # Of one sign, a dead zone is an offset while the voltage is on, and none else.
     assert loop.detect().alarm
     chosen = loop.next_action()

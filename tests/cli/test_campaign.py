@@ -2,10 +2,14 @@
 
 import json
 import sys
+from functools import partial
 
 import pytest
 
-from sbi_active.cli import main
+from sbi_active import CampaignOptions
+from sbi_active.cli import campaign as commands
+from sbi_active.cli import folder, main
+from tests.campaign.sizes import REFINEMENT
 
 SIMULATOR = """
 import torch
@@ -33,6 +37,8 @@ seed = 4
 def made(tmp_path, capsys, monkeypatch):
     monkeypatch.delitem(sys.modules, "sled", raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path])
+    small = partial(CampaignOptions, num_scored=500, refinement=REFINEMENT)
+    monkeypatch.setattr(commands, "CampaignOptions", small)
     (tmp_path / "sled.py").write_text(SIMULATOR)
     (tmp_path / "campaign.toml").write_text(CONFIG)
     assert main(["init", "camp", "--config", "campaign.toml"]) == 0
@@ -142,7 +148,16 @@ def test_exported(made, capsys, tmp_path):
     assert data["posterior"]["theta"].shape == (1, 2000, 2)
 
 
-def test_a_missing_effect_is_found_and_adopted(made, capsys):
+def test_a_missing_effect_is_found_and_adopted(made, capsys, monkeypatch):
+    usual = folder.generic_effects
+    kept = {"bias", "action gain", "sensor gain"}
+
+    def three(*arguments, **options):
+        effects = usual(*arguments, **options)
+        assert kept < {effect.name for effect in effects}
+        return [effect for effect in effects if effect.name in kept]
+
+    monkeypatch.setattr(folder, "generic_effects", three)
     for index, speed in enumerate((0.5, 1.0, 1.5, 2.0, 2.5, 3.0)):
         distance = speed**2 / (2 * 9.81 * 0.5) / (1 + 0.3 * speed)
         slip = 0.02 * (-1) ** index

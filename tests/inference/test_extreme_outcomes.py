@@ -15,7 +15,7 @@ from sbi_active import (
     SeqBED,
     SimulatorModel,
 )
-from sbi_active.inference import SeqBED_C, refine
+from sbi_active.inference import SeqBED_LFIRE, refine
 from sbi_active.inference.rounds import UnexplainedOutcomeError
 from sbi_active.inference.sampling import normalized
 from tests.campaign.test_corrections import OPTIONS, RATIOS
@@ -34,11 +34,11 @@ JUMPS = SimulatorModel(
 def trained(make):
     torch.manual_seed(0)
     theta, action = PRIOR.sample((300,)), torch.ones(300, 1)
-    if make is SeqBED:
-        trainer = SeqBED(PRIOR)
+    if make is SeqBED_LFIRE:
+        trainer = SeqBED_LFIRE(PRIOR)
         theta, action = trainer.arrange(theta, action)
     else:
-        network = RATIOS if make is SeqBED_C else OPTIONS.density_estimator
+        network = RATIOS if make is SeqBED else OPTIONS.density_estimator
         trainer = make(PRIOR, network, show_progress_bars=False)
     x = theta * action + 0.1 * torch.randn_like(theta)
     trainer.append_simulations(theta, x, action=action).train()
@@ -50,9 +50,12 @@ def trained(make):
 @pytest.mark.parametrize(
     ("make", "simulator"),
     [
-        *[(make, None) for make in (ASBI, ALHI, SeqBED_C, SeqBED)],
+        *[(make, None) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
         (ASBI, MODEL),
-        *[pytest.param(m, MODEL, marks=pytest.mark.slow) for m in (SeqBED_C, SeqBED)],
+        *[
+            pytest.param(m, MODEL, marks=pytest.mark.slow)
+            for m in (SeqBED, SeqBED_LFIRE)
+        ],
         pytest.param(ALHI, MODEL, marks=pytest.mark.slow),
     ],
 )

@@ -14,14 +14,25 @@ hold it, never turn it around:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchmarks.misfit.machines.machine import Form, Hidden
+from benchmarks.criticism.worlds.world import half_normal, normal
+from benchmarks.misfit.machines.machine import (
+    Form,
+    Hidden,
+    Machine,
+    sample_times,
+    sensor_effects,
+)
+from sbi_active.criticism import Effect
 
-__all__ = ["FORMS", "UNSEEN_FORMS", "integrate", "of_state", "read", "row"]
+__all__ = ["FORMS", "UNSEEN_FORMS", "Declared", "Joint", "read", "row"]
 
 #: Forces of position and speed in units of their typical sizes, for tuning seeds.
 FORMS = {
@@ -140,3 +151,150 @@ def read(
     v0, v1 = step * speed.gather(1, low), step * speed.gather(1, low + 1)
     rise = q1 - q0
     return q0 + w * (v0 + w * (3 * rise - 2 * v0 - v1 + w * (v0 + v1 - 2 * rise)))
+
+
+class Declared(NamedTuple):
+    """Strengths of the effects that all joints have, numbers or one a row.
+
+    Attributes:
+        sensor_lag: By which the sensor is late, s.
+        coulomb: Dry friction.
+        quadratic: Drag.
+        cubic: Spring.
+        trend: Force that grows in proportion to the time, at its end.
+    """
+
+    sensor_lag: Tensor | float = 0.0
+    coulomb: Tensor | float = 0.0
+    quadratic: Tensor | float = 0.0
+    cubic: Tensor | float = 0.0
+    trend: Tensor | float = 0.0
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint that moves for a while, and what is common to machines of one joint.
+
+    Attributes:
+        duration: Of a trial, s.
+        num_steps: Of the integrator in a trial.
+        scale: Typical position and speed, by which undeclared forms are scaled.
+    """
+
+    duration: float
+    num_steps: int
+    scale: tuple[float, float]
+
+    @property
+    def step(self) -> float:
+        """Of the integrator, s."""
+        return self.duration / self.num_steps
+
+    def trajectory(
+        self,
+        force: Callable[[Tensor, Tensor, int], Tensor],
+        start: Tensor,
+        inertia: Tensor,
+        damping: Tensor,
+        times: Tensor,
+        declared: Declared,
+        hidden: Hidden,
+    ) -> Tensor:
+        """Return what the sensor reads after a release at rest, shape (n, k), float64.
+
+        Args:
+            force: ``force(q, v, k)`` of the bare machine without what brakes, in the
+                middle of step k.
+            start: Positions, shape (n,).
+            inertia: Shape (n,), and so the damping.
+            damping: b.
+            times: s, shape (k,) or (n, k).
+            declared: Effects of all joints.
+            hidden: "force" and "wander damping" by step, and strengths of forms.
+        """
+        stiff, ramp = row(declared.cubic, start), row(declared.trend, start)
+        forms, outside = of_state(hidden, self.scale), hidden.get("force")
+        is_cubic, has_trend = bool((stiff != 0).any()), bool((ramp != 0).any())
+
+        def total(q: Tensor, v: Tensor, k: int) -> Tensor:
+            value = force(q, v, k)
+            if is_cubic:
+                value = value - stiff * q**3
+            if has_trend:
+                value = value + ramp * ((k + 0.5) / self.num_steps)
+            if outside is not None:
+                value = value + outside[:, k]
+            for apply, strength in forms:
+                value = value + strength * apply(q, v)
+            return value
+
+        path, speed = integrate(
+            start,
+            inertia,
+            damping,
+            total,
+            step=self.step,
+            num_steps=self.num_steps,
+            coulomb=row(declared.coulomb, start),
+            quadratic=row(declared.quadratic, start),
+            wander=hidden.get("wander damping"),
+        )
+        return read(path, speed, times, step=self.step, lag=declared.sensor_lag)
+
+    def machine(
+        self,
+        fn: Callable[..., Tensor],
+        num_samples: int,
+        *,
+        gain: str,
+        lag: float,
+        strengths: Sequence[float],
+        units: Sequence[str],
+        loose: str,
+        **options: Any,
+    ) -> Machine:
+        """Return a machine of one joint, with the library that all of them have.
+
+        Args:
+            fn: Its simulator, which takes ``times``.
+            num_samples: A trial.
+            gain: Name of the effect on the motor.
+            lag: Prior deviation of the sensor's, s.
+            strengths: Those of dry friction, drag, spring and trend.
+            units: Of these four.
+            loose: What may wander besides the damping.
+            options: Further ones of :class:`Machine`.
+        """
+        times = sample_times(self.duration, num_samples)
+        names = ("Coulomb", "quadratic drag", "cubic spring", "trend")
+        keywords = Declared._fields[1:]
+        makers = (half_normal, half_normal, half_normal, normal)
+        forms = {**FORMS, **UNSEEN_FORMS}
+        return Machine(
+            fn=partial(fn, times=times),
+            times=times,
+            library=[
+                Effect.keyword(
+                    "sensor lag",
+                    prior=half_normal(lag),
+                    units="s",
+                    family="observation",
+                ),
+                *sensor_effects(bias=0.05, gain=0.1, drift=0.01),
+                Effect.keyword(gain, prior=normal(0.1), family="action"),
+                *[
+                    Effect.keyword(name, keyword, prior=make(sd), units=unit)
+                    for name, keyword, make, sd, unit in zip(
+                        names, keywords, makers, strengths, units, strict=True
+                    )
+                ],
+            ],
+            fast=("sensor lag", "Coulomb"),
+            slow=("bias", "drift", "trend"),
+            forms=[*FORMS],
+            unseen_forms=[*UNSEEN_FORMS],
+            unsigned_forms=[name for name, form in forms.items() if not form.signed],
+            wandering=("wander damping", f"wander {loose}"),
+            num_steps=self.num_steps,
+            **options,
+        )

@@ -20,6 +20,7 @@ __all__ = [
     "Machine",
     "box",
     "is_positive",
+    "sample_times",
     "scale_of",
     "sensor_effects",
     "signs",
@@ -108,6 +109,11 @@ class Machine:
         """Return the names that count as one with a name, itself included."""
         groups = [group for group in self.equivalences if name in group]
         return frozenset({name}).union(*groups)
+
+
+def sample_times(duration: float, num: int) -> Tensor:
+    """Return evenly spaced times up to the end of a trial, shape (num,), float64."""
+    return torch.linspace(0, duration, num + 1, dtype=torch.float64)[1:]
 
 
 def is_positive(effect: Effect) -> bool:

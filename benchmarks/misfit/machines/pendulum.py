@@ -10,36 +10,23 @@ the trial. An action is (angle in rad, torque in N m, payload p in kg), and thet
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
-from benchmarks.criticism.worlds.world import half_normal, normal
-from benchmarks.misfit.machines.joint import (
-    FORMS,
-    UNSEEN_FORMS,
-    integrate,
-    of_state,
-    read,
-    row,
-)
+from benchmarks.misfit.machines.joint import Declared, Joint, row
 from benchmarks.misfit.machines.machine import (
     Hidden,
     Machine,
     box,
-    sensor_effects,
     signs,
     uniform_rows,
 )
-from sbi_active.criticism import Effect
 
 __all__ = ["make_pendulum", "swing"]
 
 GRAVITY = 9.81  # m/s^2
-DURATION, NUM_STEPS = 3.0, 120  # s
-SCALE = 1.0, 4.0  # rad, rad/s; of undeclared forms
 NOISE_SD = 0.01  # rad
+JOINT = Joint(3.0, 120, (1.0, 4.0))  # s; undeclared forms in rad and rad/s
 
 
 def swing(
@@ -47,13 +34,9 @@ def swing(
     action: Tensor,
     *,
     times: Tensor,
-    sensor_lag: Tensor | float = 0.0,
     motor_gain: Tensor | float = 0.0,
-    coulomb: Tensor | float = 0.0,
-    quadratic: Tensor | float = 0.0,
-    cubic: Tensor | float = 0.0,
-    trend: Tensor | float = 0.0,
     hidden: Hidden | None = None,
+    **declared: Tensor | float,
 ) -> Tensor:
     """Return the angle of the pendulum.
 
@@ -63,55 +46,32 @@ def swing(
         theta: Shape (n, 4).
         action: Shape (n, 3).
         times: s, shape (k,) or (n, k).
-        sensor_lag: By which the sensor is late, s.
         motor_gain: Relative error of the torque.
-        coulomb: Dry friction, N m.
-        quadratic: Drag, N m s^2/rad^2.
-        cubic: Spring, N m/rad^3.
-        trend: Torque that grows in proportion to the time, at its end, N m.
         hidden: What nobody declared: "force" in N m and "wander damping" and
             "wander gravity", relative, by step, and strengths of forms, N m.
+        **declared: Of :class:`Declared`, in s, N m, N m s^2/rad^2, N m/rad^3 and N m.
 
     Returns:
         Shape (n, k), rad.
     """
     length, damping, mass, armature = theta.double().unbind(1)
     angle, torque, payload = action.double().unbind(1)
-    hidden, step = hidden or {}, DURATION / NUM_STEPS
+    hidden = hidden or {}
     torque = torque * (1 + row(motor_gain, theta))
     weight = (mass + payload) * GRAVITY * length
-    stiff, ramp = row(cubic, theta), row(trend, theta)
-    forms = of_state(hidden, SCALE)
-    outside, loose = hidden.get("force"), hidden.get("wander gravity")
-    is_cubic, has_trend = bool((stiff != 0).any()), bool((ramp != 0).any())
+    loose = hidden.get("wander gravity")
 
     def force(q: Tensor, v: Tensor, k: int) -> Tensor:
         pull = weight * torch.sin(q)
         total = -pull if loose is None else -pull * (1 + loose[:, k])
-        if 0.2 <= (k + 0.5) / NUM_STEPS < 0.5:
+        if 0.2 <= (k + 0.5) / JOINT.num_steps < 0.5:
             total = total + torque
-        if is_cubic:
-            total = total - stiff * q**3
-        if has_trend:
-            total = total + ramp * ((k + 0.5) / NUM_STEPS)
-        if outside is not None:
-            total = total + outside[:, k]
-        for apply, strength in forms:
-            total = total + strength * apply(q, v)
         return total
 
-    path, speed = integrate(
-        angle,
-        (mass + payload) * length**2 + armature,
-        damping,
-        force,
-        step=step,
-        num_steps=NUM_STEPS,
-        coulomb=row(coulomb, theta),
-        quadratic=row(quadratic, theta),
-        wander=hidden.get("wander damping"),
-    )
-    return read(path, speed, times, step=step, lag=sensor_lag).to(theta.dtype)
+    inertia = (mass + payload) * length**2 + armature
+    effects = Declared(**declared)
+    x = JOINT.trajectory(force, angle, inertia, damping, times, effects, hidden)
+    return x.to(theta.dtype)
 
 
 def make_pendulum(num_trials: int, num_samples: int) -> Machine:
@@ -121,42 +81,20 @@ def make_pendulum(num_trials: int, num_samples: int) -> Machine:
         num_trials: To fit.
         num_samples: A trial.
     """
-    times = torch.linspace(0, DURATION, num_samples + 1, dtype=torch.float64)[1:]
-    dynamics = {
-        "coulomb": ("Coulomb", half_normal(0.4), "N m"),
-        "quadratic": ("quadratic drag", half_normal(0.06), "N m s^2/rad^2"),
-        "cubic": ("cubic spring", half_normal(1.0), "N m/rad^3"),
-        "trend": ("trend", normal(0.8), "N m"),
-    }
-    return Machine(
+    return JOINT.machine(
+        swing,
+        num_samples,
         name="pendulum",
-        fn=partial(swing, times=times),
         prior=box((0.35, 1.0), (0.03, 0.4), (0.4, 1.6), (0.01, 0.15)),
         parameter_names=("length", "damping", "mass", "armature"),
         draw_actions=draw_actions,
         noise_sd=NOISE_SD,
-        times=times,
         num_trials=num_trials,
-        library=[
-            Effect.keyword(
-                "sensor lag", prior=half_normal(0.06), units="s", family="observation"
-            ),
-            *sensor_effects(bias=0.05, gain=0.1, drift=0.01),
-            Effect.keyword("motor gain", prior=normal(0.1), family="action"),
-            *[
-                Effect.keyword(name, keyword, prior=prior, units=units)
-                for keyword, (name, prior, units) in dynamics.items()
-            ],
-        ],
-        fast=("sensor lag", "Coulomb"),
-        slow=("bias", "drift", "trend"),
-        forms=[*FORMS],
-        unseen_forms=[*UNSEEN_FORMS],
-        unsigned_forms=[
-            n for n, f in {**FORMS, **UNSEEN_FORMS}.items() if not f.signed
-        ],
-        wandering=("wander damping", "wander gravity"),
-        num_steps=NUM_STEPS,
+        gain="motor gain",
+        lag=0.06,
+        strengths=(0.4, 0.06, 1.0, 0.8),
+        units=("N m", "N m s^2/rad^2", "N m/rad^3", "N m"),
+        loose="gravity",
     )
 
 

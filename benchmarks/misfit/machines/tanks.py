@@ -24,6 +24,7 @@ from benchmarks.misfit.machines.machine import (
     Hidden,
     Machine,
     box,
+    sample_times,
     sensor_effects,
     uniform_rows,
 )
@@ -145,7 +146,7 @@ def make_tanks(num_trials: int, num_samples: int) -> Machine:
         num_trials: To fit.
         num_samples: A trial.
     """
-    times = torch.linspace(0, DURATION, num_samples + 1, dtype=torch.float64)[1:]
+    times = sample_times(DURATION, num_samples)
     return Machine(
         name="tanks",
         fn=partial(fill, times=times),

@@ -26,6 +26,7 @@ Array = NDArray[Any]
 MOST_PARAMETERS = 24  # that have a panel
 LEAST_SHARE = 0.05  # of a panel that the last belief takes
 NUM_PRIOR = 2_000  # draws behind the prior's quantiles
+#: Quantiles that are drawn: the median, half and nine tenths of the belief.
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 TRUTH, EXPECTED, FAINT = "#c1432e", "#333333", "#9aa3ab"
 BARS = {"ok": "C0", "watch": "#b8860b", "alarm": TRUTH, None: FAINT}

@@ -17,7 +17,7 @@ from sbi_active.inference import (
     MixtureDensity,
     RatioClassifier,
     SeqBED,
-    SeqBED_C,
+    SeqBED_LFIRE,
 )
 
 
@@ -60,8 +60,10 @@ def _alhi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
 
 def _seqbed(prior: Distribution, options: CampaignOptions) -> ActiveInference:
     if isinstance(options.density_estimator, LFIRE):
-        return SeqBED(prior, options.density_estimator, bandwidth=options.bandwidth)
-    return SeqBED_C(
+        return SeqBED_LFIRE(
+            prior, options.density_estimator, bandwidth=options.bandwidth
+        )
+    return SeqBED(
         prior,
         options.density_estimator,
         show_progress_bars=False,

@@ -38,6 +38,16 @@ LATE, STEPS = 0.02, 10.0
 #: Quantum of a sensor, and its drift over a recording, in deviations of its noise.
 QUANTUM, DRIFT = 5.0, 5.0
 
+#: Kinds of lateness: what they are called, what they do, and how reports say it.
+LATE_INPUTS = (
+    ("delay", delayed_input, "later"),
+    ("lag", lagged_input, "behind a first-order lag"),
+)
+LATE_SAMPLES = (
+    ("delay", delayed_samples, "what was there before"),
+    ("lag", lagged_samples, "behind a first-order lag"),
+)
+
 Change = Callable[[Tensor, Tensor, Context], Tensor]
 
 
@@ -127,20 +137,16 @@ def _of_input(
         )
     if bool((value.diff(dim=1) != 0).any()):
         found += [
-            make(
-                f"{called}delay",
-                partial(_late, change=delayed_input),
-                _half(delay),
-                units="s",
-                describe=f"{who} acts later",
-            ),
-            make(
-                f"{called}lag",
-                partial(_late, change=lagged_input),
-                _half(delay),
-                units="s",
-                describe=f"{who} acts behind a first-order lag",
-            ),
+            *[
+                make(
+                    f"{called}{kind}",
+                    partial(_late, change=change),
+                    _half(delay),
+                    units="s",
+                    describe=f"{who} acts {how}",
+                )
+                for kind, change, how in LATE_INPUTS
+            ],
             make(
                 f"{before}backlash",
                 _backlash,
@@ -170,20 +176,16 @@ def of_samples(sd: Tensor, times: Tensor) -> list[Effect]:
             units="1/s",
             describe="the sensor's bias grows along each recording",
         ),
-        make(
-            "sensor delay",
-            prior=Independent(delay, 1),
-            apply=partial(_of_x, change=delayed_samples),
-            units="s",
-            describe="the sensor reads what was there before",
-        ),
-        make(
-            "sensor lag",
-            prior=Independent(delay, 1),
-            apply=partial(_of_x, change=lagged_samples),
-            units="s",
-            describe="the sensor reads behind a first-order lag",
-        ),
+        *[
+            make(
+                f"sensor {kind}",
+                prior=Independent(delay, 1),
+                apply=partial(_of_x, change=change),
+                units="s",
+                describe=f"the sensor reads {how}",
+            )
+            for kind, change, how in LATE_SAMPLES
+        ],
         make(
             "sensor quantum",
             prior=Independent(HalfNormal(QUANTUM * sd), 1),

@@ -9,6 +9,7 @@ from sbi_active.criticism.evidence.least_squares import Modes
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.weights import log_sum_exp
 
+#: A choice: the draws are shown and predicted with, and decide nothing.
 NUM_DRAWS = 150
 LOG_2PI = float(np.log(2 * np.pi))
 

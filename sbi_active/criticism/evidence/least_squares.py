@@ -60,6 +60,7 @@ class Search:
     widened: float = 1.0
 
 
+#: Choices, here and below: from draws of the prior alone.
 THOROUGH = Search(
     num_starts=20,
     num_near=6,

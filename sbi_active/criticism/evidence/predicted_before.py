@@ -12,6 +12,7 @@ from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 
 Array = NDArray[Any]
 
+#: A choice: of the prior, which gives deviations to 5 % at a simulation of all trials.
 NUM_DRAWS = 200
 
 

@@ -47,6 +47,7 @@ from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorM
 
 Array = NDArray[Any]
 
+#: Draws that are kept of a model: a mean is then known to a 20th of a deviation.
 NUM_DRAWS = 400
 #: Trials from which their order may be what residuals follow.
 FEW_TRIALS = 5

@@ -18,6 +18,7 @@ from sbi_active.inference.sampling.weights import (
 
 Array = NDArray[Any]
 
+#: A choice: each move of each particle costs a simulation of every trial.
 NUM_PARTICLES, NUM_MOVES = 400, 4
 #: The prior's sample, from which the particles are the first selection, by particle.
 PRIOR_SHARE = 4

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
@@ -59,6 +60,13 @@ class LinearModel:
     def rms(self) -> float:
         """Of the residual, in standard deviations of the sensor."""
         return float(np.sqrt(np.mean(self.residual**2)))
+
+    @property
+    def chi_square(self) -> tuple[float, int, float]:
+        """Against the sensor's error: its value, degrees of freedom and tail."""
+        square = float((self.residual**2).sum())
+        freedom = max(len(self.residual) - len(self.u), 1)
+        return square, freedom, float(chi2.sf(square, freedom))
 
     def widened(self, width: float) -> Array:
         """Return the prior's deviations with effects on another scale, shape (d,)."""

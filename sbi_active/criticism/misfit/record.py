@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
@@ -26,7 +25,11 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.steps.tracing import credible_set
+from sbi_active.criticism.steps.tracing import (
+    credible_set,
+    estimate_of,
+    likeliest_first,
+)
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
 from sbi_active.seeding import derive_seed
@@ -47,8 +50,7 @@ CLOSE = 1.0
 def detected(misfit: Misfit) -> Detection:
     """Return that the bare model misses the trials, by the evidence of the verdict."""
     bare = misfit.search.found[ModelKey()]
-    square = float((bare.model.residual**2).sum())
-    freedom = float(max(len(bare.model.residual) - len(bare.model.u), 1))
+    square, freedom, p_value = bare.model.chi_square
     log_b = misfit.log_bayes_factor
     return Detection(
         log_bayes_factor=log_b,
@@ -56,8 +58,8 @@ def detected(misfit: Misfit) -> Detection:
         lower=log_b,
         threshold=THRESHOLD,
         chi_square=square,
-        degrees_of_freedom=freedom,
-        p_value=float(chi2.sf(square, freedom)),
+        degrees_of_freedom=float(freedom),
+        p_value=p_value,
         level=LEVEL,
         null_log_evidence=bare.posterior.log_sensor,
         null_cross_check=None,
@@ -132,7 +134,7 @@ def _record(misfit: Misfit, key: ModelKey) -> Evidence:
         num_simulations=rivals.simulator.num_simulations - before,
         names=rivals.names_of(rival),
         draws=rival.coordinates.to_z(u)[:, : model.own],
-        best_chi_square=float((misfit.model(key).residual ** 2).sum()),
+        best_chi_square=model.chi_square[0],
     )
     rivals.fits[key] = Fit(rival, sample, evidence)
     return evidence
@@ -205,25 +207,15 @@ def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
 
 def _estimates(misfit: Misfit, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
     bare = evidences[str(ModelKey())].log_evidence
-    found = []
-    for name in misfit.search.names:
-        effect, evidence = misfit.rivals.effects[name], evidences[name]
-        phi = evidence.draws[:, -effect.phi_dim :]
-        found.append(
-            Estimate(
-                name=name,
-                family=str(effect.family),
-                units=effect.units,
-                describe=effect.describe or "",
-                probability=misfit.choice.inclusion[name],
-                log_bayes_factor=evidence.log_evidence - bare,
-                mean=phi.mean(0),
-                sd=phi.std(0),
-                effective_sample_size=evidence.effective_sample_size,
-                engine=evidence.engine,
-            )
+    return likeliest_first(
+        estimate_of(
+            misfit.rivals.effects[name],
+            evidences[name],
+            probability=misfit.choice.inclusion[name],
+            log_bayes_factor=evidences[name].log_evidence - bare,
         )
-    return (*sorted(found, key=lambda e: -e.probability),)
+        for name in misfit.search.names
+    )
 
 
 def _aliases(misfit: Misfit) -> tuple[frozenset[str], ...]:

@@ -13,6 +13,7 @@ from sbi_active.criticism.rivals.further_trials import are_known, conditions_at
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.seeding import derive_seed
 
+#: A choice: each costs predictions of every rival.
 MAX_CANDIDATES = 64
 
 

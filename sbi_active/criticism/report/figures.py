@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
-MAX_ACTION_PANELS = 3
+MAX_ACTION_PANELS = 3  # a choice: as many as stand legibly in a row
 MOST_NAMED = 16  # trials that have their names at the axis
 LOGARITHMIC_FROM = 12.0  # standard deviations; larger residuals get a symlog axis
 METRICS = {

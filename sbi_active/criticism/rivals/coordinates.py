@@ -18,6 +18,7 @@ from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
 
+#: Draws that give a prior's mean and deviation to some 3 %; they only set units.
 NUM_DRAWS = 1_000
 #: A positive number whose prior spans this ratio (5 % to 95 %) is searched in logs.
 WIDE = 100.0

@@ -17,8 +17,10 @@ from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
+#: A choice: sets that are kept of each size. The search costs a fit for each of them
+#: and each effect that is left.
 BEAM = 3
-MAX_EFFECTS = 4
+MAX_EFFECTS = 4  # a choice: at most in one model
 #: All sets of one effect more are together this much less probable, nats.
 COST = float(np.log(3.0))
 #: Draws of an effect that are tried on the residual before the effect is fitted.

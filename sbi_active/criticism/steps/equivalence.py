@@ -22,8 +22,9 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
 
+#: A choice: of a list that is longer, or a box, so many actions stand for all.
 MAX_ACTIONS = 48
-NUM_THETA = 6
+NUM_THETA = 6  # a choice: five of six agree by the share below
 #: Share of the parameters at which two effects must look the same.
 AGREEMENT = 0.8
 #: Squared distance, in noise units over all actions, of two effects that look the same.

@@ -19,7 +19,7 @@ Array = NDArray[Any]
 #: The models fitted to some trials, and what was traced in them.
 Fold = Callable[[Trials], tuple[RivalSet, Tracing]]
 
-COVERAGE = 0.9
+COVERAGE = 0.9  # a convention: the central interval that reports state
 #: Trials below which a bootstrap interval is not what it claims to be.
 ENOUGH_TRIALS = 8
 NUM_BOOTSTRAP = 2_000

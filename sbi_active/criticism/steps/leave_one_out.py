@@ -26,7 +26,7 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-NUM_DRAWS = 400
+NUM_DRAWS = 400  # all that a model's record keeps
 #: Pareto shape above which no number of draws helps.
 LARGEST_SHAPE = 0.7
 

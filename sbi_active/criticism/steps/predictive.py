@@ -21,6 +21,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
 
+#: A choice: each draw costs a simulation of every trial.
 NUM_DRAWS = 200
 
 

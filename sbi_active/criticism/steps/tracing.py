@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -38,7 +38,7 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-PROBABILITY_OF_NONE = 0.5
+PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
 #: That what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
@@ -202,28 +202,49 @@ def credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
     return (*names,)
 
 
+def estimate_of(
+    effect: Effect, evidence: Evidence, *, probability: float, log_bayes_factor: float
+) -> Estimate:
+    """Return an effect's estimate by the draws of the model that has it alone.
+
+    Args:
+        effect: Whose phi is the end of the draws.
+        evidence: Of that model.
+        probability: That the effect is there.
+        log_bayes_factor: Of that model against the bare one.
+    """
+    phi = evidence.draws[:, -effect.phi_dim :]
+    return Estimate(
+        name=effect.name,
+        family=str(effect.family),
+        units=effect.units,
+        describe=effect.describe or "",
+        probability=probability,
+        log_bayes_factor=log_bayes_factor,
+        mean=phi.mean(0),
+        sd=phi.std(0),
+        effective_sample_size=evidence.effective_sample_size,
+        engine=evidence.engine,
+    )
+
+
+def likeliest_first(estimates: Iterable[Estimate]) -> tuple[Estimate, ...]:
+    """Return estimates in the order of their probabilities."""
+    return (*sorted(estimates, key=lambda e: -e.probability),)
+
+
 def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate, ...]:
     null = rivals.fit().evidence.log_evidence
-    found = []
-    for name, effect in rivals.effects.items():
-        key = ModelKey((name,))
-        evidence = rivals.fit(key).evidence
-        phi = evidence.draws[:, -effect.phi_dim :]
-        found.append(
-            Estimate(
-                name=name,
-                family=str(effect.family),
-                units=effect.units,
-                describe=effect.describe or "",
-                probability=inclusion[name],
-                log_bayes_factor=log_evidence(rivals, key)[0] - null,
-                mean=phi.mean(0),
-                sd=phi.std(0),
-                effective_sample_size=evidence.effective_sample_size,
-                engine=evidence.engine,
-            )
+    keys = {name: ModelKey((name,)) for name in rivals.effects}
+    return likeliest_first(
+        estimate_of(
+            effect,
+            rivals.fit(keys[name]).evidence,
+            probability=inclusion[name],
+            log_bayes_factor=log_evidence(rivals, keys[name])[0] - null,
         )
-    return (*sorted(found, key=lambda e: -e.probability),)
+        for name, effect in rivals.effects.items()
+    )
 
 
 def _is_robust(

@@ -102,7 +102,7 @@ class LFIRE:
             raise ValueError(
                 f"expected at least {fewest} outcomes of a parameter set and of the "
                 f"marginal; got {len(own)} and {len(marginal)}; simulate each "
-                "parameter set several times, as SeqBED.arrange() does"
+                "parameter set several times, as SeqBED_LFIRE.arrange() does"
             )
         features = np.concatenate([own, marginal])
         label = np.repeat([1, 0], [len(own), len(marginal)])

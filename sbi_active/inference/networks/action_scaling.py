@@ -14,9 +14,11 @@ LOG_NORMAL_MEAN = 0.6351814227  # -E log|e| of a standard normal e
 SMALLEST_SCALE = 1e-6  # of the scale over all actions: float32 ends there
 WILD = 10.0  # residuals beyond so many medians count as that many
 SAME_WEIGHTS = 0.5  # root-mean-square difference of log-weights that share a fit
+#: Bounds of what held-out rows choose from: a choice. Chebyshev polynomials of degree
+#: 16 have 16 zeros over the actions; the noise may have half as many.
 MAX_DEGREE = 16
 MAX_NOISE_DEGREE = 8
-NUM_ITERATIONS = 4
+NUM_ITERATIONS = 4  # a choice: of location and scale in turn, from the median
 
 
 class Polynomials(nn.Module):

@@ -11,10 +11,14 @@ from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.response import Response
 
 BLOCK = 4_096  # rows held in memory at once
+#: Training parameters among which a row finds its starts: a choice.
 NUM_CENTERS = 32
+#: At most, of damping that rises or falls by ten from its first value: a choice. Rows
+#: end before, once a step gains less than ``AT_REST``.
 NUM_STEPS = 7
 INITIAL_DAMPING = 1e-2
 AT_REST = 1e-3  # nat
+#: Rows of a curved baseline, which solves for each, that standardize v: a choice.
 NUM_SCALING_ROWS = 1_500
 
 

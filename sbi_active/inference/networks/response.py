@@ -18,9 +18,10 @@ from sbi_active.inference.networks.action_scaling import (
 )
 
 MAX_FEATURES = 260  # of (action, parameters)
+#: Bounds of what held-out rows choose from: choices, as is their number above.
 MAX_ACTION_DEGREE = 14
 MAX_DEGREE = 9  # of the parameters
-MAX_NOISE_DEGREE = 8
+MAX_NOISE_DEGREE = 8  # of the action, as for x alone
 JOINT_COST = 1.5  # degrees that a product of two parameters counts more
 STRAIGHT = 0.01  # fraction of the residual below which f is taken to be linear
 

@@ -19,12 +19,13 @@ from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
+#: Of the mixture whose level set is a region: a choice, enough for a few modes.
 NUM_COMPONENTS = 6
 NUM_FITTED = 2_000  # rows that a region is fitted to
 LOST = 2e-3  # share of the rows that may lie outside
 MARGIN = 3.0  # nats below the density of the last row inside
 SPREAD = 2.0  # deviations of rows to learn from, in those of a component
-BATCH_SIZE = 20_000
+BATCH_SIZE = 20_000  # rows at once, which bounds the memory
 
 
 class TrialModel(Protocol):

@@ -44,7 +44,7 @@ Array = NDArray[Any]
 
 DEVIATIONS = (1.0, 4.0, 16.0, 64.0)  # of coefficients a priori
 INTERCEPT_DEVIATION = 8.0  # at least: an event may be rare all over a region
-DEGREES = (0, 1, 2, 3)
+DEGREES = (0, 1, 2, 3)  # of the polynomials that the evidence chooses among
 ROWS_A_FEATURE = 6  # at least
 NUM_STEPS = 40  # of Newton's method
 SURPRISE = 0.01  # probability below which an outcome is a slip

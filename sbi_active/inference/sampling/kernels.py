@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from typing_extensions import override
 
 from sbi_active.inference.sampling.student_mixture import (
@@ -17,14 +16,15 @@ from sbi_active.inference.sampling.student_mixture import (
     log_student,
     student_steps,
 )
+from sbi_active.inference.sampling.weights import precise_log_sum_exp
 
 Array = NDArray[Any]
 
-NUM_KERNELS = 120
+NUM_KERNELS = 120  # a choice: the density of a draw costs one term each
 NEIGHBORS = 0.1  # share of the draws that shape one kernel
 WIDTH = 1.2  # of a kernel, in deviations of its neighbors
-SHARE_OF_BASE = 0.05
-BLOCK = 2_000
+SHARE_OF_BASE = 0.05  # a choice: weights are then below 20 times target over base
+BLOCK = 2_000  # draws at once, which bounds the memory
 
 
 class KernelMixture(StudentMixture):
@@ -47,7 +47,7 @@ class KernelMixture(StudentMixture):
         step = np.tensordot(z, inverse, (1, 2)) - center  # (n, k, d)
         log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
         each = log_student((step**2).sum(-1), log_volume, z.shape[1])
-        return np.asarray(logsumexp(each, axis=1)) - np.log(len(self.means))
+        return precise_log_sum_exp(each, axis=1) - np.log(len(self.means))
 
 
 class KernelProposal(Defended):

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -21,6 +20,7 @@ from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     normalized,
+    precise_log_sum_exp,
     systematic,
 )
 
@@ -29,7 +29,7 @@ Array = NDArray[Any]
 INFLATION = 1.4  # of the covariance of Student components
 SHARE_OF_BASE = 0.1  # of every proposal, so that nothing is lost for good
 SHARE_OF_STEP = 0.2  # particles that stay effective in a step
-MAX_COMPONENTS = 12
+MAX_COMPONENTS = 12  # a choice: two are added where steps become short
 MAX_STEPS = 40  # four times those that a peak of 1e-8 of the base's volume takes
 NUM_FITTED = 800  # particles a mixture is fitted to, at least
 FITTED = 8  # of them for each number in a covariance
@@ -57,7 +57,9 @@ class Particles:
     @property
     def log_normalizer(self) -> float:
         r""":math:`\log \frac1n \sum_i w_i`."""
-        return float(logsumexp(self.log_weight) - np.log(len(self.log_weight)))
+        return float(
+            precise_log_sum_exp(self.log_weight) - np.log(len(self.log_weight))
+        )
 
     @property
     def effective_sample_size(self) -> float:
@@ -122,7 +124,7 @@ class GaussianMixture:
             factor = np.linalg.cholesky(_positive(covariance) + floor * np.eye(d))
             log_weight = np.log(count / count.sum())
             joint = log_weight + _gaussian_log_prob(z, mean, factor)
-            total = np.asarray(logsumexp(joint, axis=1))
+            total = precise_log_sum_exp(joint, axis=1)
             share = np.exp(joint - total[:, None])
             if total.mean() - previous < 1e-3:
                 break
@@ -138,7 +140,7 @@ class GaussianMixture:
     def log_prob(self, points: Array) -> Array:
         """Return log densities, shape (n,)."""
         joint = self.log_weight + _gaussian_log_prob(points, self.mean, self.factor)
-        return np.asarray(logsumexp(joint, axis=1))
+        return precise_log_sum_exp(joint, axis=1)
 
     def assign(self, points: Array) -> NDArray[np.intp]:
         """Return the likeliest component of each point, shape (n,)."""
@@ -184,7 +186,7 @@ class WidenedMixture:
         y = z if self.unbounding is None else self.unbounding.to_line(z)
         square, log_volume = _mahalanobis(y, self.mixture.mean, self.factor)
         each = log_student(square, log_volume, z.shape[1]) + np.log(self.weight)
-        density = np.asarray(logsumexp(each, axis=1))
+        density = precise_log_sum_exp(each, axis=1)
         slope = 0.0 if self.unbounding is None else self.unbounding.log_slope(y)
         return density + slope
 

@@ -10,14 +10,19 @@ from sbi.inference.trainers.nre.nre_base import RatioEstimatorTrainer
 from sbi.neural_nets import classifier_nn
 from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor
+from typing_extensions import Self
 
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
 from sbi_active.inference.models.factors import ActionRatio
+from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
 from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
+from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 
 HELD_OUT = 0.1  # share of the rows, sbi's default
+#: Keywords of SeqBED in the last version alone.
+LFIRE_KEYWORDS = {"settings", "num_particles"}
 
 
 class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
@@ -95,7 +100,7 @@ class SeqBED_B(AmortizedRounds, NRE_B):  # noqa: N801 - as NRE_B
 
     The classifier's ratio is right but for a function of (x, action), which no belief
     depends on; the mean log ratio does. Design with
-    :class:`.InfoNCEGain`, or take :class:`SeqBED_C`.
+    :class:`.InfoNCEGain`, or take :class:`SeqBED`.
 
     References:
         Durkan, Murray & Papamakarios, ICML 2020; Kleinegesse, Drovandi & Gutmann,
@@ -108,10 +113,13 @@ class SeqBED_B(AmortizedRounds, NRE_B):  # noqa: N801 - as NRE_B
         return super().train(*args, **kwargs)
 
 
-class SeqBED_C(AmortizedRounds, NRE_C):  # noqa: N801 - as NRE_C
+class SeqBED(AmortizedRounds, NRE_C):
     r"""Amortized SeqBED by contrastive ratio estimation, on sbi's NRE_C.
 
     Its log odds are the log ratio itself, so that their mean is the utility of SeqBED.
+    As published, with a logistic regression for each parameter set and action, it is
+    :class:`.SeqBED_LFIRE`, which had this name in the last version: until the next one,
+    ``SeqBED(prior, LFIRE())`` and its keywords still give that, with a warning.
 
     References:
         Miller, Weniger & Forre, NeurIPS 2022; Kleinegesse, Drovandi & Gutmann, Bayesian
@@ -124,13 +132,43 @@ class SeqBED_C(AmortizedRounds, NRE_C):  # noqa: N801 - as NRE_C
         >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
         >>> theta, action = prior.sample((1_000,)), torch.rand(1_000, 1)
         >>> x = theta * action + 0.1 * torch.randn(1_000, 1)
-        >>> inference = SeqBED_C(prior, show_progress_bars=False)
+        >>> inference = SeqBED(prior, show_progress_bars=False)
         >>> _ = inference.append_simulations(theta, x, action=action).train()
         >>> belief = inference.update(
         ...     torch.tensor([0.3]), action=torch.tensor([0.6]), seed=0)
         >>> bool((belief.mean - 0.5).abs() < 0.1)
         True
     """
+
+    _is_default: bool
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Make it, or what the arguments meant in the last version."""
+        classifier = args[1] if len(args) > 1 else kwargs.get("classifier")
+        if isinstance(classifier, LFIRE) or LFIRE_KEYWORDS & {*kwargs}:
+            warnings.warn(
+                "sbi_active.SeqBED of logistic regressions goes in the next version: "
+                "use sbi_active.inference.SeqBED_LFIRE",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            return SeqBED_LFIRE(*args, **kwargs)  # pyright: ignore[reportReturnType]
+        made = super().__new__(cls)
+        made._is_default = len(args) < 2 and classifier is None
+        return made
+
+    def arrange(self, theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the draws as they are, see :meth:`.ActiveInference.arrange`."""
+        if self._is_default:  # this method is what the class of that name asked for
+            warnings.warn(
+                "SeqBED(prior) learns one ratio for all parameters, as SeqBED_C did in "
+                "the last version; for a logistic regression at each particle use "
+                "sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
+                "SeqBED(prior, RatioClassifier())",
+                FutureWarning,
+                stacklevel=2,
+            )
+        return super().arrange(theta, action)
 
     @takes(NRE_C.train)
     def train(self, *args: Any, **kwargs: Any) -> Any:

@@ -30,7 +30,7 @@ from sbi_active.simulation import MissingRowsWarning, simulate
 from sbi_active.threads import single_thread
 
 
-class SeqBED(ActiveInference):
+class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
     r"""Sequential Bayesian experimental design for implicit models.
 
     A belief is a set of particles. For each of them and each candidate action, LFIRE
@@ -46,7 +46,7 @@ class SeqBED(ActiveInference):
     particles of the last one, where the original redraws them once the effective sample
     size falls below half: one informative trial leaves far less. What distinguishes
     the method is its cost: every particle needs simulations of its own.
-    :class:`.SeqBED_C` shares them.
+    :class:`.SeqBED` shares them.
 
     With a simulator, ``update`` simulates new particles at the executed action alone,
     which allows more of them: ``refinement.num_histories`` simulations a trial. The
@@ -68,7 +68,7 @@ class SeqBED(ActiveInference):
         >>> from sbi.utils import BoxUniform
         >>> _ = torch.manual_seed(0)
         >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
-        >>> inference = SeqBED(prior)
+        >>> inference = SeqBED_LFIRE(prior)
         >>> theta, action = inference.arrange(prior.sample((400,)), torch.ones(400, 1))
         >>> x = theta + 0.3 * torch.randn_like(theta)
         >>> _ = inference.append_simulations(theta, x, action=action).train()

@@ -28,8 +28,8 @@ from sbi_active.information_gain.fits.nearest_neighbors import nearest_neighbor_
 from sbi_active.seeding import forked_generators
 
 NUM_MARGINAL = 20_000  # draws of the belief for the marginal of the target
-NUM_NEIGHBORS = 4
-NUM_QUANTILES = 33
+NUM_NEIGHBORS = 4  # a choice: fewer vary more, more blur more
+NUM_QUANTILES = 33  # a choice: knots of the curve through the ranks, 3 % apart
 NEARLY_NORMAL = 0.02  # nats of divergence
 FEW = 24  # outcomes of one pattern whose numbers are not used
 

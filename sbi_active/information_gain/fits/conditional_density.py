@@ -13,11 +13,12 @@ from sbi_active.information_gain.fits.emulator import kernel, linear
 from sbi_active.information_gain.fits.reduction import Reduction
 
 LOG_2PI = math.log(2 * math.pi)
+#: A choice: powers of ten, of which the left-out rows choose one.
 RIDGES = 10.0 ** torch.arange(-6.0, 3.0, dtype=torch.float64)
 LENGTHS = (0.3, 1.0, 3.0, 10.0)  # in standard deviations of x
 FEW = 300  # rows that choose the length
 DEFENSE = 0.02  # share of a standard normal in every density
-NUM_COMPONENTS = 6
+NUM_COMPONENTS = 6  # at most, with four rows for each number of a mean: a choice
 NUM_STEPS = 40  # of expectation maximization
 FLOOR = 1e-3  # variance of a component, that of the rows being 1
 

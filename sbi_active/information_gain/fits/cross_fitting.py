@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-NUM_FOLDS = 4
+NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
 
 
 def cross_fit(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 LENGTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0)  # in standard deviations of the belief
 REFINED = (0.7, 1.0, 1.4)  # of the best isotropic length, in the metric of slopes
-NUGGET = 1e-6
+NUGGET = 1e-6  # of the variance: rounding leaves kernels of near rows singular
 FEW = 300  # rows that choose the metric
 NEGLIGIBLE = 1e-4  # error, below which metrics tie, lest rounding choose among them
 BLOCK = 2**18  # kernel entries at once, to stay in the cache

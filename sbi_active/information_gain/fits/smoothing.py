@@ -14,6 +14,7 @@ from sbi_active.simulation import GaussianNoise
 
 LENGTHS = (0.7, 1.0, 1.4, 2.0, 4.0)  # in standard deviations of the belief
 REFINED = (0.7, 1.0, 1.4)  # of the best, in the metric of slopes
+#: A choice: powers of ten, of which the left-out rows choose one.
 RIDGES = 10.0 ** torch.arange(-5.0, 2.0, dtype=torch.float64)
 FEW = 300  # rows that choose the metric
 FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise

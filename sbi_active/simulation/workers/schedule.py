@@ -18,7 +18,7 @@ from sbi_active.simulation.workers.pace import Pace
 from sbi_active.simulation.workers.pools import Pool
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-_UNFINISHED = -1
+_UNFINISHED = -1  # no status of a row that is one
 
 
 class Schedule:

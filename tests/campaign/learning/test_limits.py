@@ -13,13 +13,13 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
-    RefinementOptions,
     SimulatorModel,
 )
 from tests.campaign.learning.test_revision import ACTIONS as SIDES
 from tests.campaign.learning.test_revision import BIAS, OPTIONS
 from tests.campaign.learning.test_revision import MODEL as REVISED
 from tests.campaign.learning.test_revision import PRIOR as SLOPES
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.1, 1.0, 2.0, 3.0], names=["speed"], units=["m/s"])
@@ -30,7 +30,7 @@ SMALL = CampaignOptions(
     density_estimator=MixtureDensity(
         hidden_features=(16,), num_components=2, num_iterations=100
     ),
-    refinement=RefinementOptions(num_histories=300, num_particles=2_000),
+    refinement=REFINEMENT,
 )
 MODEL = SimulatorModel(lambda t, a: a * t, noise=GaussianNoise(0.1))
 

@@ -14,10 +14,10 @@ from sbi_active import (
     CampaignOptions,
     DiscreteActions,
     MixtureDensity,
-    RefinementOptions,
 )
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.inference import LFIRE, RatioClassifier
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([0.1, 1.0, 3.0])
@@ -27,7 +27,7 @@ SMALL = CampaignOptions(
     num_simulations=600,
     num_samples=100,
     num_scored=200,
-    refinement=RefinementOptions(num_histories=300, num_particles=2_000),
+    refinement=REFINEMENT,
 )
 TRAINED = {
     **dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY),

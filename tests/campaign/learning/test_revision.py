@@ -13,11 +13,11 @@ from sbi_active import (
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
-    RefinementOptions,
     SimulatorModel,
 )
 from sbi_active.campaign.checks import most_unlike
 from sbi_active.criticism import Effect
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
@@ -31,7 +31,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=400,
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=RefinementOptions(num_histories=300),
+    refinement=REFINEMENT,
 )
 SHIFT = 0.8
 

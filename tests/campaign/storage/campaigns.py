@@ -9,9 +9,9 @@ from sbi_active import (
     CampaignOptions,
     GaussianNoise,
     MixtureDensity,
-    RefinementOptions,
     SimulatorModel,
 )
+from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 ACTIONS = BoxActions([0.5], [2.0], names=["speed"], units=["m/s"])
@@ -20,7 +20,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=100,
     density_estimator=MixtureDensity(hidden_features=(8,), num_iterations=10),
-    refinement=RefinementOptions(num_histories=300, num_particles=1_000),
+    refinement=REFINEMENT,
 )
 TRUTH = torch.tensor([[0.3, 0.6]])
 

@@ -16,13 +16,13 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 NUM_TRIALS = 6
 
 
-def run(folder):
+def run(folder, num_trials):
     """Begin the campaign or go on with it, as a robot's program would."""
     if (folder / "campaign.json").exists():
         campaign = Campaign.load(folder, simulator=drawn)
     else:
         campaign = new(folder)
-    return go_on(campaign, NUM_TRIALS)
+    return go_on(campaign, num_trials)
 
 
 def killed(work, after=None, at_call=None):
@@ -96,42 +96,54 @@ def test_killed_ten_times_and_resumed(tmp_path, how, whole):
         num_campaigns += 1
 
 
+@pytest.fixture(scope="module")
+def two_rounds():
+    return go_on(new(), 2)
+
+
 @pytest.mark.parametrize("at_call", range(1, 13))
-def test_killed_at_each_write_of_a_round(tmp_path, at_call, whole):
+def test_killed_at_each_write_of_a_round(tmp_path, at_call, two_rounds):
     """A first round, from the manifest on, dies at each of its writes in turn."""
     folder = tmp_path / "c"
     killed(lambda: go_on(new(folder), 1), at_call=at_call)
-    campaign = run_from(folder)
-    assert torch.equal(draws(campaign), draws(whole))
+    campaign = run_from(folder, 2)
+    assert torch.equal(draws(campaign), draws(two_rounds))
+    assert facts(campaign) == facts(two_rounds)
+
+
+def learn(campaign):
+    campaign.update()
+    return campaign
+
+
+def attached(folder=None):
+    campaign = new(folder)
+    campaign.attach([0.8], [0.3, 0.5, 0.7, 0.8])
+    campaign.attach([1.9], [0.6, 0.8, 1.0, 1.2])
+    return campaign
+
+
+@pytest.fixture(scope="module")
+def apart():
+    return learn(attached())
 
 
 @pytest.mark.parametrize("at_call", range(1, 15))
-def test_killed_while_several_trials_are_learned(tmp_path, at_call):
-    told = [([0.8], [0.3, 0.5, 0.7, 0.8]), ([1.9], [0.6, 0.8, 1.0, 1.2])]
-
-    def learn(campaign):
-        campaign.update()
-        return campaign
-
-    apart = new()
+def test_killed_while_several_trials_are_learned(tmp_path, at_call, apart):
     folder = tmp_path / "c"
-    with new(folder) as campaign:
-        for action, x in told:
-            apart.attach(action, x)
-            campaign.attach(action, x)
+    attached(folder).close()
     killed(lambda: learn(Campaign.load(folder, simulator=drawn)), at_call=at_call)
     campaign = learn(Campaign.load(folder, simulator=drawn))
-    apart.update()
     assert torch.equal(draws(campaign), draws(apart))
     assert facts(campaign) == facts(apart)
 
 
-def run_from(folder):
+def run_from(folder, num_trials=NUM_TRIALS):
     complete = (folder / "campaign.json").exists()
     if not complete and folder.exists():  # died before there was a campaign
         for path in sorted(folder.rglob("*"), reverse=True):
             path.unlink()
-    return run(folder)
+    return run(folder, num_trials)
 
 
 def test_a_measurement_whose_tell_returned_is_there(tmp_path):

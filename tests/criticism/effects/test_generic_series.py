@@ -104,6 +104,9 @@ def distorted(change):
 def test_what_an_actuator_does_is_found(name, change):
     trials = distorted(change)
     effects = generic_effects(MODEL, trials, prior=PRIOR)
+    rivals = {"input gain", "input offset", "input delay", "input lag", "backlash"}
+    effects = [effect for effect in effects if effect.name in rivals]
+    assert len(effects) == len(rivals)
     loop = Criticism(MODEL, PRIOR, trials, effects=effects)
     named = {
         part for group in loop.trace().equivalent if name in group for part in group

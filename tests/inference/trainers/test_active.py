@@ -14,12 +14,12 @@ from sbi.inference import NLE_A, NRE_B, NRE_C
 from sbi.neural_nets import classifier_nn, likelihood_nn, posterior_nn
 from sbi.utils import BoxUniform
 
-from sbi_active import ALHI, ASBI, CampaignOptions, SeqBED, SeqBED_B, SeqBED_C
-from sbi_active.inference import ActiveInference
+from sbi_active import ALHI, ASBI, CampaignOptions, SeqBED, SeqBED_B
+from sbi_active.inference import ActiveInference, SeqBED_LFIRE
 from sbi_active.inference.rounds import SilentTracker
 
 PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))
-TRAINERS = [ASBI, ALHI, SeqBED, SeqBED_B, SeqBED_C]
+TRAINERS = [ASBI, ALHI, SeqBED_LFIRE, SeqBED_B, SeqBED]
 SHARED = ["arrange", "update", "update_all"]
 
 
@@ -75,7 +75,7 @@ def round_of(inference):
     theta, action = PRIOR.sample((400,)), torch.ones(400, 1)
     theta, action = inference.arrange(theta, action)
     inference.append_simulations(theta, simulator(theta, action), action=action)
-    if isinstance(inference, SeqBED):
+    if isinstance(inference, SeqBED_LFIRE):
         inference.train(seed=0)
     else:
         inference.train(max_num_epochs=2)
@@ -87,7 +87,7 @@ def round_of(inference):
     ("trainer", "estimator"),
     [
         *[(ASBI, None), (ASBI, "maf"), (ALHI, None), (ALHI, "maf")],
-        *[(SeqBED_C, None), (SeqBED_B, "mlp"), (SeqBED, None)],
+        *[(SeqBED, None), (SeqBED_B, "mlp"), (SeqBED_LFIRE, None)],
     ],
 )
 def test_a_pickled_trainer_goes_on(trainer, estimator):
@@ -136,7 +136,7 @@ def test_a_trainer_on_a_builder_of_sbi_is_loaded_by_another_process(tmp_path):
     ("trainer", "builder"),
     [
         *[(ASBI, posterior_nn("maf")), (ALHI, likelihood_nn("maf"))],
-        *[(SeqBED_B, classifier_nn("mlp")), (SeqBED_C, classifier_nn("resnet"))],
+        *[(SeqBED_B, classifier_nn("mlp")), (SeqBED, classifier_nn("resnet"))],
     ],
 )
 def test_builders_of_sbi_pickle(trainer, builder):
@@ -147,7 +147,7 @@ def test_builders_of_sbi_pickle(trainer, builder):
     assert replace(options, density_estimator=None) == CampaignOptions()
 
 
-PARENTS = {ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED_C: NRE_C}
+PARENTS = {ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED: NRE_C}
 
 
 @pytest.mark.parametrize("trainer", PARENTS)

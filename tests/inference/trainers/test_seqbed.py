@@ -2,14 +2,15 @@
 
 import pickle
 import re
+import warnings
 
 import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import RefinementOptions, SeqBED, SeqBED_B, SeqBED_C
-from sbi_active.inference import LFIRE, RatioClassifier
+from sbi_active import RefinementOptions, SeqBED, SeqBED_B
+from sbi_active.inference import LFIRE, RatioClassifier, SeqBED_LFIRE
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 ACTIONS = torch.tensor([[0.5], [2.0]])
@@ -49,7 +50,7 @@ def test_lfire_meets_the_closed_form():
 
 
 def test_arrange_repeats_particles_at_every_action():
-    theta, action = SeqBED(NORMAL, num_particles=5).arrange(
+    theta, action = SeqBED_LFIRE(NORMAL, num_particles=5).arrange(
         NORMAL.sample((400,)), ACTIONS.repeat(200, 1)
     )
     assert theta.shape == action.shape == (400, 1)
@@ -60,7 +61,7 @@ def test_arrange_repeats_particles_at_every_action():
 
 def test_seqbed_weighs_particles():
     torch.manual_seed(0)
-    inference = SeqBED(NORMAL, num_particles=40)
+    inference = SeqBED_LFIRE(NORMAL, num_particles=40)
     theta, x, action = drawn(inference, 4_000, NORMAL)
     model = inference.append_simulations(theta, x, action=action).train()
     own = model.belief.sample((2_000,))
@@ -86,7 +87,7 @@ def test_seqbed_weighs_particles():
 
 @pytest.mark.slow
 def test_seqbed_with_a_simulator():
-    inference = SeqBED(NORMAL)
+    inference = SeqBED_LFIRE(NORMAL)
     x_o, settings = torch.tensor([1.6]), RefinementOptions(num_histories=1_600)
     torch.manual_seed(0)
     belief = inference.update(
@@ -105,7 +106,7 @@ def test_seqbed_with_a_simulator():
 
 
 @pytest.mark.parametrize(
-    "trainer", [pytest.param(SeqBED_B, marks=pytest.mark.slow), SeqBED_C]
+    "trainer", [pytest.param(SeqBED_B, marks=pytest.mark.slow), SeqBED]
 )
 def test_amortized_ratios_meet_the_closed_form(trainer):
     torch.manual_seed(0)
@@ -157,7 +158,7 @@ def test_no_measurement_is_information():
 
     torch.manual_seed(0)
     nothing, action = torch.tensor([torch.nan]), torch.ones(1)
-    for inference in (SeqBED(box), SeqBED_C(box, show_progress_bars=False)):
+    for inference in (SeqBED_LFIRE(box), SeqBED(box, show_progress_bars=False)):
         theta, rows = inference.arrange(box.sample((1_600,)), torch.ones(1_600, 1))
         x = falls(theta, rows)
         inference.append_simulations(theta, x, action=rows).train()
@@ -169,7 +170,7 @@ def test_no_measurement_is_information():
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
 def test_a_classifier_of_sbi():
     torch.manual_seed(0)
-    inference = SeqBED_C(PRIOR, "mlp", show_progress_bars=False)
+    inference = SeqBED(PRIOR, "mlp", show_progress_bars=False)
     theta, action = PRIOR.sample((300,)), torch.rand(300, 1)
     x = simulator(theta, action)
     inference.append_simulations(theta, x, action=action)
@@ -178,12 +179,30 @@ def test_a_classifier_of_sbi():
     assert belief.sample((3,)).shape == (3, DIM)
 
 
+def test_what_had_the_name_still_works_and_a_warning_says_the_new_one():
+    for further, named in (((LFIRE(),), {}), ((), {"num_particles": 5})):
+        with pytest.warns(DeprecationWarning, match="use .*inference.SeqBED_LFIRE"):
+            former = SeqBED(NORMAL, *further, **named)
+        assert type(former) is SeqBED_LFIRE
+    assert former._num_particles == 5
+    rows = NORMAL.sample((3,)), torch.ones(3, 1)
+    with pytest.warns(FutureWarning, match=r"as SeqBED_C did.*SeqBED_LFIRE\(prior\)"):
+        assert SeqBED(NORMAL).arrange(*rows) == rows
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # sbi's, of what pickled trainers lose
+        warnings.simplefilter("error", FutureWarning)
+        for classifier in (None, RatioClassifier()):
+            inference = SeqBED(NORMAL, classifier)
+            assert type(pickle.loads(pickle.dumps(inference))) is SeqBED
+            assert inference.arrange(*rows) == rows
+
+
 def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
 
 
 def test_errors():
-    inference = SeqBED(NORMAL)
+    inference = SeqBED_LFIRE(NORMAL)
     with raises("expected at least 6 simulations of each particle at each action"):
         inference.arrange(NORMAL.sample((50,)), torch.rand(50, 1))
     with raises("expected simulations of this round", RuntimeError):
@@ -198,7 +217,7 @@ def test_errors():
         model.log_ratio(torch.tensor([[9.0]]), x[:1], action[:1])
     with pytest.warns(UserWarning, match=r"the ratios are those at \[2.0\]"):
         inference.update(torch.zeros(1), action=torch.tensor([1.8]))
-    inference = SeqBED(NORMAL)
+    inference = SeqBED_LFIRE(NORMAL)
     theta = NORMAL.sample((100,))
     inference.append_simulations(theta, theta, action=torch.ones(1))
     with raises("simulate each parameter set several times"):
