@@ -6,7 +6,16 @@ tools. No inference, and no criticism of models, is done here. Needs
 ``sbi-active[mujoco]``.
 """
 
+from sbi_active.mujoco.beliefs import belief_to_parameters, randomization
 from sbi_active.mujoco.effects.library import mjcf_effects
 from sbi_active.mujoco.robot import Robot, from_mjcf
+from sbi_active.mujoco.sysid import from_sysid
 
-__all__ = ["Robot", "from_mjcf", "mjcf_effects"]
+__all__ = [
+    "Robot",
+    "belief_to_parameters",
+    "from_mjcf",
+    "from_sysid",
+    "mjcf_effects",
+    "randomization",
+]

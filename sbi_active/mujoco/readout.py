@@ -36,7 +36,13 @@ def held(series: Array, own: Array, num: int, step: float) -> Array:
     return series[:, np.clip(place, 0, len(own) - 1)]
 
 
-def sampled(readings: Array, times: Array, start: float, step: float) -> Array:
+def sampled(
+    readings: Array,
+    times: Array,
+    start: float,
+    step: float,
+    late: Array | None = None,
+) -> Array:
     """Return readings at times, a line between those of two steps.
 
     Args:
@@ -44,10 +50,17 @@ def sampled(readings: Array, times: Array, start: float, step: float) -> Array:
         times: Shape (n, k).
         start: Time of the first reading.
         step: Between readings.
+        late: By how much each channel reads what was there before, (n, c); None is 0.
 
     Returns:
         Shape (n, k, c).
     """
+    if late is not None:
+        each = [
+            sampled(readings[..., [c]], times - late[:, [c]], start, step)
+            for c in range(readings.shape[2])
+        ]
+        return np.concatenate(each, 2)
     last = readings.shape[1] - 1
     place = np.clip((times - start) / step, 0, last)
     nearest = np.round(place)

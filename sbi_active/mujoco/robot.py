@@ -218,7 +218,7 @@ def _start(
     places = start_places(model)
     if isinstance(start, str):
         i = element_id(model, "key", start)
-        state = np.concatenate([model.key_qpos[i], model.key_qvel[i]])
+        state = [*model.key_qpos[i], *model.key_qvel[i], *model.key_act[i]]
         return {name: float(state[place]) for name, place in places.items()}
     for name in start:
         require_name(name, places, "joint, or one with ' velocity',")

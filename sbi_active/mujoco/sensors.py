@@ -11,22 +11,24 @@ from sbi_active.mujoco.models.quantities import is_hinge, is_scalar
 from sbi_active.mujoco.models.spec import Source, mujoco_of
 from sbi_active.mujoco.simulator import Channel
 
-__all__ = ["added_sensors", "channels_of"]
+__all__ = ["JointSensor", "added_sensors", "channels_of"]
 
 VELOCITY = " velocity"
 
 
 @dataclass(frozen=True)
-class _JointSensor:
+class JointSensor:
     """Adds a sensor of a joint's position or velocity."""
 
     name: str
     joint: str
+    is_speed: bool
 
     def __call__(self, spec: Any) -> None:
+        """Add it to a spec."""
         mujoco = mujoco_of()
         kinds = mujoco.mjtSensor
-        is_speed = self.name.endswith(VELOCITY)
+        is_speed = self.is_speed
         spec.add_sensor(
             name=self.name,
             type=kinds.mjSENS_JOINTVEL if is_speed else kinds.mjSENS_JOINTPOS,
@@ -64,7 +66,9 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
     for name in sensors:
         require_name(name, known, "sensor or joint")
         if name not in own:
-            edits.append(_JointSensor(name, name.removesuffix(VELOCITY)))
+            edits.append(
+                JointSensor(name, name.removesuffix(VELOCITY), name.endswith(VELOCITY))
+            )
     return source.edited(*edits)
 
 

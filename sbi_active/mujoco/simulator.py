@@ -17,7 +17,7 @@ from sbi_active.mujoco.models.names import names_of, require_name, start_places
 from sbi_active.mujoco.models.running import readings
 from sbi_active.mujoco.readout import held, num_steps, sampled
 
-__all__ = ["MODEL", "Channel", "MujocoFunction"]
+__all__ = ["MODEL", "RECORDING", "Channel", "MujocoFunction"]
 
 Array = NDArray[Any]
 
@@ -27,6 +27,8 @@ Watch = Callable[[Model, list[Any], Rows], Any]
 NUMBERS = 4_000_000
 #: Entry of an action that says which of several models runs.
 MODEL = "model"
+#: Entry of an action that is the number of a recording.
+RECORDING = "recording"
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,11 @@ class MujocoFunction:
         times: At which it is returned where trials do not say, shape (k,).
         start: Positions and velocities of all trials that do not say, by name.
         threads: Of MuJoCo's rollout.
+        readout: What lies between the model's sensors and what is returned, with
+            ``readout.late(theta)``, by how much each channel reads what was there
+            before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
+        recorded: Model and start states of each recording, where the entry "recording"
+            of an action is its number.
 
     Attributes:
         machines: As given.
@@ -74,7 +81,10 @@ class MujocoFunction:
         times: Array | None = None,
         start: Mapping[str, float] | None = None,
         threads: int = 1,
+        readout: Any = None,
+        recorded: Sequence[tuple[int, Mapping[str, float]]] = (),
     ) -> None:
+        self.readout, self.recorded = readout, tuple(recorded)
         self.machines, self.channels = tuple(machines), tuple(channels)
         self.roles, self.threads = tuple(roles), threads
         self.times, self.start = times, dict(start or {})
@@ -120,14 +130,12 @@ class MujocoFunction:
         series = {k: _array(u) for k, u in (inputs or {}).items()}
         grid = None if input_times is None else _array(input_times)
         starts = self._starts(start, actions, num)
-        which = np.zeros(num, dtype=int)
-        if MODEL in self.roles:
-            which = np.rint(actions[:, self.roles.index(MODEL)]).astype(int)
-            if which.min() < 0 or which.max() >= len(self.machines):
-                raise ValueError(
-                    f"expected models 0 to {len(self.machines) - 1}; got "
-                    f"{which.min()} to {which.max()}; correct the action"
-                )
+        which = np.rint(starts.pop(MODEL, np.zeros(num))).astype(int)
+        if num and (which.min() < 0 or which.max() >= len(self.machines)):
+            raise ValueError(
+                f"expected models 0 to {len(self.machines) - 1}; got {which.min()} to "
+                f"{which.max()}; correct the action"
+            )
         found = np.empty((num, wanted.shape[1], len(self.channels)))
         changes = require_changes("model", model)
         forces = require_changes("force", force)
@@ -181,7 +189,9 @@ class MujocoFunction:
             if watch is not None:
                 watch(model, models, some)
             x = readings(model, models, some, threads=self.threads)
-            return sampled(x[..., places], times[at], begin, step)
+            late = None if self.readout is None else self.readout.late(some.theta)
+            x = sampled(x[..., places], times[at], begin, step, late)
+            return x if self.readout is None else self.readout.read(x, some.theta)
 
         return machine.models(rows, run, size)
 
@@ -217,8 +227,13 @@ class MujocoFunction:
         return np.broadcast_to(self.times, (num, len(self.times)))
 
     def _starts(self, start: Any, actions: Array, num: int) -> dict[str, Array]:
-        known = start_places(self.model)
+        known = {*start_places(self.model), MODEL}
         found = {name: np.full(num, value) for name, value in self.start.items()}
+        if RECORDING in self.roles and start is None:
+            number = np.rint(actions[:, self.roles.index(RECORDING)]).astype(int)
+            each = [{MODEL: k, **values} for k, values in self.recorded]
+            for name in each[0]:
+                found[name] = np.array([own[name] for own in each])[number]
         for role, value in zip(self.roles, actions.T, strict=False):
             if role in known:
                 found[role] = value

@@ -109,17 +109,29 @@ class Machine:
     Args:
         source: Of the model.
         parameters: In the order of theta.
+        edit: ``edit(spec, theta)`` of all of them at once, in place of theirs.
 
     Attributes:
         model: As compiled.
     """
 
-    def __init__(self, source: Source, parameters: Sequence[Bounded]) -> None:
-        self.source, self.parameters = source, tuple(parameters)
+    def __init__(
+        self,
+        source: Source,
+        parameters: Sequence[Bounded],
+        *,
+        edit: Callable[[Any, Array], Any] | None = None,
+    ) -> None:
+        self.source, self.parameters, self.edit = source, tuple(parameters), edit
         self.model = source.compile()
         mujoco = mujoco_of()
         # A state that diverges stays what it is, instead of starting again.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        # Found here, with all digits of the spec, and used in every process.
+        writer = writer_of(
+            source.exact, self.model, self.parameters, edit=edit, text=source.spec
+        )
+        self._writer = writer if writer.fields or not self.parameters else None
         self._models: dict[tuple[Insertion, ...], Model] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -187,14 +199,14 @@ class Machine:
         if inserted not in self._models:
             mujoco = mujoco_of()
             edits = tuple(change.edit for change in inserted)
-            source = self.source.edited(*edits)
-            base = self.model
+            spec = self.source.edited(*edits).spec
+            base, writer = self.model, self._writer
             if inserted:
-                base = source.compile()
+                base, writer = spec().compile(), None
                 base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             self._models[inserted] = Model(
                 base,
-                writer_of(source.spec, base, self.parameters),
+                writer or writer_of(spec, base, self.parameters, edit=self.edit),
                 mujoco.MjData(base),
                 *self._order(base),
                 inserted,
@@ -205,8 +217,8 @@ class Machine:
         """Return where the machine's positions and velocities are in a model."""
         own, other = start_places(self.model), start_places(base)
         places = np.array([other[name] for name in sorted(own, key=own.__getitem__)])
-        nq = self.model.nq
-        return places[:nq].astype(int), (places[nq:] - base.nq).astype(int)
+        nq, nv = self.model.nq, self.model.nv
+        return places[:nq].astype(int), places[nq : nq + nv].astype(int) - base.nq
 
 
 def _parts(places: Array, rows: Rows, size: int) -> list[Array]:

@@ -64,9 +64,10 @@ def require_name(name: str, known: Iterable[str], what: str) -> None:
 
 
 def start_places(model: Any) -> dict[str, int]:
-    """Return places of start positions and velocities in (qpos, qvel), by name.
+    """Return places of start states in (qpos, qvel, act), by name.
 
-    Joints of more than one position are numbered, as in "base[0]".
+    Joints of more than one position are numbered, as in "base[0]"; velocities are
+    "hinge velocity", and states of an actuator "motor activation".
     """
     found = {}
     for name in names_of(model, "joint"):
@@ -79,4 +80,10 @@ def start_places(model: Any) -> dict[str, int]:
         for k in range(nv):
             speed = f"{name} velocity"
             found[speed if nv == 1 else f"{speed}[{k}]"] = model.nq + v + k
+    first = model.nq + model.nv
+    for i, name in enumerate(names_of(model, "actuator")):
+        at, number = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
+        for k in range(number if at >= 0 else 0):
+            state = f"{name} activation"
+            found[state if number == 1 else f"{state}[{k}]"] = first + at + k
     return found

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -130,7 +131,12 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
 
 
 def writer_of(
-    spec: Callable[[], Any], model: Any, parameters: Sequence[Bounded]
+    spec: Callable[[], Any],
+    model: Any,
+    parameters: Sequence[Bounded],
+    *,
+    edit: Callable[[Any, Array], Any] | None = None,
+    text: Callable[[], Any] | None = None,
 ) -> Writer:
     """Return what writes parameters into a model.
 
@@ -138,13 +144,18 @@ def writer_of(
         spec: Returns a spec that compiles to the model.
         model: As compiled.
         parameters: In the order of theta.
+        edit: ``edit(spec, theta)`` of all parameters at once, in place of theirs.
+        text: Returns a spec as another process has it, for parameters that are
+            compiled there; None takes ``spec``.
     """
-    if all(p.edit is None for p in parameters):
+    if edit is None and all(p.edit is None for p in parameters):
         quantities = [p.quantity for p in parameters if p.quantity is not None]
         return _Quantities([q.entries(model) for q in quantities])
 
-    def compiled(theta: Array) -> Any:
-        edited = spec()
+    def compiled(theta: Array, source: Callable[[], Any] = spec) -> Any:
+        edited = source()
+        if edit is not None:
+            edit(edited, theta)
         for parameter, value in zip(parameters, theta, strict=True):
             if parameter.edit is not None:
                 parameter.edit(edited, float(value))
@@ -158,7 +169,8 @@ def writer_of(
 
     low = np.array([p.low for p in parameters])
     high = np.array([p.high for p in parameters])
-    return _affine(compiled, low, high) or _Compiled(compiled)
+    found = _affine(compiled, low, high)
+    return found or _Compiled(partial(compiled, source=text or spec))
 
 
 def renew(model: Any, data: Any) -> None:

@@ -98,15 +98,18 @@ class Source:
             spec = mujoco.MjSpec.from_string(self._text, assets=self._assets)
         return self._edited(spec)
 
+    def exact(self) -> Any:
+        """Return the spec, edited, with all digits where this process has it."""
+        return self.spec() if self._spec is None else self._edited(self._spec.copy())
+
     def compile(self) -> Any:
-        """Return the model, of what was given where this process has it.
+        """Return the model, with all digits where this process has the spec.
 
         Raises:
             ValueError: If it does not compile, with what MuJoCo says.
         """
         try:
-            spec = self.spec() if self._spec is None else self._spec.copy()
-            return (spec if self._spec is None else self._edited(spec)).compile()
+            return self.exact().compile()
         except ValueError as error:
             raise ValueError(
                 f"expected an MJCF that compiles; got {error}; correct it there"
