@@ -13,6 +13,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
@@ -154,7 +155,9 @@ def from_mjcf(
         sample_times=None if grid is None else torch.from_numpy(grid),
         inputs=space,
     )
-    return Robot(simulator, NamedBox(declared), actions, trials)
+    prior = NamedBox(declared)
+    warn_of_idle(simulator, prior, actions, trials)
+    return Robot(simulator, prior, actions, trials)
 
 
 def from_spec(spec_or_path: Any) -> SimulatorModel:

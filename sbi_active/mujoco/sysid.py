@@ -22,6 +22,7 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import Recorded
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.spec import Source
@@ -127,7 +128,9 @@ def from_sysid(
         sample_times=grid,
         inputs=space if isinstance(space, SignalActions) else None,
     )
-    return Robot(simulator, NamedBox(declared), space, trials)
+    prior = NamedBox(declared)
+    warn_of_idle(simulator, prior, space, trials)
+    return Robot(simulator, prior, space, trials)
 
 
 @dataclass

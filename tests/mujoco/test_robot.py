@@ -292,3 +292,8 @@ def test_signals_out_of_range_and_unknown_actuators_are_said():
     )
     with pytest.raises(ValueError, match="name of a actuator|did you mean 'push'"):
         from_mjcf(CART_POLE, {"cart.mass": (0.5, 2)}, inputs=other)
+
+
+def test_a_parameter_that_changes_nothing_is_said_at_once():
+    with pytest.warns(UserWarning, match="bob.com_y change nothing that is read"):
+        pendulum(parameters={"hinge.damping": (0, 0.1), "bob.com_y": (-0.1, 0.1)})
