@@ -25,6 +25,8 @@ Watch = Callable[[Model, list[Any], Rows], Any]
 
 #: Numbers of readings, controls and states in memory at once.
 NUMBERS = 4_000_000
+#: Rows that are stepped together, each with data of its own.
+TOGETHER = 64
 #: Entry of an action that says which of several models runs.
 MODEL = "model"
 #: Entry of an action that is the number of a recording.
@@ -178,6 +180,8 @@ class MujocoFunction:
         num = num_steps(times, begin, step)
         width = base.nu + base.nsensordata + base.nq + base.nv + 1
         size = max(1, NUMBERS // (num * width))
+        if rows.forces:
+            size = min(size, TOGETHER)
         numbers = np.arange(len(rows), dtype=float)[:, None]
         places = [c.place for c in self.channels]
         # Controls of all rows may be large: they are made for those that run.

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.robots.models import ARM, BALL, PENDULUM, TIMES
 from sbi_active import BoxActions
 from sbi_active.criticism import AugmentedSimulator
 from sbi_active.mujoco import from_mjcf, mjcf_effects
 from sbi_active.mujoco.effects.acting import force_effect, half_normal
 from sbi_active.mujoco.effects.powers import PowerForce
-from tests.mujoco.models import ARM, BALL, PENDULUM, TIMES
 from tests.mujoco.test_robot import pendulum
 
 

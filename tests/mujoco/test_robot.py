@@ -8,13 +8,13 @@ import pandas as pd
 import pytest
 import torch
 
+from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS, TIMES
 from sbi_active import BoxActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Trials
 from sbi_active.mujoco import Robot, from_mjcf
 from sbi_active.simulation import Outcome, simulate
-from tests.mujoco.models import ARM, CART_POLE, PENDULUM, SPRING_MASS, TIMES
 
 RELEASE = BoxActions([-1.5], [1.5], names=["hinge"])
 

@@ -11,6 +11,7 @@ import yaml
 from mujoco import sysid
 from sbi.utils import BoxUniform
 
+from benchmarks.robots.models import SPRING_MASS
 from sbi_active import GaussianNoise
 from sbi_active.mujoco import (
     belief_to_parameters,
@@ -19,7 +20,6 @@ from sbi_active.mujoco import (
     randomization,
 )
 from sbi_active.simulation import check_simulator, simulate
-from tests.mujoco.models import SPRING_MASS
 
 if not hasattr(sysid, "Parameter"):
     pytest.skip(

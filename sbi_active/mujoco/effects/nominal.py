@@ -168,7 +168,7 @@ def _watched(model: Any, models: Sequence[Any], rows: Rows) -> dict[str, Array]:
         for k in range(steps):
             data.ctrl[:] = controls[k]
             mujoco.mj_step(own, data)
-            if k % every or any(w.number for w in data.warning):
+            if k % every or data.warning.number.any():
                 continue
             state = {
                 "q": _scalars(own, data),

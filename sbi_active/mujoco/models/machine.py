@@ -67,6 +67,9 @@ class Model:
         positions: Places of the machine's ``qpos`` in that of this model.
         velocities: The same of its ``qvel``.
         inserted: What it has beyond the machine's model.
+        pool: Copies of the base that are written into.
+        datas: To step rows together.
+        originals: Fields as compiled, of those that are ever written.
     """
 
     base: Any
@@ -76,6 +79,7 @@ class Model:
     velocities: Array
     inserted: tuple[Insertion, ...] = ()
     pool: list[Any] = field(default_factory=list)
+    datas: list[Any] = field(default_factory=list)
     originals: dict[str, Any] = field(default_factory=dict)
 
     def written(

@@ -93,8 +93,11 @@ def _stepped(
     mujoco = mujoco_of()
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
     steps, step = rows.controls.shape[1], model.base.opt.timestep
-    datas = [mujoco.MjData(m) for m in models]
+    while len(model.datas) < len(models):
+        model.datas.append(mujoco.MjData(model.base))
+    datas = model.datas[: len(models)]
     for own, data, state in zip(models, datas, start, strict=True):
+        mujoco.mj_resetData(own, data)
         mujoco.mj_setState(own, data, state, kind)
     x = np.empty((len(rows), steps, model.base.nsensordata))
     # Views: what MuJoCo writes is there at the next look.
@@ -116,6 +119,6 @@ def _stepped(
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
-                bad = [any(w.number for w in d.warning) for d in datas]
+                bad = [d.warning.number.any() for d in datas]
                 going &= ~np.array(bad)
     return x, going & np.isfinite(x).all((1, 2))
