@@ -30,7 +30,7 @@ from sbi_active.mujoco.simulator import MODEL, MujocoFunction
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
-__all__ = ["NamedBox", "Robot", "from_mjcf", "from_spec"]
+__all__ = ["NamedBox", "Robot", "from_mjcf", "from_spec", "require_alike"]
 
 
 class NamedBox(BoxUniform):
@@ -82,7 +82,9 @@ def from_mjcf(
     r"""Return a robot from its MJCF, ready for ``Campaign`` and ``close_loop``.
 
     Args:
-        spec_or_path: An ``MjSpec``, the path of an MJCF, or its text.
+        spec_or_path: An ``MjSpec``, the path of an MJCF, or its text; or a list of such
+            that share all parameters, as with and without a payload, of which the entry
+            "model" of an action is the number.
         parameters: What is unknown, by name: ``{"hinge.damping": (low, high)}`` for a
             quantity of :mod:`.quantities`; ``{"friction": (low, high,
             "hinge.frictionloss")}`` under a name of one's own; ``{"length": (low, high,
@@ -122,12 +124,12 @@ def from_mjcf(
         >>> robot.simulator.mean(torch.zeros(1, 1), torch.zeros(1, 1)).shape
         torch.Size([1, 2])
     """
-    source = Source(spec_or_path)
-    model = source.compile()
-    source = added_sensors(source, model, sensors)
-    model = source.compile()
-    declared = bounded(model, parameters)
-    machine = Machine(source, declared)
+    every = spec_or_path if isinstance(spec_or_path, list | tuple) else [spec_or_path]
+    sources = [_read(given, sensors) for given in every]
+    declared = bounded(sources[0].compile(), parameters)
+    machines = [Machine(source, declared) for source in sources]
+    require_alike(machines)
+    machine = machines[0]
     channels = channels_of(machine.model, sensors)
     space, driven = _inputs(machine.model, inputs)
     actions = _actions(machine.model, actions, space)
@@ -140,7 +142,7 @@ def from_mjcf(
         times = space.input_times
     grid = None if times is None else np.asarray(times, dtype=np.float64)
     function = MujocoFunction(
-        [machine],
+        machines,
         channels,
         roles=() if actions is None or space is not None else actions.names,
         times=grid,
@@ -158,6 +160,23 @@ def from_mjcf(
     prior = NamedBox(declared)
     warn_of_idle(simulator, prior, actions, trials)
     return Robot(simulator, prior, actions, trials)
+
+
+def _read(given: Any, sensors: Sequence[str] | None) -> Source:
+    source = Source(given)
+    return added_sensors(source, source.compile(), sensors)
+
+
+def require_alike(machines: Sequence[Machine]) -> None:
+    """Raise where models differ in what trials say of them by name."""
+    for kind in ("joint", "actuator", "sensor"):
+        names = [names_of(machine.model, kind) for machine in machines]
+        for k, own in enumerate(names):
+            if own != names[0]:
+                raise ValueError(
+                    f"expected models with the same {kind}s; got {', '.join(own)} in "
+                    f"model {k} beside {', '.join(names[0])}; name them alike"
+                )
 
 
 def from_spec(spec_or_path: Any) -> SimulatorModel:

@@ -28,7 +28,7 @@ from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range
 from sbi_active.mujoco.residuals import free_parameters, from_residuals
-from sbi_active.mujoco.robot import NamedBox, Robot
+from sbi_active.mujoco.robot import NamedBox, Robot, require_alike
 from sbi_active.mujoco.sensors import JointSensor
 from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunction
 from sbi_active.mujoco.transforms import Signal, SignalReadout
@@ -91,6 +91,7 @@ def from_sysid(
     for group in groups:
         source, channels = _readable(Source(group.spec), signals)
         machines.append(Machine(source, declared, edit=edit))
+    require_alike(machines)
     step = float(machines[0].model.opt.timestep)
     is_sensor = [s.kind == "MjSensor" for s in signals for _ in range(s.width)]
     readout = SignalReadout.of(transform, params, signals, np.array(is_sensor) * step)

@@ -297,3 +297,26 @@ def test_signals_out_of_range_and_unknown_actuators_are_said():
 def test_a_parameter_that_changes_nothing_is_said_at_once():
     with pytest.warns(UserWarning, match="bob.com_y change nothing that is read"):
         pendulum(parameters={"hinge.damping": (0, 0.1), "bob.com_y": (-0.1, 0.1)})
+
+
+def test_models_with_and_without_a_payload_share_their_parameters():
+    loaded = SPRING_MASS.replace(
+        "</body>",
+        '<geom type="sphere" size=".05" mass="1" contype="0" conaffinity="0"/></body>',
+    )
+    robot = from_mjcf(
+        [SPRING_MASS, loaded],
+        {"slide.damping": (0.1, 1.0)},
+        sensors=["position"],
+        actions=BoxActions([1.0, 0.0], [2.0, 1.0], names=["push", "model"]),
+        times=TIMES,
+        noise=0.01,
+    )
+    theta = torch.full((2, 1), 0.3, dtype=torch.float64)
+    x = robot.simulator.mean(theta, torch.tensor([[2.0, 0.0], [2.0, 1.0]]).double())
+    assert x[0].max() == pytest.approx(0.2, rel=0.15)  # the same at rest, and later
+    assert x[1].argmax() > x[0].argmax()
+    with pytest.raises(ValueError, match="same joints"):
+        from_mjcf(
+            [SPRING_MASS, CART_POLE], {"cart.mass": (0.5, 2)}, sensors=["slide"]
+        )
