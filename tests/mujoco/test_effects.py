@@ -182,3 +182,45 @@ def test_patterns_choose_and_unknown_ones_are_said(robot):
 def test_a_spec_alone_has_effects_too():
     names = {e.name for e in mjcf_effects(mujoco.MjSpec.from_string(ARM))}
     assert {"elbow friction loss", "shoulder servo gain", "lower payload"} <= names
+
+
+@pytest.mark.parametrize("what", ["backlash", "series elasticity"])
+def test_transmissions_grow_from_nothing_without_a_jump(robot, effects, what):
+    effect = effects[f"hinge {what}"]
+    least = effect.apply.key.least
+    sizes = [0.0, 0.01 * least, 0.02 * least, 0.999 * least, 1.001 * least]
+    x = run(robot, effect, sizes)
+    moved = np.abs(x - x[0]).max(1)
+    assert moved[2] == pytest.approx(2 * moved[1], rel=1e-6)
+    assert np.abs(x[4] - x[3]).max() < 0.05 * moved[3]
+    assert moved[3] > 1e-4
+
+
+def test_two_transmissions_and_a_force_together():
+    robot = from_mjcf(
+        ARM,
+        {"shoulder.damping": (0.05, 0.2)},
+        sensors=["shoulder", "elbow"],
+        actions=BoxActions([-0.3], [0.3], names=["shoulder servo"]),
+        times=np.arange(0.1, 1, 0.1),
+        noise=0.001,
+    )
+    found = mjcf_effects(
+        robot, include=["elbow series elasticity", "shoulder backlash"]
+    )
+    # A torque on the shoulder, the first joint: with the inserted ones it is elsewhere.
+    pull = force_effect(
+        "pull", PowerForce(((0, 0, 1.0),), "stiffness", 1), prior=half_normal(1.0)
+    )
+    model = AugmentedSimulator(robot.simulator, [*found, pull])
+    theta = torch.full((1, 1), 0.1, dtype=torch.float64)
+    action = torch.zeros(1, 1, dtype=torch.float64)
+    phi = {e.name: torch.full((1, 1), 2 * e.apply.key.least).double() for e in found}
+    rest = {"pull": torch.full((1, 1), 2.0, dtype=torch.float64)}
+    bare = model.evaluate(theta, {}, action)
+    pulled = model.evaluate(theta, rest, action) - bare
+    both = model.evaluate(theta, {**phi, **rest}, action)
+    given = model.evaluate(theta, phi, action)
+    assert both.isfinite().all()
+    assert (given - bare).abs().max() > 1e-4
+    assert (both - given - pulled).abs().max() < 0.3 * pulled.abs().max()

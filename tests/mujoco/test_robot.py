@@ -317,6 +317,4 @@ def test_models_with_and_without_a_payload_share_their_parameters():
     assert x[0].max() == pytest.approx(0.2, rel=0.15)  # the same at rest, and later
     assert x[1].argmax() > x[0].argmax()
     with pytest.raises(ValueError, match="same joints"):
-        from_mjcf(
-            [SPRING_MASS, CART_POLE], {"cart.mass": (0.5, 2)}, sensors=["slide"]
-        )
+        from_mjcf([SPRING_MASS, CART_POLE], {"cart.mass": (0.5, 2)}, sensors=["slide"])

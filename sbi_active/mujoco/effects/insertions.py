@@ -8,9 +8,10 @@ width :math:`\phi` (backlash), or a spring with a compliance :math:`\phi`,
 .. math::
     |q_i| \le \phi / 2, \qquad \tau = -q_i / \phi - d\, \dot q_i .
 
-Where the joint has no armature the motor's side gets a hundredth of the inertia behind
-it. The spring is damped to a fifth of what is critical, and no stiffer than a
-simulation of this time step can follow. At the start it carries the load.
+Where the joint has no armature the motor's side gets a small part of the inertia behind
+it. The spring is damped to a fifth of what is critical. What is stiffer, or plays less,
+than a simulation of this time step can follow is mixed from the least that it can and
+none. At the start it carries the load.
 """
 
 from __future__ import annotations
@@ -26,19 +27,17 @@ from sbi_active.mujoco.models.changes import Insertion
 from sbi_active.mujoco.models.names import element_id
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["INSERTED", "Transmission"]
+__all__ = ["INSERTED", "Transmission", "least_compliance"]
 
 Array = NDArray[Any]
 
 #: What an inserted joint is called after its joint.
 INSERTED = " (inserted)"
 #: Inertia of the motor's side where the model gives none, in that behind the joint.
-ROTOR = 0.01
+ROTOR = 0.03
 DAMPING = 0.2  # of critical
-STIFFEST = 0.5  # radians of its oscillation a step
+STIFFEST = 1.0  # radians of its oscillation a step
 STOP = (0.95, 0.99, 0.001, 0.5, 2.0)  # solimp of the play's ends
-#: Width of play and deflection below which there is none, rad or m.
-SMALLEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -53,23 +52,22 @@ class Transmission(Insertion):
         is_spring: A spring rather than play.
         inertias: Behind each joint, kg m^2 or kg.
         step: Of the simulation, s.
-        load: Typical force, N m or N, which says from where on a spring matters.
+        least: Smallest phi that is simulated.
     """
 
     names: tuple[str, ...]
     is_spring: bool
     inertias: tuple[float, ...]
     step: float
-    load: float
+    least: float
 
     @override
     def fields(self) -> tuple[str, ...]:
         return ("jnt_stiffness", "dof_damping") if self.is_spring else ("jnt_range",)
 
     @override
-    def is_active(self, phi: Array) -> bool:
-        width = phi[0] * self.load if self.is_spring else phi[0]
-        return bool(width > SMALLEST)
+    def share(self, phi: Array) -> float:
+        return float(np.clip(phi[0] / self.least, 0.0, 1.0))
 
     @override
     def edit(self, spec: Any) -> None:
@@ -90,18 +88,16 @@ class Transmission(Insertion):
 
     @override
     def write(self, model: Any, phi: Array) -> None:
-        if not self.is_active(phi):
-            return
+        width = max(float(phi[0]), self.least)
         for name, inertia in zip(self.names, self.inertias, strict=True):
             i = element_id(model, "joint", name + INSERTED)
             if not self.is_spring:
-                model.jnt_range[i] = -0.5 * phi[0], 0.5 * phi[0]
+                model.jnt_range[i] = -0.5 * width, 0.5 * width
                 continue
             motor = float(model.dof_armature[model.jnt_dofadr[i] - 1])
             reduced = inertia * motor / (inertia + motor)
-            stiffness = min(1 / phi[0], reduced * (STIFFEST / self.step) ** 2)
-            model.jnt_stiffness[i] = stiffness
-            damping = 2 * DAMPING * np.sqrt(stiffness * reduced)
+            model.jnt_stiffness[i] = 1 / width
+            damping = 2 * DAMPING * np.sqrt(reduced / width)
             model.dof_damping[model.jnt_dofadr[i]] = damping
 
     @override
@@ -112,7 +108,21 @@ class Transmission(Insertion):
             if self.is_spring:
                 data.qpos[place] = -load / model.jnt_stiffness[i]
             else:
-                data.qpos[place] = -0.5 * np.sign(load) * phi[0]
+                width = max(float(phi[0]), self.least)
+                data.qpos[place] = -0.5 * np.sign(load) * width
+
+
+def least_compliance(inertia: float, armature: float, step: float) -> float:
+    """Return the compliance of the stiffest spring that steps can follow.
+
+    Args:
+        inertia: Behind the joint.
+        armature: Of the joint, 0 for none.
+        step: s.
+    """
+    motor = armature if armature > 0 else ROTOR * inertia
+    reduced = inertia * motor / (inertia + motor)
+    return 1 / (reduced * (STIFFEST / step) ** 2)
 
 
 def _like(inserted: Any, joint: Any) -> None:

@@ -12,7 +12,7 @@ from sbi_active.mujoco.effects.acting import (
     model_effect,
     normal,
 )
-from sbi_active.mujoco.effects.insertions import Transmission
+from sbi_active.mujoco.effects.insertions import Transmission, least_compliance
 from sbi_active.mujoco.effects.nominal import Nominal
 from sbi_active.mujoco.effects.powers import PowerForce
 from sbi_active.mujoco.effects.ties import Group
@@ -28,6 +28,8 @@ SHARE = 0.2
 INERTIA = 0.2
 #: Play, and the deflection of a spring under a typical force, in ranges of positions.
 PLAY, DEFLECTION = 0.05, 0.1
+#: Of a deviation, the least play that is simulated.
+LEAST = 0.2
 #: Zero offset, as a share of the range of positions, and at most, rad or m.
 ZERO, MOST = 0.1, 0.1
 
@@ -137,9 +139,13 @@ def _transmissions(
     length = "rad" if is_hinge(model, group.names[0]) else "m"
     unit = f"{length}/N m" if length == "rad" else f"{length}/N"
     step = float(model.opt.timestep)
+    stiffest = max(
+        least_compliance(inertia, float(model.dof_armature[k]), step)
+        for inertia, k in zip(behind, dofs, strict=True)
+    )
     yield make(
         "backlash",
-        Transmission(group.names, False, behind, step, force),
+        Transmission(group.names, False, behind, step, LEAST * PLAY * q),
         prior=half_normal(PLAY * q),
         units=length,
         family="transmission",
@@ -147,7 +153,7 @@ def _transmissions(
     )
     yield make(
         "series elasticity",
-        Transmission(group.names, True, behind, step, force),
+        Transmission(group.names, True, behind, step, stiffest),
         prior=half_normal(DEFLECTION * q / force),
         units=unit,
         family="transmission",

@@ -34,14 +34,21 @@ class ModelChange(ABC):
 
 
 class Insertion(ModelChange):
-    """A change that also needs elements that the model does not have.
+    r"""A change that also needs elements that the model does not have.
 
-    A row in which it is not active is simulated by the model without them.
+    With little of it a simulation would need steps too short to be worth it. What is
+    read is then a mixture of what the model reads without the elements and with them,
+    as much of it as there is at least,
+
+    .. math::
+        x = (1 - w)\, x_{without} + w\, x_{with},
+
+    right to first order, and with a slope where it vanishes.
     """
 
     @abstractmethod
-    def is_active(self, phi: Array) -> bool:
-        """Return whether the model needs the elements, phi of shape (k,)."""
+    def share(self, phi: Array) -> float:
+        """Return w of the elements in what is read, within [0, 1], phi of (k,)."""
 
     @abstractmethod
     def edit(self, spec: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import compress, product
 from typing import Any
 
 import numpy as np
@@ -156,15 +157,17 @@ class Machine:
             What ``run`` returned, in the order of the rows.
         """
         found: Array | None = None
-        for inserted, places in self._groups(rows):
+        for inserted, places, weights in self._groups(rows):
             model = self._model(inserted)
+            share = np.zeros(len(rows))
+            share[places] = weights
             for part in _parts(places, rows, size):
                 some = rows.at(part)
                 with quiet():
                     x = run(model, self._each(model, some, inserted), some)
                 if found is None:
-                    found = np.empty((len(rows), *x.shape[1:]))
-                found[part] = x
+                    found = np.zeros((len(rows), *x.shape[1:]))
+                found[part] += share[part].reshape(-1, *[1] * (x.ndim - 1)) * x
         assert found is not None
         return found
 
@@ -183,21 +186,26 @@ class Machine:
                 known[key] = model.written(len(known), rows.theta[i], phi)
         return [known[key] for key in keys]
 
-    def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array]]:
+    def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
+        """Return what is inserted, in which rows, and its weight in what they read."""
         insertions = [c for c in rows.changes if isinstance(c, Insertion)]
         if not insertions:
-            return [((), np.arange(len(rows)))]
-        active = np.array(
-            [[c.is_active(phi) for phi in rows.changes[c]] for c in insertions]
-        ).T
-        patterns, place = np.unique(active, axis=0, return_inverse=True)
-        return [
-            (
-                tuple(c for c, on in zip(insertions, pattern, strict=True) if on),
-                np.flatnonzero(place.reshape(-1) == k),
-            )
-            for k, pattern in enumerate(patterns)
-        ]
+            return [((), np.arange(len(rows)), np.ones(len(rows)))]
+        shares = np.array(
+            [
+                [change.share(phi) for phi in rows.changes[change]]
+                for change in insertions
+            ]
+        )
+        groups = []
+        for pattern in product((False, True), repeat=len(insertions)):
+            on = np.array(pattern)[:, None]
+            weights = np.where(on, shares, 1 - shares).prod(0)
+            places = np.flatnonzero(weights)
+            if len(places):
+                inserted = tuple(compress(insertions, pattern))
+                groups.append((inserted, places, weights[places]))
+        return groups
 
     def _model(self, inserted: tuple[Insertion, ...]) -> Model:
         if inserted not in self._models:
