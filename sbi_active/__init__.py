@@ -5,7 +5,7 @@ neural posterior with the measurement, and go on. An extension of sbi.
 
 Here stand the names that most programs need; each is imported when it is first used.
 All others are in the packages: ``actions``, ``simulation``, ``inference``,
-``information_gain``, ``search``, ``design``, ``campaign`` and ``criticism``.
+``information_gain``, ``search``, ``design``, ``campaign``, ``criticism`` and ``mujoco``.
 """
 
 from __future__ import annotations
@@ -76,6 +76,7 @@ _HOMES = {
     "export": "to_inference_data",
     "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B",
     "information_gain": "",
+    "mujoco": "",
     "search": "",
     "simulation": "AutocorrelatedNoise Bank GaussianNoise SimulatorModel StudentTNoise "
     "estimate_noise simulate",

@@ -133,6 +133,20 @@ def test_campaigns(run, capsys):
     assert page.campaign.history[1].reason == "read off the wrong tape"
 
 
+@pytest.mark.slow
+def test_robots(run, capsys):
+    cart, verdict = run("docs/robots.md")
+    printed = capsys.readouterr().out
+    assert "x depends on them through mass / gear alone" in printed
+    assert {t.action[1].item() for t in cart.campaign.history} == {0.0, 1.0}
+    belief = cart.campaign.belief
+    assert ((belief.mean - cart.truth[0]).abs() < 4 * belief.variance.sqrt()).all()
+    assert verdict.report.verdict == "hinge friction loss"
+    text = (ROOT / "docs/robots.md").read_text()
+    for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
+
+
 def test_no_page_is_forgotten():
     pages = {
         page.name
@@ -147,4 +161,5 @@ def test_no_page_is_forgotten():
         "seeing.md",
         "closing_the_loop.md",
         "identifiability.md",
+        "robots.md",
     }

@@ -1,0 +1,1 @@
+"""Robots from their MJCF: what simulating them costs."""

@@ -1,0 +1,161 @@
+"""Simulations a CPU second of robots from their MJCF, beside a bare loop.
+
+    python -m benchmarks.robots.speed [--go2 ../shared/data/go2_in_air/go2_in_air.xml]
+
+Of each model a second of simulated time from a start that differs by row, with another
+mass or damping in each row, and all readings of all sensors. Ways take turns in one
+process on one thread:
+
+- ours: ``simulator.mean`` of all rows;
+- trials: the same, in which eight rows in a row share parameters, as trials do;
+- force: the same with a generalized force at every step;
+- bare: a Python loop over ``mj_step`` that writes the parameter into the one model;
+- compile: the same, which compiles the spec for each row instead.
+
+Writes speed.json beside this file: rows, steps, and rows a CPU second (median, lowest
+and highest of the repeats).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
+from sbi_active import BoxActions
+from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco.effects.powers import PowerForce
+from sbi_active.threads import single_thread
+
+SECONDS, SHARED = 1.0, 8
+MODELS = {
+    "pendulum": (PENDULUM, "hinge", 0.0, 0.1),
+    "spring-mass": (SPRING_MASS, "slide", 0.0, 1.0),
+    "cart-pole": (CART_POLE, "hinge", 0.0, 0.01),
+    "two-link arm": (ARM, "elbow", 0.05, 0.2),
+}
+
+
+def ways(xml: Any, joint: str, low: float, high: float, num: int) -> dict[str, Any]:
+    """Return the ways of simulating rows, and how many steps each has."""
+    spec = mujoco.MjSpec.from_string(xml) if isinstance(xml, str) else xml
+    model = spec.compile()
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    step = model.opt.timestep
+    steps = round(SECONDS / step) + 1
+    robot = from_mjcf(
+        spec,
+        {f"{joint}.damping": (low, high)},
+        sensors=None if model.nsensor else joints,
+        actions=BoxActions([-0.5], [0.5], names=[joint]),
+        times=step * np.arange(steps),
+        noise=0.01,
+    )
+    simulator = robot.simulator
+    base = simulator.fn.model
+    theta = torch.linspace(low, high, num, dtype=torch.float64)[:, None]
+    action = torch.linspace(-0.5, 0.5, num, dtype=torch.float64)[:, None]
+    shared = theta[::SHARED].repeat_interleave(SHARED, 0)[:num]
+    dof = int(base.joint(joint).dofadr[0])
+    place = int(base.joint(joint).qposadr[0])
+    force = {PowerForce(((place, dof, 0.0),), "damping", 2): torch.full((num, 1), 0.01)}
+
+    def bare(each: Callable[[float], Any]) -> np.ndarray:
+        found = np.empty((num, steps, base.nsensordata))
+        for i in range(num):
+            own, data = each(float(theta[i]))
+            mujoco.mj_resetData(own, data)
+            data.qpos[place] = float(action[i])
+            for k in range(steps):
+                mujoco.mj_step(own, data)
+                found[i, k] = data.sensordata
+        return found
+
+    one, data = base.__copy__(), mujoco.MjData(base)
+    text = simulator.fn.machines[0].source
+
+    def written(value: float) -> Any:
+        one.dof_damping[dof] = value
+        return one, data
+
+    def compiled(value: float) -> Any:
+        other = text.exact()
+        own = other.joint(joint)
+        own.damping = value + 0.0 * np.asarray(own.damping)
+        made = other.compile()
+        return made, mujoco.MjData(made)
+
+    run = {
+        "ours": lambda: simulator.mean(theta, action),
+        "trials": lambda: simulator.mean(shared, action),
+        "force": lambda: simulator.mean(theta, action, force=force),
+        "bare": lambda: bare(written),
+        "compile": lambda: bare(compiled),
+    }
+    x = run["ours"]().reshape(num, steps, -1).numpy()
+    difference = float(np.abs(x - run["bare"]()).max())
+    return {"run": run, "steps": steps, "difference": difference}
+
+
+def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
+    """Return rows a CPU second, by model and way."""
+    result = {}
+    for name, given in models.items():
+        own = ways(*given, num)
+        spent: dict[str, list[float]] = {way: [] for way in own["run"]}
+        for _ in range(repeats):
+            for way, run in own["run"].items():
+                start = time.process_time()
+                run()
+                spent[way].append(time.process_time() - start)
+        result[name] = {
+            "steps": own["steps"],
+            "largest_difference_from_bare": own["difference"],
+            "rows_per_cpu_second": {
+                way: {
+                    "median": round(num / float(np.median(each)), 1),
+                    "lowest": round(num / max(each), 1),
+                    "highest": round(num / min(each), 1),
+                }
+                for way, each in spent.items()
+            },
+        }
+        print(name, json.dumps(result[name]["rows_per_cpu_second"]))
+    return result
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run from a shell."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rows", type=int, default=64)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--go2", type=Path)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    options = parser.parse_args(arguments)
+    models: dict[str, Any] = dict(MODELS)
+    if options.go2 is not None:
+        spec = mujoco.MjSpec.from_file(str(options.go2))
+        models["quadruped, 12 joints"] = (spec, "FL_calf_joint", 0.0, 1.0)
+    with single_thread():
+        found = measured(models, options.rows, options.repeats)
+    record = {
+        "date": date.today().isoformat(),
+        "mujoco": mujoco.__version__,
+        "rows": options.rows,
+        "repeats": options.repeats,
+        "models": found,
+    }
+    options.out.write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

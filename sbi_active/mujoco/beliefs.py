@@ -1,0 +1,163 @@
+"""A belief for the tools of MuJoCo: its parameters, and domain randomization."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sbi_active.seeding import forked_generators
+
+__all__ = ["Randomization", "belief_to_parameters", "randomization"]
+
+Array = NDArray[Any]
+
+NUM_DRAWS = 10_000
+
+
+def belief_to_parameters(
+    belief: Any,
+    params: Any = None,
+    *,
+    names: Sequence[str] | None = None,
+    level: float = 0.95,
+    seed: int = 0,
+    path: str | Path | None = None,
+) -> Any:
+    """Return a ``ParameterDict`` of ``mujoco.sysid`` that says what a belief says.
+
+    Each parameter has the belief's mean as its value and nominal, and its central
+    interval as bounds; frozen ones stay as they are. ``ParameterDict.load_from_disk``
+    reads the file, in the order of the parameters, which ``save_to_disk`` would sort.
+
+    Args:
+        belief: Over the free parameters in the order of ``params.as_vector()``, with
+            ``sample``.
+        params: The ``ParameterDict`` that the belief began with, whose shapes, frozen
+            parameters and modifiers are kept; None makes one of single numbers.
+        names: One a parameter where there are no ``params``; None takes those of the
+            belief.
+        level: Of the intervals.
+        seed: Of the draws.
+        path: Of a YAML file to write.
+
+    Raises:
+        ValueError: If their number of parameters differs, or there are no names.
+        ImportError: If ``mujoco.sysid`` is not installed.
+    """
+    try:
+        from mujoco.sysid import Parameter, ParameterDict  # pyright: ignore
+    except ImportError as error:
+        raise ImportError(
+            "expected mujoco.sysid; got none; run pip install 'sbi-active[sysid]'"
+        ) from error
+    draws = _draws(belief, seed)
+    mean = draws.mean(0)
+    low, high = np.quantile(draws, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    if params is None:
+        found = ParameterDict()
+        for k, name in enumerate(_names(belief, names, draws.shape[1])):
+            found.add(Parameter(name, mean[k], low[k], high[k]))
+    else:
+        if params.size != draws.shape[1]:
+            raise ValueError(
+                f"expected a belief over {params.size} free parameters; got "
+                f"{draws.shape[1]}; pass the parameters that it began with"
+            )
+        found, at = params.copy(), 0
+        for name in found.keys():  # noqa: SIM118
+            own = found[name]
+            if own.frozen:
+                continue
+            here = slice(at, at + own.size)
+            at += own.size
+            own.value, own.min_value, own.max_value = (
+                part[here].reshape(own.shape) for part in (mean, low, high)
+            )
+            own.nominal = own.value.copy()
+    if path is not None:
+        import yaml
+
+        states = {name: found[name].__getstate__() for name in found.keys()}  # noqa: SIM118
+        Path(path).write_text(yaml.safe_dump(states, sort_keys=False))
+    return found
+
+
+class Randomization(NamedTuple):
+    """Ranges and joint draws for domain randomization.
+
+    Attributes:
+        names: One a parameter.
+        ranges: By level, {name: (low, high)}, central intervals of single parameters.
+        samples: Joint draws, shape (n, d), which keep what ranges lose: the
+            correlations between parameters.
+    """
+
+    names: tuple[str, ...]
+    ranges: dict[float, dict[str, tuple[float, float]]]
+    samples: Array
+
+
+def randomization(
+    belief: Any,
+    levels: Sequence[float] = (0.5, 0.9, 0.99),
+    *,
+    names: Sequence[str] | None = None,
+    num_samples: int = 1_000,
+    seed: int = 0,
+) -> Randomization:
+    """Return what to randomize a simulation by, as wide as a belief is.
+
+    Args:
+        belief: With ``sample``; a prior's box will do.
+        levels: Probabilities of the ranges, each in (0, 1).
+        names: One a parameter; None takes those of the belief.
+        num_samples: Joint draws to return.
+        seed: Of the draws.
+
+    Raises:
+        ValueError: If a level is no probability, or there are no names.
+
+    Example:
+        >>> from sbi.utils import BoxUniform
+        >>> box = BoxUniform(torch.zeros(2), torch.ones(2))
+        >>> found = randomization(box, levels=[0.9], names=["mass", "damping"])
+        >>> low, high = found.ranges[0.9]["mass"]
+        >>> round(high - low, 1), found.samples.shape
+        (0.9, (1000, 2))
+    """
+    for level in levels:
+        if not 0 < level < 1:
+            raise ValueError(
+                f"expected levels between 0 and 1; got {level}; pass probabilities"
+            )
+    draws = _draws(belief, seed)
+    known = _names(belief, names, draws.shape[1])
+    ranges = {}
+    for level in levels:
+        ends = np.quantile(draws, [0.5 - level / 2, 0.5 + level / 2], axis=0).T
+        each = zip(known, ends.tolist(), strict=True)
+        ranges[float(level)] = {name: (low, high) for name, (low, high) in each}
+    return Randomization(known, ranges, draws[:num_samples])
+
+
+def _draws(belief: Any, seed: int) -> Array:
+    with forked_generators(seed, "randomization"):
+        draws = belief.sample(torch.Size([NUM_DRAWS]))
+    return draws.detach().cpu().double().reshape(NUM_DRAWS, -1).numpy()
+
+
+def _names(belief: Any, names: Sequence[str] | None, num: int) -> tuple[str, ...]:
+    if names is None:
+        names = getattr(belief, "parameter_names", None)
+    if names is None:
+        names = getattr(belief, "names", None)
+    if names is None or len(names) != num:
+        raise ValueError(
+            f"expected {num} names of parameters; got {names}; pass names="
+        )
+    return tuple(str(name) for name in names)

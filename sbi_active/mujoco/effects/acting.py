@@ -1,0 +1,77 @@
+"""How effects act: on the model, and as generalized forces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import HalfNormal, Independent, Normal, Uniform
+
+from sbi_active.criticism.effects.effect import Context, Effect
+
+__all__ = ["force_effect", "half_normal", "model_effect", "normal", "uniform"]
+
+
+def model_effect(name: str, change: Any, *, prior: Any, **options: Any) -> Effect:
+    """Return an effect that changes the model.
+
+    Args:
+        name: Of the effect.
+        change: A :class:`.ModelChange`.
+        prior: Of phi.
+        **options: As in :class:`.Effect`; the null is 0 unless given.
+    """
+    options = {"null": 0.0, **options}
+    return Effect(
+        name, hook="dynamics", prior=prior, apply=_Keyword("model", change), **options
+    )
+
+
+def force_effect(name: str, force: Any, *, prior: Any, **options: Any) -> Effect:
+    """Return an effect that is a generalized force.
+
+    Args:
+        name: Of the effect.
+        force: A :class:`.Force`, zero at the null.
+        prior: Of phi.
+        **options: As in :class:`.Effect`; the null is 0 unless given.
+    """
+    options = {"null": 0.0, **options}
+    return Effect(
+        name, hook="dynamics", prior=prior, apply=_Keyword("force", force), **options
+    )
+
+
+@dataclass(frozen=True)
+class _Keyword:
+    """Adds phi to a keyword argument of the simulator's function, under a key."""
+
+    keyword: str
+    key: Any
+
+    def __call__(
+        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
+    ) -> dict[str, Any]:
+        others = value.get(self.keyword) or {}
+        return {**value, self.keyword: {**others, self.key: phi}}
+
+
+def normal(sd: float) -> Independent:
+    """Return a normal prior of one number around 0."""
+    return Independent(Normal(_one(0.0), _one(sd)), 1)
+
+
+def half_normal(sd: float) -> Independent:
+    """Return a half-normal prior of one number."""
+    return Independent(HalfNormal(_one(sd)), 1)
+
+
+def uniform(low: float, high: float) -> Independent:
+    """Return a uniform prior of one number."""
+    return Independent(Uniform(_one(low), _one(high)), 1)
+
+
+def _one(value: float) -> Tensor:
+    return torch.tensor([value], dtype=torch.float64)

@@ -1,0 +1,168 @@
+"""What a plain model lacks: its effects, enumerated from the model itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+import torch
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.mujoco.effects.actuators import of_actuators
+from sbi_active.mujoco.effects.joints import of_joints
+from sbi_active.mujoco.effects.nominal import Nominal, nominal
+from sbi_active.mujoco.effects.sensors import of_sensors
+from sbi_active.mujoco.effects.surroundings import (
+    of_bodies,
+    of_contacts,
+    of_surroundings,
+)
+from sbi_active.mujoco.effects.ties import (
+    actuator_groups,
+    body_groups,
+    joint_groups,
+)
+from sbi_active.mujoco.effects.writing import QuantityChange, is_parameter
+from sbi_active.mujoco.models.names import names_of, require_name
+from sbi_active.mujoco.robot import Robot, from_spec
+from sbi_active.mujoco.simulator import MujocoFunction
+from sbi_active.simulation import SimulatorModel
+
+__all__ = ["mjcf_effects"]
+
+#: Change of x by a prior deviation, in deviations of x, that counts as none.
+NOTHING = 1e-9
+
+
+def mjcf_effects(
+    model: Any,
+    *,
+    trials: Trials | None = None,
+    actions: ActionSpace | None = None,
+    include: Sequence[str] = ("*",),
+    exclude: Sequence[str] = (),
+) -> list[Effect]:
+    r"""Return what a plain model may lack, with names, units, nulls and priors.
+
+    Each effect is called by its element, as in "hinge friction loss". Elements that are
+    alike, such as the knees of four legs, are offered together, as in "all knee
+    friction loss", and one by one. Priors are as wide as what moves the robot allows: a
+    friction's deviation is a fifth of the generalized force along nominal trajectories.
+    What is a parameter already, and what changes nothing there, is left out.
+
+    ============= ==================================================================
+    of            effects
+    ============= ==================================================================
+    joints        friction loss, viscous, quadratic and cubic damping, stiffness,
+                  quadratic and cubic stiffness, armature, zero offset, backlash,
+                  series elasticity
+    actuators     gain, bias, back-EMF, saturation; delay and lag of signals
+    sensors       bias, gain, delay, lag, quantum
+    bodies        payload, center of mass x, y, z
+    surroundings  gravity tilt x, y; medium density, viscosity
+    contacts      friction, softness, restitution
+    ============= ==================================================================
+
+    Args:
+        model: The simulator of :func:`.from_mjcf` or :func:`.from_sysid`, or what they
+            return, or an ``MjSpec``, a path or the text of an MJCF.
+        trials: Whose actions and inputs say how the robot moves; None takes those of
+            a robot, else its signals or actions, else it is released around its start.
+        actions: In place of the robot's.
+        include: Patterns of names that are kept, as in "\* friction loss".
+        exclude: Patterns of names that are not.
+
+    Raises:
+        ValueError: If a pattern fits no effect.
+    """
+    simulator, actions, trials = _simulator(model, actions, trials)
+    sizes, call = nominal(simulator, trials, actions)
+    every = [*_all(simulator, sizes, trials)]
+    names = [e.name for e in every]
+    for pattern in [*include, *exclude]:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            require_name(pattern, names, "effect, or a pattern of some,")
+    kept = [
+        e
+        for e in every
+        if any(fnmatchcase(e.name, p) for p in include)
+        and not any(fnmatchcase(e.name, p) for p in exclude)
+    ]
+    return _that_matter(simulator, kept, call)
+
+
+def _simulator(model: Any, actions: Any, trials: Any) -> tuple[Any, Any, Any]:
+    if isinstance(model, Robot):
+        return model.simulator, actions or model.actions, trials or model.trials
+    if not isinstance(model, SimulatorModel):
+        return from_spec(model), actions, trials
+    if not isinstance(model.fn, MujocoFunction):
+        raise TypeError(
+            "expected a simulator of from_mjcf or from_sysid; got another; pass the "
+            "MJCF, or write down its effects"
+        )
+    return model, actions, trials
+
+
+def _all(
+    simulator: SimulatorModel, sizes: Nominal, trials: Trials | None
+) -> Iterator[Effect]:
+    function = simulator.fn
+    assert isinstance(function, MujocoFunction)
+    model = function.model
+    driven: list[str] = []
+    if trials is not None and trials.inputs is not None:
+        driven = [*trials.inputs]
+    elif simulator.inputs is not None:
+        driven = [*simulator.inputs.inputs(simulator.inputs.sample((1,), seed=0))]
+    for group in joint_groups(model):
+        yield from of_joints(group, sizes)
+    for group in actuator_groups(model):
+        known = [name for name in driven if name in names_of(model, "actuator")]
+        yield from of_actuators(group, sizes, driven=known)
+    sds = getattr(simulator.noise, "sd", None)
+    yield from of_sensors(
+        function.channels, sizes, None if sds is None else torch.as_tensor(sds)
+    )
+    for group in body_groups(model):
+        yield from of_bodies(group, sizes)
+    yield from of_surroundings(sizes)
+    yield from of_contacts(sizes)
+
+
+def _that_matter(
+    simulator: SimulatorModel, effects: Sequence[Effect], call: dict[str, Any]
+) -> list[Effect]:
+    """Return those that are no parameter and change what is read."""
+    function = simulator.fn
+    assert isinstance(function, MujocoFunction)
+    bare = SimulatorModel(
+        function, sample_times=simulator.sample_times, inputs=simulator.inputs
+    )
+    theta, action = call["theta"], call["action"]
+    context = Context(
+        index=torch.arange(len(theta), dtype=torch.float64),
+        **{k: v for k, v in call.items() if k not in ("theta", "action")},
+    )
+    x = AugmentedSimulator(bare, ()).evaluate(theta, {}, action, context=context)
+    scale = float(np.nanstd(x.double().numpy())) or 1.0
+    kept = []
+    for effect in effects:
+        change = getattr(effect.apply, "key", None)
+        if isinstance(change, QuantityChange) and is_parameter(
+            function.machines[0].parameters, change
+        ):
+            continue
+        draws = effect.declared_draws()[: len(theta)].to(theta.dtype)
+        changed = AugmentedSimulator(bare, [effect]).evaluate(
+            theta, {effect.name: draws}, action, context=context
+        )
+        moved = (changed - x).abs()
+        if bool((moved.nan_to_num(torch.inf) > NOTHING * scale).any()):
+            kept.append(effect)
+    return kept

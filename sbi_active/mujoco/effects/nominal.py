@@ -1,0 +1,205 @@
+"""How large things are in a model as it usually moves: what priors are scaled by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.mujoco.models.machine import Rows
+from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.running import start_states
+from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.simulator import MujocoFunction
+from sbi_active.simulation import SimulatorModel
+
+__all__ = ["Nominal", "nominal"]
+
+Array = NDArray[Any]
+
+#: Rows that are looked at, and states in each.
+NUM_ROWS, NUM_STATES = 4, 200
+#: Where nothing says how the robot moves: rad or m from the start, s.
+SPREAD, SECONDS = 0.5, 1.0
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """Sizes along nominal trajectories, at the middle of the parameters' bounds.
+
+    Attributes:
+        model: At these parameters.
+        position: Half the range that 90 % of the time is spent in, (nv,), rad or m.
+        velocity: Root mean square, (nv,).
+        force: Root of the mean square of gravity and inertia, of actuators and of
+            passive forces, (nv,), N m or N.
+        inertia: Of each degree of freedom with all others held, (nv,).
+        actuator_force: Root mean square, one an actuator.
+        actuator_velocity: The same of its length.
+        reading: Standard deviation of each channel, (c,).
+        times: Of the readings of one row, (k,).
+        has_contacts: Whether anything touched.
+    """
+
+    model: Any
+    position: Array
+    velocity: Array
+    force: Array
+    inertia: Array
+    actuator_force: Array
+    actuator_velocity: Array
+    reading: Array
+    times: Array
+    has_contacts: bool
+
+
+def nominal(
+    simulator: SimulatorModel, trials: Trials | None, actions: Any = None
+) -> tuple[Nominal, dict[str, Any]]:
+    """Return sizes, and rows on which effects can be tried.
+
+    Args:
+        simulator: Of :class:`.MujocoFunction`.
+        trials: That say how the robot moves; None takes signals or actions.
+        actions: Permitted ones, where there are no trials.
+
+    Returns:
+        The sizes; and theta, action and keyword arguments of a call.
+    """
+    function = simulator.fn
+    assert isinstance(function, MujocoFunction)
+    call = _call(simulator, function, trials, actions)
+    seen: list[dict[str, Array]] = []
+    x = function(**call, watch=lambda *given: seen.append(_watched(*given)))
+    together = {k: np.concatenate([s[k] for s in seen]) for k in seen[0]}
+    model = function.machines[0].model
+    low, high = np.percentile(together["q"], [5, 95], axis=0)
+    parts = [_rms(together[k]) ** 2 for k in ("bias", "actuator", "passive")]
+    readings = x.double().reshape(len(x), x.shape[1], -1).numpy()
+    times = call.get("times")
+    own = function.times if times is None else times[0].numpy()
+    assert own is not None
+    return (
+        Nominal(
+            model,
+            position=_positive(0.5 * (high - low), SPREAD),
+            velocity=_positive(_rms(together["v"]), 1.0),
+            force=_positive(np.sqrt(sum(parts)), 1.0),
+            inertia=together["inertia"].mean(0),
+            actuator_force=_positive(_rms(together["force"]), 1.0),
+            actuator_velocity=_positive(_rms(together["speed"]), 1.0),
+            reading=_positive(np.nanstd(readings, (0, 1)), 1.0),
+            times=own[np.isfinite(own)],
+            has_contacts=bool(together["contacts"].any()),
+        ),
+        call,
+    )
+
+
+def _call(
+    simulator: SimulatorModel,
+    function: MujocoFunction,
+    trials: Trials | None,
+    actions: Any,
+) -> dict[str, Any]:
+    """Return arguments of a call of a few typical rows."""
+    machine = function.machines[0]
+    middle = torch.tensor(
+        [0.5 * (p.low + p.high) for p in machine.parameters], dtype=torch.float64
+    )
+    call: dict[str, Any] = {}
+    if trials is not None:
+        some = torch.linspace(0, len(trials) - 1, min(NUM_ROWS, len(trials))).long()
+        picked = trials.select(some.unique())
+        call["action"] = picked.action.double()
+        if picked.inputs is not None:
+            call |= {"inputs": picked.inputs, "input_times": picked.input_times}
+        if picked.start is not None:
+            call["start"] = picked.start
+        if picked.sample_times is not None:
+            times = picked.sample_times.expand(len(picked), -1)
+            last = times.nan_to_num(-torch.inf).amax(1, keepdim=True)
+            call["times"] = times.where(times.isfinite(), last).double()
+    elif simulator.inputs is not None or actions is not None:
+        space = simulator.inputs or actions
+        call["action"] = space.sample((NUM_ROWS,), seed=0).double()
+        if simulator.inputs is not None:
+            call["inputs"] = simulator.inputs.inputs(call["action"])
+            call["input_times"] = simulator.inputs.input_times
+    else:
+        call |= _released(machine.model)
+    num = len(call["action"])
+    if "times" not in call and function.times is None:
+        grid = torch.linspace(0, SECONDS, 51, dtype=torch.float64)
+        call["times"] = grid.expand(num, -1)
+    return {"theta": middle.expand(num, -1), **call}
+
+
+def _released(model: Any) -> dict[str, Any]:
+    """Return start states around that of the model."""
+    rng = np.random.default_rng(0)
+    start = {
+        name: torch.from_numpy(
+            model.qpos0[place] + SPREAD * rng.uniform(-1, 1, NUM_ROWS)
+        )
+        for name, place in start_places(model).items()
+        if place < model.nq and "[" not in name
+    }
+    return {"action": torch.zeros(NUM_ROWS, 1, dtype=torch.float64), "start": start}
+
+
+def _watched(model: Any, models: Sequence[Any], rows: Rows) -> dict[str, Array]:
+    """Return states and forces along rows."""
+    mujoco = mujoco_of()
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+    found: dict[str, list[Array]] = {}
+    steps = rows.controls.shape[1]
+    every = max(1, steps // NUM_STATES)
+    starts = start_states(model, rows)
+    for own, start, controls in zip(models, starts, rows.controls, strict=True):
+        data = mujoco.MjData(own)
+        mujoco.mj_setState(own, data, start, kind)
+        inertia = np.array(own.dof_M0)
+        for k in range(steps):
+            data.ctrl[:] = controls[k]
+            mujoco.mj_step(own, data)
+            if k % every or data.warning.number.any():
+                continue
+            state = {
+                "q": _scalars(own, data),
+                "v": data.qvel,
+                "bias": data.qfrc_bias,
+                "actuator": data.qfrc_actuator,
+                "passive": data.qfrc_passive,
+                "force": data.actuator_force,
+                "speed": data.actuator_velocity,
+                "inertia": inertia,
+                "contacts": np.array([data.ncon]),
+            }
+            for name, value in state.items():
+                found.setdefault(name, []).append(np.array(value, dtype=float))
+    return {name: np.stack(each) for name, each in found.items()}
+
+
+def _scalars(model: Any, data: Any) -> Array:
+    """Return the position of every degree of freedom, from that of the model."""
+    away = np.zeros(model.nv)
+    mujoco_of().mj_differentiatePos(model, away, 1.0, model.qpos0, data.qpos)
+    return away
+
+
+def _rms(value: Array) -> Array:
+    return np.sqrt((value**2).mean(0))
+
+
+def _positive(value: Array, otherwise: float) -> Array:
+    """Return sizes, those of what does not move as the others' or a default."""
+    value = np.nan_to_num(np.asarray(value, dtype=float))
+    moving = value > 1e-9 * max(value.max(initial=0.0), 1e-12)
+    typical = float(np.median(value[moving])) if moving.any() else otherwise
+    return np.where(moving, value, typical)

@@ -1,0 +1,107 @@
+"""What an effect changes in a model: keys of the simulator's ``model`` and ``force``.
+
+Both are keyword arguments of a simulator's function, {change: phi}, with phi of shape
+(n, k). A change of the model is a :class:`ModelChange`; a generalized force is a
+:class:`Force`. They are hashed by what they say, and go to other processes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Force", "Insertion", "ModelChange", "require_changes"]
+
+Array = NDArray[Any]
+
+
+class ModelChange(ABC):
+    """Writes fields of ``mjModel`` for one set of numbers, after the parameters.
+
+    Subclasses are frozen dataclasses.
+    """
+
+    @abstractmethod
+    def fields(self) -> tuple[str, ...]:
+        """Return the fields that it writes; all others are left alone."""
+
+    @abstractmethod
+    def write(self, model: Any, phi: Array) -> None:
+        """Write a model in place, phi of shape (k,), nothing where it vanishes."""
+
+
+class Insertion(ModelChange):
+    r"""A change that also needs elements that the model does not have.
+
+    With little of it a simulation would need steps too short to be worth it. What is
+    read is then a mixture of what the model reads without the elements and with them,
+    as much of it as there is at least,
+
+    .. math::
+        x = (1 - w)\, x_{without} + w\, x_{with},
+
+    right to first order, and with a slope where it vanishes.
+    """
+
+    @abstractmethod
+    def share(self, phi: Array) -> float:
+        """Return w of the elements in what is read, within [0, 1], phi of (k,)."""
+
+    @abstractmethod
+    def edit(self, spec: Any) -> None:
+        """Add the elements to a spec."""
+
+    @abstractmethod
+    def settle(self, model: Any, data: Any, phi: Array) -> None:
+        """Move what was inserted to where it rests under the load at the start.
+
+        Args:
+            model: Written.
+            data: At the start, its forces computed.
+            phi: Shape (k,).
+        """
+
+
+class Force(Protocol):
+    r"""A generalized force :math:`\tau = \tau(q, v, t; \phi)`, added at every step.
+
+    It is called once a step for many rows, before the step, and what it returns goes
+    into ``qfrc_applied``. It is hashable and can be pickled; rows are independent.
+
+    Args:
+        q: Positions of the joints, shape (n, nq), in the order of the model's ``qpos``.
+        v: Their velocities, shape (n, nv), in the order of its ``qvel``.
+        t: Time since the start of the trial, s.
+        phi: Shape (n, k). What depends on the number of the trial has it as a part of
+            phi: an effect's ``apply`` is told ``context.index``.
+
+    Returns:
+        Shape (n, nv), N or N m.
+    """
+
+    def __call__(self, q: Array, v: Array, t: float, phi: Array, /) -> Array:
+        """Return the forces."""
+        ...
+
+
+def require_changes(name: str, value: Any) -> dict[Any, Array]:
+    """Return changes with float64 arrays of shape (n, k).
+
+    Raises:
+        TypeError: If it is no dict of them.
+    """
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise TypeError(
+            f"expected {name} as {{change: phi}}; got {type(value).__name__}; pass "
+            "changes of sbi_active.mujoco.models.changes, with phi of shape (n, k)"
+        )
+    found = {}
+    for key, phi in value.items():
+        rows = np.asarray(phi, dtype=np.float64)
+        found[key] = rows if rows.ndim == 2 else rows.reshape(len(rows), -1)
+    return found

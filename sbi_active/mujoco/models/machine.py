@@ -1,0 +1,253 @@
+"""Models that are compiled once a process, and run for many parameters."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import compress, product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.mujoco.models.changes import Insertion, ModelChange
+from sbi_active.mujoco.models.fields import copied, restore
+from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
+from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
+
+__all__ = ["Machine", "Model", "Rows"]
+
+Array = NDArray[Any]
+
+#: Models at a time: more gain nothing, and each has memory of its own.
+POOL = 32
+
+
+@dataclass
+class Rows:
+    """What one model simulates at once.
+
+    Attributes:
+        theta: Parameters, shape (n, d).
+        changes: By change, shape (n, k).
+        forces: By force, shape (n, k).
+        start: Positions and velocities at the start, by name, (n,).
+        controls: Shape (n, steps, nu), held over each step.
+    """
+
+    theta: Array
+    changes: dict[Any, Array]
+    forces: dict[Any, Array]
+    start: dict[str, Array]
+    controls: Array
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def at(self, rows: Any) -> Rows:
+        """Return some rows."""
+        return Rows(
+            self.theta[rows],
+            {change: phi[rows] for change, phi in self.changes.items()},
+            {force: phi[rows] for force, phi in self.forces.items()},
+            {name: value[rows] for name, value in self.start.items()},
+            self.controls[rows],
+        )
+
+
+@dataclass
+class Model:
+    """A compiled model, copies of it, and what writes parameters.
+
+    Attributes:
+        base: As compiled; nothing is written into it.
+        writer: Of the parameters.
+        data: To work in.
+        positions: Places of the machine's ``qpos`` in that of this model.
+        velocities: The same of its ``qvel``.
+        inserted: What it has beyond the machine's model.
+        pool: Copies of the base that are written into.
+        datas: To step rows together.
+        originals: Fields as compiled, of those that are ever written.
+    """
+
+    base: Any
+    writer: Writer
+    data: Any
+    positions: Array
+    velocities: Array
+    inserted: tuple[Insertion, ...] = ()
+    pool: list[Any] = field(default_factory=list)
+    datas: list[Any] = field(default_factory=list)
+    originals: dict[str, Any] = field(default_factory=dict)
+
+    def written(
+        self, number: int, theta: Array, changes: dict[ModelChange, Array]
+    ) -> Any:
+        """Return a model with its parameters and changes.
+
+        Args:
+            number: Of the copy to write into.
+            theta: Shape (d,).
+            changes: By change, shape (k,).
+        """
+        model = self.writer.model(theta)
+        if model is None:
+            names = {*self.writer.fields}.union(*(c.fields() for c in changes))
+            self.originals |= copied(self.base, names - {*self.originals})
+            while len(self.pool) <= number:
+                self.pool.append(copy.copy(self.base))
+            model = self.pool[number]
+            restore(model, self.originals)
+            self.writer.write(model, theta)
+        for change, phi in changes.items():
+            change.write(model, phi)
+        renew(model, self.data)
+        return model
+
+
+class Machine:
+    """A model with parameters.
+
+    Args:
+        source: Of the model.
+        parameters: In the order of theta.
+        edit: ``edit(spec, theta)`` of all of them at once, in place of theirs.
+
+    Attributes:
+        model: As compiled.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        parameters: Sequence[Bounded],
+        *,
+        edit: Callable[[Any, Array], Any] | None = None,
+    ) -> None:
+        self.source, self.parameters, self.edit = source, tuple(parameters), edit
+        self.model = source.compile()
+        mujoco = mujoco_of()
+        # A state that diverges stays what it is, instead of starting again.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        # Found here, with all digits of the spec, and used in every process.
+        writer = writer_of(
+            source.exact, self.model, self.parameters, edit=edit, text=source.spec
+        )
+        self._writer = writer if writer.fields or not self.parameters else None
+        self._models: dict[tuple[Insertion, ...], Model] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_models": {}}
+
+    def models(
+        self, rows: Rows, run: Callable[[Model, list[Any], Rows], Array], size: int
+    ) -> Array:
+        """Run rows, whatever models they need.
+
+        Args:
+            rows: All of them.
+            run: ``run(model, models, rows)`` simulates some rows, each by its model,
+                and returns one result a row.
+            size: Most rows at a time.
+
+        Returns:
+            What ``run`` returned, in the order of the rows.
+        """
+        found: Array | None = None
+        for inserted, places, weights in self._groups(rows):
+            model = self._model(inserted)
+            share = np.zeros(len(rows))
+            share[places] = weights
+            for part in _parts(places, rows, size):
+                some = rows.at(part)
+                with quiet():
+                    x = run(model, self._each(model, some, inserted), some)
+                if found is None:
+                    found = np.zeros((len(rows), *x.shape[1:]))
+                found[part] += share[part].reshape(-1, *[1] * (x.ndim - 1)) * x
+        assert found is not None
+        return found
+
+    def _each(
+        self, model: Model, rows: Rows, inserted: tuple[Insertion, ...]
+    ) -> list[Any]:
+        """Return a model for every row; rows of the same numbers share one."""
+        active = [
+            c for c in rows.changes if not isinstance(c, Insertion) or c in inserted
+        ]
+        keys = _keys(rows.theta, [rows.changes[c] for c in active])
+        known: dict[bytes, Any] = {}
+        for i, key in enumerate(keys):
+            if key not in known:
+                phi: dict[ModelChange, Array] = {c: rows.changes[c][i] for c in active}
+                known[key] = model.written(len(known), rows.theta[i], phi)
+        return [known[key] for key in keys]
+
+    def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
+        """Return what is inserted, in which rows, and its weight in what they read."""
+        insertions = [c for c in rows.changes if isinstance(c, Insertion)]
+        if not insertions:
+            return [((), np.arange(len(rows)), np.ones(len(rows)))]
+        shares = np.array(
+            [
+                [change.share(phi) for phi in rows.changes[change]]
+                for change in insertions
+            ]
+        )
+        groups = []
+        for pattern in product((False, True), repeat=len(insertions)):
+            on = np.array(pattern)[:, None]
+            weights = np.where(on, shares, 1 - shares).prod(0)
+            places = np.flatnonzero(weights)
+            if len(places):
+                inserted = tuple(compress(insertions, pattern))
+                groups.append((inserted, places, weights[places]))
+        return groups
+
+    def _model(self, inserted: tuple[Insertion, ...]) -> Model:
+        if inserted not in self._models:
+            mujoco = mujoco_of()
+            edits = tuple(change.edit for change in inserted)
+            spec = self.source.edited(*edits).spec
+            base, writer = self.model, self._writer
+            if inserted:
+                base, writer = spec().compile(), None
+                base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+            self._models[inserted] = Model(
+                base,
+                writer or writer_of(spec, base, self.parameters, edit=self.edit),
+                mujoco.MjData(base),
+                *self._order(base),
+                inserted,
+            )
+        return self._models[inserted]
+
+    def _order(self, base: Any) -> tuple[Array, Array]:
+        """Return where the machine's positions and velocities are in a model."""
+        own, other = start_places(self.model), start_places(base)
+        places = np.array([other[name] for name in sorted(own, key=own.__getitem__)])
+        nq, nv = self.model.nq, self.model.nv
+        return places[:nq].astype(int), places[nq : nq + nv].astype(int) - base.nq
+
+
+def _parts(places: Array, rows: Rows, size: int) -> list[Array]:
+    """Return places in parts of a few rows, and of no more models than the pool has."""
+    keys = _keys(rows.theta[places], [phi[places] for phi in rows.changes.values()])
+    parts: list[list[int]] = [[]]
+    seen: set[bytes] = set()
+    for place, key in zip(places.tolist(), keys, strict=True):
+        full = len(parts[-1]) == size or (key not in seen and len(seen) == POOL)
+        if full:
+            parts.append([])
+            seen = set()
+        parts[-1].append(place)
+        seen.add(key)
+    return [np.array(part) for part in parts]
+
+
+def _keys(theta: Array, phi: Sequence[Array]) -> list[bytes]:
+    table = np.ascontiguousarray(np.concatenate([theta, *phi], 1) + 0.0)
+    return [row.tobytes() for row in table]

@@ -1,0 +1,89 @@
+"""Elements of a model by their names, and what was probably meant by others."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+from sbi_active.mujoco.models.spec import mujoco_of
+
+__all__ = ["KINDS", "element_id", "names_of", "require_name", "start_places"]
+
+#: Kinds of elements: what MuJoCo calls them, and the count in a model.
+KINDS = {
+    "body": ("mjOBJ_BODY", "nbody"),
+    "joint": ("mjOBJ_JOINT", "njnt"),
+    "geom": ("mjOBJ_GEOM", "ngeom"),
+    "actuator": ("mjOBJ_ACTUATOR", "nu"),
+    "sensor": ("mjOBJ_SENSOR", "nsensor"),
+    "tendon": ("mjOBJ_TENDON", "ntendon"),
+    "key": ("mjOBJ_KEY", "nkey"),
+}
+
+
+def names_of(model: Any, kind: str) -> list[str]:
+    """Return the names of a kind of element in their order.
+
+    What has none is called by its kind and number, as in "joint 0".
+    """
+    mujoco = mujoco_of()
+    mark, count = KINDS[kind]
+    number = model.njnt if kind == "joint" else getattr(model, count)
+    if kind == "actuator":
+        number = len(model.actuator_trntype)
+    each = (
+        mujoco.mj_id2name(model, getattr(mujoco.mjtObj, mark), i) for i in range(number)
+    )
+    return [name or f"{kind} {i}" for i, name in enumerate(each)]
+
+
+def element_id(model: Any, kind: str, name: str) -> int:
+    """Return the number of an element.
+
+    Raises:
+        ValueError: If there is none of that name, with the nearest ones.
+    """
+    known = names_of(model, kind)
+    require_name(name, known, kind)
+    return known.index(name)
+
+
+def require_name(name: str, known: Iterable[str], what: str) -> None:
+    """Raise where a name is not among those that are known."""
+    known = [*known]
+    if name in known:
+        return
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "correct it"
+    listed = ", ".join(map(repr, known[:12])) or "none"
+    more = f" and {len(known) - 12} more" if len(known) > 12 else ""
+    raise ValueError(
+        f"expected the name of a {what} among {listed}{more}; got {name!r}; {hint}"
+    )
+
+
+def start_places(model: Any) -> dict[str, int]:
+    """Return places of start states in (qpos, qvel, act), by name.
+
+    Joints of more than one position are numbered, as in "base[0]"; velocities are
+    "hinge velocity", and states of an actuator "motor activation".
+    """
+    found = {}
+    for name in names_of(model, "joint"):
+        i = element_id(model, "joint", name)
+        q, v = int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])
+        kind = int(model.jnt_type[i])
+        nq, nv = {0: (7, 6), 1: (4, 3)}.get(kind, (1, 1))  # free, ball
+        for k in range(nq):
+            found[name if nq == 1 else f"{name}[{k}]"] = q + k
+        for k in range(nv):
+            speed = f"{name} velocity"
+            found[speed if nv == 1 else f"{speed}[{k}]"] = model.nq + v + k
+    first = model.nq + model.nv
+    for i, name in enumerate(names_of(model, "actuator")):
+        at, number = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
+        for k in range(number if at >= 0 else 0):
+            state = f"{name} activation"
+            found[state if number == 1 else f"{state}[{k}]"] = first + at + k
+    return found

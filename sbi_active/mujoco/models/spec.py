@@ -1,0 +1,127 @@
+"""A model's source: read, edited and compiled, here and in every worker process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+__all__ = ["INSTALL", "Source", "mujoco_of", "quiet"]
+
+#: What to install where MuJoCo is missing.
+INSTALL = "pip install 'sbi-active[mujoco]'"
+
+Edit = Callable[[Any], None]
+
+
+def mujoco_of() -> Any:
+    """Return the module ``mujoco``, or raise with the line that installs it."""
+    try:
+        import mujoco
+        import mujoco.rollout
+    except ImportError as error:
+        raise ImportError(
+            f"expected MuJoCo 3.5 or later; got none; run {INSTALL}"
+        ) from error
+    return mujoco
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep MuJoCo from printing a line, and writing a file, a row that diverges.
+
+    Such rows are counted as invalid outcomes.
+    """
+    mujoco = mujoco_of()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_nothing)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _nothing(text: str) -> None:
+    """Take a warning and drop it."""
+
+
+class Source:
+    """An MJCF and what is changed in it before it is compiled.
+
+    A spec is written down as text, with six digits: what is compiled from it in another
+    process has them. The model itself is compiled from the spec as it is given.
+
+    Args:
+        given: Path of an MJCF, its text, or an ``MjSpec``, which is copied.
+        edits: Called with the spec in this order; they go to other processes too.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it does not compile.
+        TypeError: If it is something else.
+    """
+
+    def __init__(self, given: Any, edits: tuple[Edit, ...] = ()) -> None:
+        mujoco = mujoco_of()
+        self.edits = edits
+        self._text, self._path, self._assets = None, None, {}
+        self._spec = None
+        if isinstance(given, mujoco.MjSpec):
+            self._spec = given.copy()
+        elif isinstance(given, str) and given.lstrip().startswith("<"):
+            self._text = given
+        elif isinstance(given, str | Path):
+            self._path = Path(given).resolve()
+            if not self._path.is_file():
+                raise FileNotFoundError(
+                    f"expected an MJCF in {given}; got no such file; correct the path"
+                )
+        else:
+            raise TypeError(
+                f"expected an MjSpec, a path or the text of an MJCF; got "
+                f"{type(given).__name__}; pass one of them"
+            )
+        self.compile()
+        if self._spec is not None:
+            self._text, self._assets = self._spec.to_xml(), dict(self._spec.assets)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_spec": None}
+
+    def spec(self) -> Any:
+        """Return the spec, edited; the same in every process."""
+        mujoco = mujoco_of()
+        if self._path is not None:
+            spec = mujoco.MjSpec.from_file(str(self._path))
+        else:
+            spec = mujoco.MjSpec.from_string(self._text, assets=self._assets)
+        return self._edited(spec)
+
+    def exact(self) -> Any:
+        """Return the spec, edited, with all digits where this process has it."""
+        return self.spec() if self._spec is None else self._edited(self._spec.copy())
+
+    def compile(self) -> Any:
+        """Return the model, with all digits where this process has the spec.
+
+        Raises:
+            ValueError: If it does not compile, with what MuJoCo says.
+        """
+        try:
+            return self.exact().compile()
+        except ValueError as error:
+            raise ValueError(
+                f"expected an MJCF that compiles; got {error}; correct it there"
+            ) from error
+
+    def edited(self, *edits: Edit) -> Source:
+        """Return a source that is changed further."""
+        other = object.__new__(Source)
+        vars(other).update(vars(self), edits=(*self.edits, *edits))
+        return other
+
+    def _edited(self, spec: Any) -> Any:
+        for edit in self.edits:
+            edit(spec)
+        return spec

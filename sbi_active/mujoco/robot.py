@@ -1,0 +1,269 @@
+"""A robot from its MJCF: simulator, prior, actions and trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from sbi.utils import BoxUniform
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace
+from sbi_active.actions.signals import SignalActions
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.mujoco.idle import warn_of_idle
+from sbi_active.mujoco.models.machine import Machine
+from sbi_active.mujoco.models.names import (
+    element_id,
+    names_of,
+    require_name,
+    start_places,
+)
+from sbi_active.mujoco.models.parameters import Bounded, bounded
+from sbi_active.mujoco.models.quantities import is_scalar
+from sbi_active.mujoco.models.spec import Source
+from sbi_active.mujoco.recordings import require_in_range, trials_of
+from sbi_active.mujoco.sensors import added_sensors, channels_of
+from sbi_active.mujoco.simulator import MODEL, MujocoFunction
+from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.noise.base import NoiseModel
+
+__all__ = ["NamedBox", "Robot", "from_mjcf", "from_spec", "require_alike"]
+
+
+class NamedBox(BoxUniform):
+    """A uniform prior on a box whose sides have names and units.
+
+    Attributes:
+        names: One a parameter.
+        units: One a parameter, "" for none.
+    """
+
+    def __init__(self, parameters: Sequence[Bounded]) -> None:
+        self.names = tuple(p.name for p in parameters)
+        self.units = tuple(p.unit for p in parameters)
+        super().__init__(
+            torch.tensor([p.low for p in parameters]),
+            torch.tensor([p.high for p in parameters]),
+        )
+
+
+class Robot(NamedTuple):
+    """What a campaign or the closed loop needs of a robot.
+
+    Attributes:
+        simulator: Runs MuJoCo; ``simulator.fn`` is a :class:`.MujocoFunction`.
+        prior: Uniform within the bounds of the parameters.
+        actions: What the robot may do; None where only recordings say that.
+        trials: The recordings; None where there are none.
+    """
+
+    simulator: SimulatorModel
+    prior: NamedBox
+    actions: ActionSpace | None = None
+    trials: Trials | None = None
+
+
+def from_mjcf(
+    spec_or_path: Any,
+    parameters: Mapping[str, Any],
+    *,
+    inputs: Sequence[str] | SignalActions | None = None,
+    sensors: Sequence[str] | None = None,
+    actions: ActionSpace | None = None,
+    times: Any = None,
+    noise: NoiseModel | float | Tensor | Mapping[str, float] | None = None,
+    start: Mapping[str, float] | str | None = None,
+    recordings: Any = None,
+    threads: int = 1,
+) -> Robot:
+    r"""Return a robot from its MJCF, ready for ``Campaign`` and ``close_loop``.
+
+    Args:
+        spec_or_path: An ``MjSpec``, the path of an MJCF, or its text; or a list of such
+            that share all parameters, as with and without a payload, of which the entry
+            "model" of an action is the number.
+        parameters: What is unknown, by name: ``{"hinge.damping": (low, high)}`` for a
+            quantity of :mod:`.quantities`; ``{"friction": (low, high,
+            "hinge.frictionloss")}`` under a name of one's own; ``{"length": (low, high,
+            edit)}`` with ``edit(spec, value)`` for what only the spec can say. The
+            prior is uniform within these bounds.
+        inputs: Actuators that recordings drive, None for all; or a space of signals
+            named by actuators, which are then the actions.
+        sensors: Sensors of the MJCF that are read, None for all; also joints, as in
+            "hinge" or "hinge velocity", for which it has no sensor.
+        actions: What is chosen in each trial where that is no signal: its names are
+            joints (start positions), joints with " velocity", or actuators (a control
+            that is held).
+        times: At which sensors are read, s from the start of a trial, shape (k,); None
+            takes those of the inputs, of the recordings, or they come with the trials.
+        noise: Of the sensors, as ``SimulatorModel`` takes it, or standard deviations by
+            sensor; None takes ``noise`` of the sensors in the MJCF, where it is given.
+        start: Of every trial whose action or recording does not say: positions and
+            velocities by name, or the name of a keyframe. None is the model's.
+        recordings: Logs, one a trial, as in :func:`.trials_of`.
+        threads: Of MuJoCo's rollout, in each process. Results do not depend on it.
+
+    Raises:
+        ValueError: If the MJCF does not compile, a name does not exist (the nearest are
+            told), a control is outside its range, or a log does not fit.
+        ImportError: If MuJoCo is not installed.
+
+    Example:
+        >>> robot = from_mjcf(
+        ...     '''<mujoco><worldbody><body name="bob"><joint name="hinge" axis="0 1 0"
+        ...     /><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/>
+        ...     </body></worldbody></mujoco>''',
+        ...     {"hinge.damping": (0.0, 0.1)}, sensors=["hinge"], noise=0.01,
+        ...     times=[0.1, 0.2], start={"hinge": 1.0},
+        ... )
+        >>> robot.simulator.parameter_names, robot.prior.units
+        (['hinge.damping'], ('N m s/rad',))
+        >>> robot.simulator.mean(torch.zeros(1, 1), torch.zeros(1, 1)).shape
+        torch.Size([1, 2])
+    """
+    every = spec_or_path if isinstance(spec_or_path, list | tuple) else [spec_or_path]
+    sources = [_read(given, sensors) for given in every]
+    declared = bounded(sources[0].compile(), parameters)
+    machines = [Machine(source, declared) for source in sources]
+    require_alike(machines)
+    machine = machines[0]
+    channels = channels_of(machine.model, sensors)
+    space, driven = _inputs(machine.model, inputs)
+    actions = _actions(machine.model, actions, space)
+    trials = None
+    if recordings is not None:
+        trials = trials_of(machine.model, recordings, channels, inputs=driven)
+        if times is None and trials.sample_times is not None:
+            times = trials.sample_times if trials.sample_times.ndim == 1 else None
+    if times is None and space is not None:
+        times = space.input_times
+    grid = None if times is None else np.asarray(times, dtype=np.float64)
+    function = MujocoFunction(
+        machines,
+        channels,
+        roles=() if actions is None or space is not None else actions.names,
+        times=grid,
+        start=_start(machine.model, start),
+        threads=threads,
+    )
+    simulator = SimulatorModel(
+        function,
+        noise=_noise(machine.model, channels, noise),
+        parameter_names=[p.name for p in declared],
+        channel_names=[_labeled(c) for c in channels],
+        sample_times=None if grid is None else torch.from_numpy(grid),
+        inputs=space,
+    )
+    prior = NamedBox(declared)
+    warn_of_idle(simulator, prior, actions, trials)
+    return Robot(simulator, prior, actions, trials)
+
+
+def _read(given: Any, sensors: Sequence[str] | None) -> Source:
+    source = Source(given)
+    return added_sensors(source, source.compile(), sensors)
+
+
+def require_alike(machines: Sequence[Machine]) -> None:
+    """Raise where models differ in what trials say of them by name."""
+    for kind in ("joint", "actuator", "sensor"):
+        names = [names_of(machine.model, kind) for machine in machines]
+        for k, own in enumerate(names):
+            if own != names[0]:
+                raise ValueError(
+                    f"expected models with the same {kind}s; got {', '.join(own)} in "
+                    f"model {k} beside {', '.join(names[0])}; name them alike"
+                )
+
+
+def from_spec(spec_or_path: Any) -> SimulatorModel:
+    """Return the simulator of a model without parameters, by all its joints."""
+    source = Source(spec_or_path)
+    model = source.compile()
+    sensors = names_of(model, "sensor") or [
+        name for name in names_of(model, "joint") if is_scalar(model, name)
+    ]
+    source = added_sensors(source, model, sensors)
+    machine = Machine(source, ())
+    channels = channels_of(machine.model, sensors)
+    return SimulatorModel(MujocoFunction([machine], channels))
+
+
+def _labeled(channel: Any) -> str:
+    return f"{channel.name} [{channel.unit}]" if channel.unit else channel.name
+
+
+def _inputs(model: Any, inputs: Any) -> tuple[SignalActions | None, list[str]]:
+    """Return the space of signals, if any, and the names of driven actuators."""
+    known = names_of(model, "actuator")
+    if not isinstance(inputs, SignalActions):
+        driven = known if inputs is None else [*inputs]
+        for name in driven:
+            require_name(name, known, "actuator")
+        return None, driven
+    played = inputs.inputs(inputs.sample((64,), seed=0))
+    for name, series in played.items():
+        require_name(name, known, "actuator")
+        require_in_range(model, name, series.numpy(), "a signal")
+    return inputs, [*played]
+
+
+def _actions(
+    model: Any, actions: ActionSpace | None, space: SignalActions | None
+) -> ActionSpace | None:
+    """Return the actions, whose entries are known to the model."""
+    if space is not None:
+        if actions is not None:
+            raise ValueError(
+                "expected signals or actions; got both; pass a generator that takes "
+                "all entries of the action"
+            )
+        return space
+    if actions is not None:
+        known = [*start_places(model), *names_of(model, "actuator"), MODEL]
+        for k, name in enumerate(actions.names):
+            require_name(name, known, "joint, a joint with ' velocity', or an actuator")
+            if name in names_of(model, "actuator"):
+                drawn = actions.sample((64,), seed=0)[:, k]
+                require_in_range(model, name, drawn.numpy(), "an action")
+    return actions
+
+
+def _start(
+    model: Any, start: Mapping[str, float] | str | None
+) -> dict[str, float] | None:
+    if start is None:
+        return None
+    places = start_places(model)
+    if isinstance(start, str):
+        i = element_id(model, "key", start)
+        state = [*model.key_qpos[i], *model.key_qvel[i], *model.key_act[i]]
+        return {name: float(state[place]) for name, place in places.items()}
+    for name in start:
+        require_name(name, places, "joint, or one with ' velocity',")
+    return {name: float(value) for name, value in start.items()}
+
+
+def _noise(model: Any, channels: Sequence[Any], noise: Any) -> Any:
+    if isinstance(noise, Mapping):
+        known = [c.name for c in channels]
+        for name in noise:
+            require_name(name, known, "sensor")
+        lost = [name for name in known if name not in noise]
+        if lost:
+            raise ValueError(
+                f"expected the noise of every sensor; got none of {', '.join(lost)}; "
+                "add it"
+            )
+        sds = [float(noise[name]) for name in known]
+        return sds[0] if len(sds) == 1 else torch.tensor(sds)
+    if noise is not None:
+        return noise
+    owner = np.repeat(np.arange(model.nsensor), model.sensor_dim)
+    sds = [float(model.sensor_noise[owner[c.place]]) for c in channels]
+    if min(sds) <= 0:
+        return None
+    return sds[0] if len(sds) == 1 else torch.tensor(sds)

@@ -1,0 +1,109 @@
+"""What is read: sensors of the MJCF, and those of joints that it does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sbi_active.mujoco.models.names import names_of, require_name
+from sbi_active.mujoco.models.quantities import is_hinge, is_scalar
+from sbi_active.mujoco.models.spec import Source, mujoco_of
+from sbi_active.mujoco.simulator import Channel
+
+__all__ = ["JointSensor", "added_sensors", "channels_of"]
+
+VELOCITY = " velocity"
+
+
+@dataclass(frozen=True)
+class JointSensor:
+    """Adds a sensor of a joint's position or velocity."""
+
+    name: str
+    joint: str
+    is_speed: bool
+
+    def __call__(self, spec: Any) -> None:
+        """Add it to a spec."""
+        mujoco = mujoco_of()
+        kinds = mujoco.mjtSensor
+        is_speed = self.is_speed
+        spec.add_sensor(
+            name=self.name,
+            type=kinds.mjSENS_JOINTVEL if is_speed else kinds.mjSENS_JOINTPOS,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=self.joint,
+        )
+
+
+def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> Source:
+    """Return a source with sensors of those joints that are named in their place.
+
+    Args:
+        source: Of the model.
+        model: Compiled.
+        sensors: Names; None for those that the model has.
+
+    Raises:
+        ValueError: If there is neither a sensor nor a joint of a name, or none at all.
+    """
+    own = names_of(model, "sensor")
+    joints = [j for j in names_of(model, "joint") if is_scalar(model, j)]
+    if sensors is None:
+        if not own:
+            raise ValueError(
+                "expected sensors in the MJCF; got none; pass sensors=['hinge'], say, "
+                f"of its joints {', '.join(map(repr, joints))}"
+            )
+        return source
+    if not len(sensors) or isinstance(sensors, str):
+        raise ValueError(
+            f"expected a list of sensors; got {sensors!r}; pass their names"
+        )
+    known = [*own, *joints, *[j + VELOCITY for j in joints]]
+    edits = []
+    for name in sensors:
+        require_name(name, known, "sensor or joint")
+        if name not in own:
+            edits.append(
+                JointSensor(name, name.removesuffix(VELOCITY), name.endswith(VELOCITY))
+            )
+    return source.edited(*edits)
+
+
+def channels_of(model: Any, sensors: Sequence[str] | None) -> tuple[Channel, ...]:
+    """Return the numbers that sensors read, in the order of their names.
+
+    Args:
+        model: Compiled, with all of them.
+        sensors: Names; None for all.
+    """
+    own = names_of(model, "sensor")
+    channels = []
+    for name in own if sensors is None else sensors:
+        i = own.index(name)
+        place, width = int(model.sensor_adr[i]), int(model.sensor_dim[i])
+        for k in range(width):
+            called = name if width == 1 else f"{name}[{k}]"
+            channels.append(Channel(called, place + k, _unit(model, i)))
+    return tuple(channels)
+
+
+def _unit(model: Any, i: int) -> str:
+    kinds = mujoco_of().mjtSensor
+    kind, position = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTPOS)
+    if kind in (position, int(kinds.mjSENS_JOINTVEL)):
+        joint = names_of(model, "joint")[int(model.sensor_objid[i])]
+        unit = "rad" if is_hinge(model, joint) else "m"
+        return unit if kind == position else f"{unit}/s"
+    fixed = {
+        kinds.mjSENS_ACCELEROMETER: "m/s^2",
+        kinds.mjSENS_GYRO: "rad/s",
+        kinds.mjSENS_FRAMEPOS: "m",
+        kinds.mjSENS_FORCE: "N",
+        kinds.mjSENS_TORQUE: "N m",
+        kinds.mjSENS_TOUCH: "N",
+        kinds.mjSENS_VELOCIMETER: "m/s",
+    }
+    return {int(key): unit for key, unit in fixed.items()}.get(kind, "")

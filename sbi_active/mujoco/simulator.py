@@ -1,0 +1,258 @@
+"""MuJoCo models as the function of a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.mujoco.models.changes import require_changes
+from sbi_active.mujoco.models.machine import Machine, Model, Rows
+from sbi_active.mujoco.models.names import names_of, require_name, start_places
+from sbi_active.mujoco.models.running import readings
+from sbi_active.mujoco.readout import held, num_steps, sampled
+
+__all__ = ["MODEL", "RECORDING", "Channel", "MujocoFunction"]
+
+Array = NDArray[Any]
+
+Watch = Callable[[Model, list[Any], Rows], Any]
+
+#: Numbers of readings, controls and states in memory at once.
+NUMBERS = 4_000_000
+#: Rows that are stepped together, each with data of its own.
+TOGETHER = 64
+#: Entry of an action that says which of several models runs.
+MODEL = "model"
+#: Entry of an action that is the number of a recording.
+RECORDING = "recording"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A number that a sensor reads.
+
+    Attributes:
+        name: What reports call it.
+        place: In the model's ``sensordata``.
+        unit: In SI, as far as the model tells it.
+    """
+
+    name: str
+    place: int
+    unit: str = ""
+
+
+class MujocoFunction:
+    r"""The function ``fn(theta, action, ...)`` of a simulator that runs MuJoCo.
+
+    Entries of an action are the names of joints (a start position), of joints with
+    " velocity", of actuators (a control that is held), or "model", the number of the
+    model that runs. Where the action parametrizes signals, or trials bring their own,
+    they come as ``inputs``, named by actuators.
+
+    Args:
+        machines: Models of one set of parameters.
+        channels: What is returned.
+        roles: Meaning of each entry of an action; "" for one that only names a trial.
+        times: At which it is returned where trials do not say, shape (k,).
+        start: Positions and velocities of all trials that do not say, by name.
+        threads: Of MuJoCo's rollout.
+        readout: What lies between the model's sensors and what is returned, with
+            ``readout.late(theta)``, by how much each channel reads what was there
+            before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
+        recorded: Model and start states of each recording, where the entry "recording"
+            of an action is its number.
+
+    Attributes:
+        machines: As given.
+        channels: As given.
+    """
+
+    def __init__(
+        self,
+        machines: Sequence[Machine],
+        channels: Sequence[Channel],
+        *,
+        roles: Sequence[str] = (),
+        times: Array | None = None,
+        start: Mapping[str, float] | None = None,
+        threads: int = 1,
+        readout: Any = None,
+        recorded: Sequence[tuple[int, Mapping[str, float]]] = (),
+    ) -> None:
+        self.readout, self.recorded = readout, tuple(recorded)
+        self.machines, self.channels = tuple(machines), tuple(channels)
+        self.roles, self.threads = tuple(roles), threads
+        self.times, self.start = times, dict(start or {})
+
+    @property
+    def model(self) -> Any:
+        """The first model, as compiled."""
+        return self.machines[0].model
+
+    def __call__(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        *,
+        inputs: Mapping[str, Tensor] | None = None,
+        input_times: Tensor | None = None,
+        times: Tensor | None = None,
+        start: Any = None,
+        model: Any = None,
+        force: Any = None,
+        watch: Watch | None = None,
+    ) -> Tensor:
+        """Return what the sensors read.
+
+        Args:
+            theta: Shape (n, d).
+            action: Shape (n, action_dim).
+            inputs: Controls by actuator, shape (n, m), held between their times.
+            input_times: Shape (m,); the simulation starts at the first.
+            times: Of the readings, shape (n, k).
+            start: By name of a joint, or with " velocity", shape (n,).
+            model: Changes of the model, {:class:`.ModelChange`: (n, k)}.
+            force: Generalized forces, {:class:`.Force`: (n, k)}.
+            watch: Called with the rows that run, before they do.
+
+        Returns:
+            Shape (n, k, channels), or (n, k) of a single one; NaN in a row that
+            diverged.
+        """
+        num = len(theta)
+        actions = action.detach().cpu().double().numpy()
+        wanted = self._times(times, num)
+        series = {k: _array(u) for k, u in (inputs or {}).items()}
+        grid = None if input_times is None else _array(input_times)
+        starts = self._starts(start, actions, num)
+        which = np.rint(starts.pop(MODEL, np.zeros(num))).astype(int)
+        if num and (which.min() < 0 or which.max() >= len(self.machines)):
+            raise ValueError(
+                f"expected models 0 to {len(self.machines) - 1}; got {which.min()} to "
+                f"{which.max()}; correct the action"
+            )
+        found = np.empty((num, wanted.shape[1], len(self.channels)))
+        changes = require_changes("model", model)
+        forces = require_changes("force", force)
+        for k, machine in enumerate(self.machines):
+            own = np.flatnonzero(which == k)
+            if not len(own):
+                continue
+            rows = Rows(
+                _array(theta)[own],
+                {c: phi[own] for c, phi in changes.items()},
+                {f: phi[own] for f, phi in forces.items()},
+                {name: value[own] for name, value in starts.items()},
+                np.empty((len(own), 0)),
+            )
+            found[own] = self._run(
+                machine,
+                rows,
+                {name: u[own] for name, u in series.items()},
+                grid,
+                actions[own],
+                wanted[own],
+                watch,
+            )
+        x = torch.from_numpy(found[..., 0] if len(self.channels) == 1 else found)
+        return x.to(theta.dtype)
+
+    def _run(
+        self,
+        machine: Machine,
+        rows: Rows,
+        series: dict[str, Array],
+        grid: Array | None,
+        actions: Array,
+        times: Array,
+        watch: Watch | None,
+    ) -> Array:
+        base = machine.model
+        step = base.opt.timestep
+        begin = 0.0 if grid is None else float(grid[0])
+        num = num_steps(times, begin, step)
+        width = base.nu + base.nsensordata + base.nq + base.nv + 1
+        size = max(1, NUMBERS // (num * width))
+        if rows.forces:
+            size = min(size, TOGETHER)
+        numbers = np.arange(len(rows), dtype=float)[:, None]
+        places = [c.place for c in self.channels]
+        # Controls of all rows may be large: they are made for those that run.
+        rows.controls = numbers
+
+        def run(model: Model, models: list[Any], some: Rows) -> Array:
+            at = some.controls[:, 0].astype(int)
+            some.controls = self._controls(base, series, grid, actions, at, num, step)
+            if watch is not None:
+                watch(model, models, some)
+            x = readings(model, models, some, threads=self.threads)
+            late = None if self.readout is None else self.readout.late(some.theta)
+            x = sampled(x[..., places], times[at], begin, step, late)
+            return x if self.readout is None else self.readout.read(x, some.theta)
+
+        return machine.models(rows, run, size)
+
+    def _controls(
+        self,
+        model: Any,
+        series: dict[str, Array],
+        grid: Array | None,
+        actions: Array,
+        at: Array,
+        num: int,
+        step: float,
+    ) -> Array:
+        names = names_of(model, "actuator")
+        controls = np.zeros((len(at), num, model.nu))
+        for role, value in zip(self.roles, actions[at].T, strict=False):
+            if role in names:
+                controls[:, :, names.index(role)] = value[:, None]
+        for name, u in series.items():
+            require_name(name, names, "actuator")
+            assert grid is not None
+            controls[:, :, names.index(name)] = held(u[at], grid, num, step)
+        return controls
+
+    def _times(self, times: Tensor | None, num: int) -> Array:
+        if times is not None:
+            return _array(times)
+        if self.times is None:
+            raise ValueError(
+                "expected the times at which sensors are read; got none; pass times= "
+                "to from_mjcf, or Trials(sample_times=...)"
+            )
+        return np.broadcast_to(self.times, (num, len(self.times)))
+
+    def _starts(self, start: Any, actions: Array, num: int) -> dict[str, Array]:
+        known = {*start_places(self.model), MODEL}
+        found = {name: np.full(num, value) for name, value in self.start.items()}
+        if RECORDING in self.roles and start is None:
+            number = np.rint(actions[:, self.roles.index(RECORDING)]).astype(int)
+            each = [{MODEL: k, **values} for k, values in self.recorded]
+            for name in each[0]:
+                found[name] = np.array([own[name] for own in each])[number]
+        for role, value in zip(self.roles, actions.T, strict=False):
+            if role in known:
+                found[role] = value
+        if start is None:
+            return found
+        if not isinstance(start, Mapping):
+            raise ValueError(
+                "expected start states by the names of joints; got an array; pass "
+                "Trials(start={'hinge': angles})"
+            )
+        for name, value in start.items():
+            require_name(name, known, "joint, or one with ' velocity',")
+            found[name] = _array(value)
+        return found
+
+
+def _array(value: Tensor) -> Array:
+    return value.detach().cpu().double().numpy()

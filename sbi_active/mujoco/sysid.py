@@ -1,0 +1,366 @@
+r"""Data and parameters of ``mujoco.sysid`` as simulator, prior, actions and trials.
+
+What is simulated is what it simulates: controls are lines between their samples, taken
+at the model's steps and held over each; a sensor's reading is stamped with the end of
+the step at whose begin it was taken, and a state with its own time. Signals are
+compared at the measured times that its window keeps. A transform's delays, gains and
+biases act on the prediction, those of the measured signals the other way round, so that
+outcomes are in the units in which they were measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.actions.signals import SignalActions
+from sbi_active.actions.waveforms import Recorded
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.mujoco.idle import warn_of_idle
+from sbi_active.mujoco.models.machine import Machine
+from sbi_active.mujoco.models.names import names_of, start_places
+from sbi_active.mujoco.models.spec import Source
+from sbi_active.mujoco.recordings import require_in_range
+from sbi_active.mujoco.residuals import free_parameters, from_residuals
+from sbi_active.mujoco.robot import NamedBox, Robot, require_alike
+from sbi_active.mujoco.sensors import JointSensor
+from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunction
+from sbi_active.mujoco.transforms import Signal, SignalReadout
+from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
+from sbi_active.simulation.noise.base import NoiseModel
+
+__all__ = ["from_sysid"]
+
+Array = NDArray[Any]
+
+#: Unknown errors, from this share of a signal's deviation up to all of it, lasting from
+#: this share of a sample's distance up to this share of a trial.
+SHARE, SHORT, LONG = 1e-4, 0.1, 0.5
+#: Endings of signals that are states, by kind.
+STATES = {"MjStateQPos": "_qpos", "MjStateQVel": "_qvel"}
+SPEED = "MjStateQVel"
+
+
+def from_sysid(
+    model_sequences: Any,
+    params: Any,
+    *,
+    transform: Any = None,
+    actions: ActionSpace | None = None,
+    noise: NoiseModel | float | Tensor | None = None,
+    threads: int = 1,
+) -> Robot:
+    r"""Return a robot from the data and parameters of ``mujoco.sysid``.
+
+    Several ``ModelSequences``, as of a robot with and without a payload, share theta.
+    Parameters keep the order of ``params.as_vector()``, and frozen ones their value.
+
+    Args:
+        model_sequences: One ``ModelSequences`` or several; or a ``residual_fn`` of
+            ``build_residual_fn``, which is taken as a simulator as it is: an outcome is
+            then minus its residual, whose measured value is 0.
+        params: A ``ParameterDict``. A uniform prior within ``get_bounds()``.
+        transform: A ``SignalTransform``; of its weights and its normalization nothing
+            is needed where noise is declared.
+        actions: What the robot may do; None takes the recorded sequences, of which the
+            action is the number. Entries are those of :class:`.MujocoFunction`; "model"
+            is the number of a ``ModelSequences``.
+        noise: Of the signals, one or one a signal; None takes autocorrelated errors of
+            unknown size, one a signal, and unknown correlation time. Of a
+            ``residual_fn`` it is needed.
+        threads: Of MuJoCo's rollout.
+
+    Raises:
+        ValueError: If signals differ between sequences, a signal is not one of the
+            model, a control or a measured signal is not finite, or a control is outside
+            its range.
+    """
+    if callable(model_sequences):
+        return from_residuals(model_sequences, params, noise=noise)
+    groups = _groups(model_sequences)
+    edit = _Edit.of(params)
+    declared = free_parameters(params)
+    signals = _signals(groups)
+    machines, channels = [], ()
+    for group in groups:
+        source, channels = _readable(Source(group.spec), signals)
+        machines.append(Machine(source, declared, edit=edit))
+    require_alike(machines)
+    step = float(machines[0].model.opt.timestep)
+    is_sensor = [s.kind == "MjSensor" for s in signals for _ in range(s.width)]
+    readout = SignalReadout.of(transform, params, signals, np.array(is_sensor) * step)
+    kept = [k for k, c in enumerate(channels) if readout.keeps(c.name)]
+    channels = tuple(channels[k] for k in kept)
+    readout = readout.only(kept)
+    sequences = [
+        _Sequence.of(k, group, i, signals, step, readout, kept, machines[k].model)
+        for k, group in enumerate(groups)
+        for i in range(len(group.control))
+    ]
+    trials = _trials(sequences, channels)
+    recorded = [(s.model, s.start) for s in sequences]
+    roles: tuple[str, ...] = (RECORDING,)
+    if actions is None:
+        space: ActionSpace = _recorded(trials)
+    else:
+        space, roles = actions, tuple(actions.names)
+    times = trials.sample_times
+    grid = times if times is not None and times.ndim == 1 else None
+    function = MujocoFunction(
+        machines,
+        channels,
+        roles=roles,
+        times=None if grid is None else grid.numpy(),
+        threads=threads,
+        readout=readout,
+        recorded=recorded,
+    )
+    simulator = SimulatorModel(
+        function,
+        noise=_noise(trials) if noise is None else noise,
+        parameter_names=[p.name for p in declared],
+        channel_names=[c.name for c in channels],
+        sample_times=grid,
+        inputs=space if isinstance(space, SignalActions) else None,
+    )
+    prior = NamedBox(declared)
+    warn_of_idle(simulator, prior, space, trials)
+    return Robot(simulator, prior, space, trials)
+
+
+@dataclass
+class _Edit:
+    """Puts parameters into a spec by their modifiers.
+
+    A ``Parameter`` that is pickled loses its modifier: what it has is kept apart.
+    """
+
+    each: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, params: Any) -> _Edit:
+        """Return the edit of a ``ParameterDict``."""
+        return cls([dict(vars(params[name])) for name in params.keys()])  # noqa: SIM118
+
+    def __call__(self, spec: Any, theta: Array) -> None:
+        params = self.params()
+        params.update_from_vector(np.asarray(theta))
+        for name in params.keys():  # noqa: SIM118
+            if not params[name].frozen:
+                params[name].apply_modifier(spec)
+
+    def params(self) -> Any:
+        """Return a ``ParameterDict`` of its own."""
+        from mujoco.sysid import Parameter, ParameterDict  # pyright: ignore
+
+        found = ParameterDict()
+        for each in self.each:
+            parameter = Parameter.__new__(Parameter)
+            parameter.__dict__.update(each)
+            parameter.value = np.array(each["value"], dtype=float)
+            found.add(parameter)
+        return found
+
+
+def _groups(given: Any) -> list[Any]:
+    groups = list(given) if isinstance(given, Sequence) else [given]
+    for group in groups:
+        for part in ("spec", "control", "sensordata", "initial_state"):
+            if not hasattr(group, part):
+                raise TypeError(
+                    f"expected ModelSequences of mujoco.sysid; got "
+                    f"{type(group).__name__}; pass one or a list"
+                )
+    if not groups:
+        raise ValueError("expected at least one ModelSequences; got none; pass one")
+    return groups
+
+
+def _signals(groups: Sequence[Any]) -> list[Signal]:
+    """Return the signals that all sequences have."""
+    found: list[Signal] | None = None
+    for group in groups:
+        for series in group.sensordata:
+            mapping = series.signal_mapping
+            if mapping is None:
+                mapping = type(series).compute_all_sensor_mapping(group.gt_model)
+            own = [
+                Signal(name, kind.name, len(np.atleast_1d(places)))
+                for name, (kind, places) in mapping.items()
+            ]
+            if found is not None and own != found:
+                raise ValueError(
+                    f"expected the same signals in all sequences; got "
+                    f"{[s.name for s in own]} in {group.name!r} beside "
+                    f"{[s.name for s in found]}; slice them by name"
+                )
+            found = own
+    assert found is not None
+    return found
+
+
+def _readable(
+    source: Source, signals: Sequence[Signal]
+) -> tuple[Source, tuple[Channel, ...]]:
+    """Return a source with a sensor of every signal, and the channels."""
+    model = source.compile()
+    joints = {
+        n for n, place in start_places(model).items() if " " not in n and place >= 0
+    }
+    edits, reads = [], {}
+    for signal in signals:
+        if signal.kind in STATES:
+            joint = signal.name.removesuffix(STATES[signal.kind])
+            if joint not in joints:
+                raise ValueError(
+                    f"expected the state of a hinge or slide; got {signal.name!r}; "
+                    "pass sensors of other joints"
+                )
+            reads[signal.name] = f"state {signal.name}"
+            edits.append(JointSensor(reads[signal.name], joint, signal.kind == SPEED))
+        elif signal.kind == "MjSensor":
+            reads[signal.name] = signal.name
+        else:
+            raise ValueError(
+                f"expected sensors, positions or velocities; got {signal.name!r} of "
+                f"type {signal.kind}; pass a residual_fn, which knows what it is"
+            )
+    source = source.edited(*edits)
+    model = source.compile()
+    own = names_of(model, "sensor")
+    channels = []
+    for signal in signals:
+        i = own.index(reads[signal.name])
+        for k in range(signal.width):
+            name = signal.name if signal.width == 1 else f"{signal.name}[{k}]"
+            channels.append(Channel(name, int(model.sensor_adr[i]) + k))
+    return source, tuple(channels)
+
+
+@dataclass
+class _Sequence:
+    """A recorded sequence, its times from the begin of its control."""
+
+    name: str
+    model: int
+    start: dict[str, float]
+    times: Array
+    x: Array
+    controls: dict[str, Array]
+    grid: Array
+
+    @classmethod
+    def of(
+        cls,
+        k: int,
+        group: Any,
+        i: int,
+        signals: Sequence[Signal],
+        step: float,
+        readout: SignalReadout,
+        kept: Sequence[int],
+        model: Any,
+    ) -> _Sequence:
+        """Return a sequence of a group."""
+        what = f"sequence {group.sequence_name[i]!r} of {group.name!r}"
+        control = group.control[i].resample(target_dt=step)
+        begin = float(control.times[0])
+        end = begin + (len(control.times) - 1) * step
+        series = group.sensordata[i]
+        _require_finite(group.control[i].data, f"controls in {what}")
+        mapping = series.signal_mapping or type(series).compute_all_sensor_mapping(
+            group.gt_model
+        )
+        columns = np.concatenate(
+            [np.atleast_1d(mapping[s.name][1]).astype(int) for s in signals]
+        )[list(kept)]
+        times = np.asarray(series.times, dtype=float)
+        low, high = readout.window
+        slack = 1e-9 * max(abs(end), step)
+        inside = (times >= begin + step - low - slack) & (times <= end - high + slack)
+        if not inside.any():
+            raise ValueError(
+                f"expected signals measured while the controls of {what} act, "
+                f"{begin:g} to {end:g}; got none; give both in one unit"
+            )
+        names = names_of(model, "actuator")
+        data = np.asarray(control.data, dtype=float)
+        for j, name in enumerate(names):
+            require_in_range(model, name, data[:, j], what)
+        state = np.asarray(group.initial_state[i], dtype=float)
+        return cls(
+            str(group.sequence_name[i]),
+            k,
+            {n: float(state[1 + place]) for n, place in start_places(model).items()},
+            times[inside] - begin,
+            np.asarray(series.data, dtype=float)[inside][:, columns],
+            {name: data[:, j] for j, name in enumerate(names)},
+            step * np.arange(len(data)),
+        )
+
+
+def _require_finite(value: Any, what: str) -> None:
+    rows = np.flatnonzero(~np.isfinite(np.asarray(value, dtype=float)).all(-1))
+    if len(rows):
+        raise ValueError(
+            f"expected finite {what}; got NaN or inf in row {rows[0]}; fill in what "
+            "was commanded, or cut the log there"
+        )
+
+
+def _trials(sequences: Sequence[_Sequence], channels: Sequence[Channel]) -> Trials:
+    """Return sequences as trials, of which the action is the number."""
+    single = len(channels) == 1
+    times = [s.times for s in sequences]
+    same = all(len(t) == len(times[0]) and (t == times[0]).all() for t in times)
+    controls = {
+        name: [s.controls[name] for s in sequences] for name in sequences[0].controls
+    }
+    return Trials(
+        np.arange(len(sequences), dtype=float)[:, None],
+        [s.x[:, 0] if single else s.x for s in sequences],
+        sample_times=times[0] if same else times,
+        names=[s.name for s in sequences]
+        if len({s.name for s in sequences}) == len(sequences)
+        else None,
+        action_labels=["recording"],
+        channel_labels=[c.name for c in channels],
+        inputs=controls or None,
+        input_times=[s.grid for s in sequences] if controls else None,
+        start={
+            MODEL: [float(s.model) for s in sequences],
+            **{name: [s.start[name] for s in sequences] for name in sequences[0].start},
+        },
+    )
+
+
+def _recorded(trials: Trials) -> ActionSpace:
+    """Return the space of the recorded sequences."""
+    if trials.inputs is None:
+        return DiscreteActions(trials.action.float(), names=[RECORDING])
+    assert trials.input_times is not None
+    played = Recorded(trials.inputs, trials.input_times, names=(RECORDING,))
+    return SignalActions(played)
+
+
+def _noise(trials: Trials) -> AutocorrelatedNoise:
+    """Return errors of unknown size and duration, one size a signal."""
+    x = trials.x.double()
+    x = x.reshape(*x.shape[:2], -1)
+    times = trials.sample_times
+    assert times is not None
+    gap = float(times.diff(dim=-1)[times.diff(dim=-1).isfinite()].median())
+    spread = np.nanstd(x.numpy(), (0, 1))
+    spread = np.where(spread > 0, spread, 1.0)
+    pairs = [(SHARE * float(sd), float(sd)) for sd in spread]
+    span = float(times.nan_to_num(0.0).max())
+    return AutocorrelatedNoise.unknown(
+        sd=pairs[0] if len(pairs) == 1 else pairs,
+        correlation_time=(SHORT * gap, max(LONG * span, gap)),
+    )

@@ -1,0 +1,226 @@
+"""Effects enumerated from a model: names, nulls, and what they do."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.robots.models import ARM, BALL, PENDULUM, TIMES
+from sbi_active import BoxActions
+from sbi_active.criticism import AugmentedSimulator
+from sbi_active.mujoco import from_mjcf, mjcf_effects
+from sbi_active.mujoco.effects.acting import force_effect, half_normal
+from sbi_active.mujoco.effects.powers import PowerForce
+from tests.mujoco.test_robot import pendulum
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return pendulum(parameters={"hinge.damping": (0.0, 0.1)})
+
+
+@pytest.fixture(scope="module")
+def effects(robot):
+    return {effect.name: effect for effect in mjcf_effects(robot)}
+
+
+def run(robot, effect, phi, angle=1.0):
+    model = AugmentedSimulator(robot.simulator, [effect])
+    theta = torch.full((len(phi), 1), 0.03, dtype=torch.float64)
+    action = torch.full((len(phi), 1), angle, dtype=torch.float64)
+    phi = torch.tensor(phi, dtype=torch.float64)[:, None]
+    return model.evaluate(theta, {effect.name: phi}, action).numpy()
+
+
+def test_a_joint_has_what_a_plain_one_lacks(effects):
+    joint = {n.removeprefix("hinge ") for n in effects if n.startswith("hinge ")}
+    assert joint >= {
+        "friction loss",
+        "quadratic damping",
+        "cubic damping",
+        "stiffness",
+        "quadratic stiffness",
+        "cubic stiffness",
+        "armature",
+        "zero offset",
+        "backlash",
+        "series elasticity",
+        "sensor bias",
+        "sensor gain",
+        "sensor delay",
+        "sensor lag",
+        "sensor quantum",
+    }
+    assert {"bob payload", "gravity tilt y", "medium density"} <= {*effects}
+
+
+def test_parameters_and_what_changes_nothing_are_left_out(effects):
+    assert "hinge viscous damping" not in effects  # a parameter of the model
+    assert "bob center of mass y" not in effects  # along the axis
+    assert not [name for name in effects if "contact" in name]
+
+
+def test_every_effect_has_a_name_a_unit_a_null_and_a_family(effects):
+    assert all(e.describe and e.family for e in effects.values())
+    assert effects["hinge friction loss"].units == "N m"
+    assert effects["hinge series elasticity"].units == "rad/N m"
+    assert effects["bob payload"].units == "kg"
+    # A fifth of the generalized force, which gravity's share m g l / sqrt(2) dominates.
+    sd = effects["hinge friction loss"].declared_draws().square().mean().sqrt()
+    assert 0.2 * 1.0 < sd < 0.2 * 4.0
+
+
+def test_every_effect_vanishes_at_its_null_and_moves_the_robot(robot, effects):
+    theta = robot.prior.sample((4,)).double()
+    action = robot.actions.sample((4,)).double()
+    model = AugmentedSimulator(robot.simulator, [*effects.values()])
+    bare = robot.simulator.mean(theta, action)
+    for effect in effects.values():
+        null = effect.null_phi(4)
+        assert (model.evaluate(theta, {effect.name: null}, action) == bare).all()
+        phi = effect.declared_draws()[:4]
+        changed = model.evaluate(theta, {effect.name: phi}, action)
+        assert changed.isfinite().all(), effect.name
+        assert (changed - bare).abs().max() > 1e-9, effect.name
+
+
+def test_fields_are_those_of_the_mjcf(robot, effects):
+    def native(**attributes):
+        text = " ".join(f'{k}="{v}"' for k, v in attributes.items())
+        other = from_mjcf(
+            PENDULUM.replace('damping="0.03"', f'damping="0.03" {text}'),
+            {"hinge.damping": (0.0, 0.1)},
+            sensors=["hinge"],
+            actions=robot.actions,
+            times=TIMES,
+            noise=0.01,
+        )
+        theta = torch.full((1, 1), 0.03, dtype=torch.float64)
+        return other.simulator.mean(theta, torch.ones(1, 1, dtype=torch.float64))
+
+    for attribute, name in (
+        ("frictionloss", "hinge friction loss"),
+        ("stiffness", "hinge stiffness"),
+        ("armature", "hinge armature"),
+    ):
+        x = run(robot, effects[name], [0.07])
+        assert x == pytest.approx(native(**{attribute: 0.07}).numpy(), abs=1e-12)
+
+
+@pytest.mark.parametrize(("what", "power"), [("damping", 2), ("stiffness", 3)])
+def test_a_force_of_the_caller_does_what_a_field_does(robot, effects, what, power):
+    if not hasattr(robot.simulator.fn.model, "dof_dampingpoly"):
+        pytest.skip("this MuJoCo has no polynomial springs and dampers")
+    word = {2: "quadratic", 3: "cubic"}[power]
+    native = run(robot, effects[f"hinge {word} {what}"], [0.05, 0.2])
+    force = force_effect(
+        "force", PowerForce(((0, 0, 0.0),), what, power), prior=half_normal(1.0)
+    )
+    # MuJoCo takes a part of its own at the end of a step, and a force at its begin.
+    assert run(robot, force, [0.05, 0.2]) == pytest.approx(native, abs=0.03)
+    bare = robot.simulator.mean(
+        torch.full((1, 1), 0.03, dtype=torch.float64),
+        torch.ones(1, 1, dtype=torch.float64),
+    )
+    assert run(robot, force, [0.0]) == pytest.approx(bare.numpy(), abs=0)
+    assert np.abs(native - bare.numpy()).max() > 0.1
+
+
+def test_play_lets_a_load_fall_by_its_width(robot, effects):
+    hold = pendulum(
+        parameters={"hinge.damping": (0.0, 0.1)},
+        start={"hinge": 0.0},
+        actions=BoxActions([-1.5], [1.5], names=["hinge velocity"]),
+    )
+    x = run(hold, effects["hinge backlash"], [0.0, 0.1], angle=0.0)
+    assert np.abs(x).max() < 0.06
+
+
+def test_a_compliant_servo_hangs_lower_behind_its_encoder():
+    robot = from_mjcf(
+        ARM,
+        {"shoulder.damping": (0.05, 0.2)},
+        sensors=["shoulder", "elbow"],
+        actions=BoxActions([-0.3], [0.3], names=["shoulder servo"]),
+        times=np.arange(0.1, 3, 0.1),
+        noise=0.001,
+    )
+    (effect,) = mjcf_effects(robot, include=["elbow series elasticity"])
+    model = AugmentedSimulator(robot.simulator, [effect])
+    theta = torch.full((2, 1), 0.1, dtype=torch.float64)
+    action = torch.zeros(2, 1, dtype=torch.float64)
+    x = model.evaluate(theta, {effect.name: torch.tensor([[0.0], [0.05]])}, action)
+    assert x.isfinite().all()
+    # At rest the encoder sees the load alone: that of a link that hangs a little lower.
+    assert (x[1, -1] - x[0, -1]).abs().max() < 0.05
+    assert (x[1] - x[0]).abs().max() > 1e-4
+
+
+def test_contacts_are_offered_where_something_touches():
+    robot = from_mjcf(
+        BALL, {"ball.mass": (0.05, 0.2)}, times=np.arange(0.02, 0.8, 0.02)
+    )
+    found = mjcf_effects(robot, include=["*softness", "*restitution"])
+    assert "contact restitution" in {e.name for e in found}
+    (effect,) = (e for e in found if e.name == "contact restitution")
+    model = AugmentedSimulator(robot.simulator, [effect])
+    theta = torch.full((2, 1), 0.1, dtype=torch.float64)
+    phi = torch.tensor([[0.0], [1.5]], dtype=torch.float64)
+    x = model.evaluate(theta, {effect.name: phi}, torch.zeros(2, 1).double())
+    bounce = x[:, 15:].amax(1)
+    assert bounce[1] > bounce[0] + 0.01
+
+
+def test_patterns_choose_and_unknown_ones_are_said(robot):
+    names = [e.name for e in mjcf_effects(robot, include=["*damping", "bob*"])]
+    assert {"hinge quadratic damping", "bob payload"} <= {*names}
+    assert not [n for n in mjcf_effects(robot, exclude=["hinge*"]) if "hinge" in n.name]
+    with pytest.raises(ValueError, match="did you mean 'hinge friction loss'"):
+        mjcf_effects(robot, include=["hinge frictionloss"])
+
+
+def test_a_spec_alone_has_effects_too():
+    names = {e.name for e in mjcf_effects(mujoco.MjSpec.from_string(ARM))}
+    assert {"elbow friction loss", "shoulder servo gain", "lower payload"} <= names
+
+
+@pytest.mark.parametrize("what", ["backlash", "series elasticity"])
+def test_transmissions_grow_from_nothing_without_a_jump(robot, effects, what):
+    effect = effects[f"hinge {what}"]
+    least = effect.apply.key.least
+    sizes = [0.0, 0.01 * least, 0.02 * least, 0.999 * least, 1.001 * least]
+    x = run(robot, effect, sizes)
+    moved = np.abs(x - x[0]).max(1)
+    assert moved[2] == pytest.approx(2 * moved[1], rel=1e-6)
+    assert np.abs(x[4] - x[3]).max() < 0.05 * moved[3]
+    assert moved[3] > 1e-4
+
+
+def test_two_transmissions_and_a_force_together():
+    robot = from_mjcf(
+        ARM,
+        {"shoulder.damping": (0.05, 0.2)},
+        sensors=["shoulder", "elbow"],
+        actions=BoxActions([-0.3], [0.3], names=["shoulder servo"]),
+        times=np.arange(0.1, 1, 0.1),
+        noise=0.001,
+    )
+    found = mjcf_effects(
+        robot, include=["elbow series elasticity", "shoulder backlash"]
+    )
+    # A torque on the shoulder, the first joint: with the inserted ones it is elsewhere.
+    pull = force_effect(
+        "pull", PowerForce(((0, 0, 1.0),), "stiffness", 1), prior=half_normal(1.0)
+    )
+    model = AugmentedSimulator(robot.simulator, [*found, pull])
+    theta = torch.full((1, 1), 0.1, dtype=torch.float64)
+    action = torch.zeros(1, 1, dtype=torch.float64)
+    phi = {e.name: torch.full((1, 1), 2 * e.apply.key.least).double() for e in found}
+    rest = {"pull": torch.full((1, 1), 2.0, dtype=torch.float64)}
+    bare = model.evaluate(theta, {}, action)
+    pulled = model.evaluate(theta, rest, action) - bare
+    both = model.evaluate(theta, {**phi, **rest}, action)
+    given = model.evaluate(theta, phi, action)
+    assert both.isfinite().all()
+    assert (given - bare).abs().max() > 1e-4
+    assert (both - given - pulled).abs().max() < 0.3 * pulled.abs().max()

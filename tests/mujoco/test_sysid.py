@@ -1,0 +1,274 @@
+"""The data and parameters of mujoco.sysid, and beliefs for it."""
+
+import pickle
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import pytest
+import torch
+import yaml
+from mujoco import sysid
+from sbi.utils import BoxUniform
+
+from benchmarks.robots.models import SPRING_MASS
+from sbi_active import GaussianNoise
+from sbi_active.mujoco import (
+    belief_to_parameters,
+    from_sysid,
+    mjcf_effects,
+    randomization,
+)
+from sbi_active.simulation import check_simulator, simulate
+
+if not hasattr(sysid, "Parameter"):
+    pytest.skip(
+        "needs mujoco.sysid; run pip install 'sbi-active[sysid]'",
+        allow_module_level=True,
+    )
+
+
+def mass(spec, parameter):
+    spec.body("cart").first_geom().mass = float(parameter.value[0])
+
+
+def gear(spec, parameter):
+    spec.actuator("push").gear[0] = float(parameter.value[0])
+
+
+def stiffness(spec, parameter):
+    spring = spec.joint("slide")
+    spring.stiffness = parameter.value[0] + 0.0 * np.asarray(spring.stiffness)
+
+
+def parameters(delay=False):
+    params = sysid.ParameterDict()
+    params.add(sysid.Parameter("mass", 1.0, 0.5, 2.0, modifier=mass))
+    params.add(
+        sysid.Parameter("stiffness", 20.0, 5.0, 40.0, modifier=stiffness, frozen=True)
+    )
+    params.add(sysid.Parameter("gear", 1.0, 0.5, 2.0, modifier=gear))
+    if delay:
+        params.add(sysid.Parameter("delay", 0.01, 0.0, 0.05))
+        params.add(sysid.Parameter("scale", 1.0, 0.8, 1.2))
+        params.add(sysid.Parameter("shift", 0.0, -0.1, 0.1))
+    return params
+
+
+def payload(text):
+    return text.replace(
+        "</body>",
+        '<geom type="sphere" size=".05" mass=".7" contype="0" conaffinity="0"/></body>',
+    )
+
+
+def sequences(text=SPRING_MASS, name="bare", num=2, spring=True):
+    if not spring:
+        text = text.replace('stiffness="20" damping="0.5"', "")
+    spec = mujoco.MjSpec.from_string(text)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    t = np.arange(0, 1.0, 0.01)
+    starts, controls, readings = [], [], []
+    for k in range(num):
+        control = np.sin((4 + k) * t)[:, None]
+        data.qpos[:] = 0.05 * k
+        start = sysid.create_initial_state(model, data.qpos, data.qvel, data.act)
+        state, sensor = mujoco.rollout.rollout(
+            model, mujoco.MjData(model), start, control[:-1]
+        )
+        starts.append(start)
+        controls.append(sysid.TimeSeries(t, control))
+        readings.append(
+            sysid.TimeSeries.from_names(
+                state[0, ::3, 0], sensor[0, ::3].copy(), model, None
+            )
+        )
+    names = [f"{name} {k}" for k in range(num)]
+    return sysid.ModelSequences(name, spec, names, starts, controls, readings)
+
+
+def test_outcomes_are_what_sysid_predicts():
+    """Two specs share theta, and outcomes are signals on the measured grid."""
+    groups = [sequences(), sequences(payload(SPRING_MASS), "payload")]
+    params = parameters()
+    robot = from_sysid(groups, params, noise=0.01)
+    assert robot.simulator.parameter_names == ["mass", "gear"]
+    assert [p.item() for p in robot.prior.base_dist.low] == pytest.approx([0.5, 0.5])
+    assert robot.trials is not None
+    assert robot.trials.names == ("bare 0", "bare 1", "payload 0", "payload 1")
+    residual_fn = sysid.build_residual_fn(models_sequences=groups)
+    for theta in ([1.0, 1.0], [1.4, 0.8]):
+        # Of a copy: sysid changes the spec that it was given.
+        _, predicted, _ = residual_fn(np.array(theta), params.copy())
+        rows = torch.tensor([theta] * 4, dtype=torch.float64)
+        x = robot.simulator.mean(
+            rows,
+            robot.trials.action,
+            inputs=robot.trials.inputs,
+            input_times=robot.trials.input_times,
+            start=robot.trials.start,
+            times=robot.trials.sample_times.expand(4, -1),
+        )
+        for k in range(4):
+            (series,) = predicted[k]
+            times = robot.trials.sample_times.numpy()
+            at = np.searchsorted(series.times, times - 1e-9)
+            assert series.times[at] == pytest.approx(times)
+            assert x[k].numpy() == pytest.approx(series.data[at], abs=1e-6)
+    played = robot.simulator.mean(rows, robot.actions.listed().double())
+    assert played.numpy() == pytest.approx(x.numpy(), abs=1e-9)
+
+
+def test_a_transform_acts_on_what_is_predicted():
+    params = parameters(delay=True)
+    transform = sysid.SignalTransform(normalize=False)
+    transform.delay("*", params["delay"])
+    transform.gain("position", params["scale"], target="predicted")
+    transform.bias("position", params["shift"], target="measured")
+    transform.enable_sensors(["position"])
+    group = sequences()
+    robot = from_sysid(group, params, transform=transform, noise=0.01)
+    assert robot.simulator.channel_names == ["position"]
+    residual_fn = sysid.build_residual_fn(
+        models_sequences=[group], modify_residual=transform.apply
+    )
+    theta = np.array([1.2, 0.9, 0.017, 1.1, 0.03])
+    found, _, measured = residual_fn(theta, params.copy())
+    rows = torch.tensor(theta)[None].expand(2, -1)
+    x = robot.simulator.mean(rows, robot.actions.listed().double())
+    assert robot.trials is not None
+    for k in range(2):
+        (series,) = measured[k]
+        residual = np.asarray(found[k]).reshape(len(series.times), -1)[:, 0]
+        own = robot.trials.x[k].numpy() - x[k].numpy()
+        assert own == pytest.approx(residual, abs=1e-6)
+
+
+def test_states_are_signals_too():
+    group = sequences()
+    for k, series in enumerate(group.sensordata):
+        group.sensordata[k] = sysid.TimeSeries.from_names(
+            series.times, series.data, group.gt_model, ["slide_qpos", "slide_qvel"]
+        )
+    robot = from_sysid(group, parameters(), noise=0.01)
+    assert robot.simulator.channel_names == ["slide_qpos", "slide_qvel"]
+
+
+def test_any_residual_is_a_deterministic_simulator():
+    group = sequences()
+    params = parameters()
+    residual_fn = sysid.build_residual_fn(models_sequences=[group])
+    robot = from_sysid(residual_fn, params, noise=GaussianNoise(0.1))
+    found, *_ = residual_fn(np.array([1.3, 0.9]), params.copy())
+    theta = torch.tensor([[1.3, 0.9]], dtype=torch.float64).expand(2, -1)
+    x = robot.simulator.mean(theta, robot.actions.listed().double())
+    assert x[1].numpy() == pytest.approx(-np.asarray(found[1]).reshape(-1))
+    assert robot.trials is not None
+    assert (robot.trials.x == 0).all()
+    with pytest.raises(ValueError, match="noise of residuals"):
+        from_sysid(residual_fn, params)
+
+
+def test_it_goes_to_other_processes_with_its_modifiers():
+    robot = from_sysid(sequences(), parameters(), noise=0.01)
+    theta = robot.prior.sample((6,))
+    action = robot.actions.sample((6,))
+    x = simulate(robot.simulator, theta, action, seed=0).x
+    other = simulate(
+        robot.simulator, theta, action, seed=0, num_workers=2, batch_size=2
+    )
+    assert (other.x == x).all()
+    again = pickle.loads(pickle.dumps(robot.simulator.fn.machines[0]))
+    assert again.model.nq == 1
+
+
+def test_what_no_trial_determines_is_named_and_the_payload_does():
+    """Mass and gear of a cart without a spring: only their ratio shows."""
+    params = parameters()
+    bare = from_sysid(sequences(spring=False), params, noise=0.001)
+    text = str(check_simulator(bare.simulator, bare.prior, bare.actions, num_rows=64))
+    assert "mass" in text
+    assert "gear" in text
+    report = check_simulator(bare.simulator, bare.prior, bare.actions, num_rows=64)
+    (found,) = report.undetermined
+    assert set(found.parameters) == {"mass", "gear"}
+    both = [
+        sequences(spring=False),
+        sequences(payload(SPRING_MASS), "payload", spring=False),
+    ]
+    loaded = from_sysid(both, params, noise=0.001)
+    report = check_simulator(
+        loaded.simulator, loaded.prior, loaded.actions, num_rows=64
+    )
+    assert not report.undetermined
+
+
+def test_errors_of_unknown_size_are_the_default():
+    robot = from_sysid(sequences(), parameters())
+    assert robot.simulator.noise.parameter_names[-1] == "correlation_time"
+
+
+def test_effects_of_a_sysid_robot():
+    robot = from_sysid(sequences(), parameters(), noise=0.01)
+    names = {e.name for e in mjcf_effects(robot, include=["slide*", "push*"])}
+    assert {"slide friction loss", "push gain", "push delay"} <= names
+
+
+def test_a_belief_comes_back_as_parameters(tmp_path):
+    params = parameters()
+    belief = BoxUniform(torch.tensor([0.9, 1.0]), torch.tensor([1.1, 1.4]))
+    file = tmp_path / "found.yaml"
+    found = belief_to_parameters(belief, params, path=file)
+    assert found["mass"].value == pytest.approx([1.0], abs=0.01)
+    assert found["gear"].get_bounds()[0] == pytest.approx([1.01], abs=0.01)
+    assert found["stiffness"].value == [20.0]
+    assert found["mass"].modifier is mass
+    assert params["mass"].value == [1.0]
+    loaded = sysid.ParameterDict.load_from_disk(file)
+    assert loaded.as_vector() == pytest.approx(found.as_vector())
+    assert loaded["stiffness"].frozen
+    assert {*yaml.safe_load(file.read_text())} == {"mass", "stiffness", "gear"}
+    fresh = belief_to_parameters(belief, names=["a", "b"])
+    assert fresh.as_vector() == pytest.approx(found.as_vector())
+    with pytest.raises(ValueError, match="belief over 5 free"):
+        belief_to_parameters(belief, parameters(delay=True))
+
+
+def test_randomization_keeps_what_parameters_have_in_common():
+    line = torch.distributions.MultivariateNormal(
+        torch.zeros(2), torch.tensor([[1.0, 0.9], [0.9, 1.0]])
+    )
+    found = randomization(line, [0.5, 0.95], names=["a", "b"], num_samples=4_000)
+    low, high = found.ranges[0.95]["a"]
+    assert (low, high) == (pytest.approx(-1.96, abs=0.1), pytest.approx(1.96, abs=0.1))
+    assert found.ranges[0.5]["b"][1] == pytest.approx(0.674, abs=0.05)
+    assert np.corrcoef(found.samples.T)[0, 1] == pytest.approx(0.9, abs=0.03)
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        randomization(line, [95], names=["a", "b"])
+    with pytest.raises(ValueError, match="names"):
+        randomization(line)
+
+
+def test_bad_logs_and_parameters_are_said():
+    group = sequences()
+    group.control[1].data[4] = np.nan
+    with pytest.raises(ValueError, match="finite controls in sequence 'bare 1'"):
+        from_sysid(group, parameters())
+    group = sequences()
+    group.control[0].data[:] *= 9
+    with pytest.raises(ValueError, match="ctrlrange"):
+        from_sysid(group, parameters())
+    params = parameters()
+    for name in params.keys():  # noqa: SIM118
+        params[name].frozen = True
+    with pytest.raises(ValueError, match="not frozen"):
+        from_sysid(sequences(), params)
+    other = sequences()
+    other.sensordata[1] = sysid.TimeSeries.slice_by_name(
+        other.sensordata[1], ["position"]
+    )
+    with pytest.raises(ValueError, match="same signals in all sequences"):
+        from_sysid(other, parameters())
+    with pytest.raises(TypeError, match="expected ModelSequences"):
+        from_sysid([SPRING_MASS], parameters())
