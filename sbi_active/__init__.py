@@ -5,7 +5,8 @@ neural posterior with the measurement, and go on. An extension of sbi.
 
 Here stand the names that most programs need; each is imported when it is first used.
 All others are in the packages: ``actions``, ``simulation``, ``inference``,
-``information_gain``, ``search``, ``design``, ``campaign``, ``criticism`` and ``mujoco``.
+``information_gain``, ``search``, ``design``, ``campaign``, ``criticism`` and
+``mujoco``.
 """
 
 from __future__ import annotations

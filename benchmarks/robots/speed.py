@@ -110,7 +110,8 @@ def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
     """Return rows a CPU second, by model and way."""
     result = {}
     for name, given in models.items():
-        own = ways(*given, num)
+        xml, joint, low, high = given
+        own = ways(xml, joint, low, high, num)
         spent: dict[str, list[float]] = {way: [] for way in own["run"]}
         for _ in range(repeats):
             for way, run in own["run"].items():

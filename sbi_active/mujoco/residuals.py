@@ -12,7 +12,7 @@ from torch import Tensor
 from sbi_active.actions import DiscreteActions
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.mujoco.models.parameters import Bounded
-from sbi_active.mujoco.robot import NamedBox, Robot
+from sbi_active.mujoco.robot import Robot, named_box
 from sbi_active.simulation import SimulatorModel
 
 __all__ = ["free_parameters", "from_residuals"]
@@ -73,7 +73,7 @@ def from_residuals(residual_fn: Any, params: Any, *, noise: Any) -> Robot:
     )
     actions = DiscreteActions(number, names=["recording"])
     trials = Trials(number, x, action_labels=["recording"])
-    return Robot(simulator, NamedBox(declared), actions, trials)
+    return Robot(simulator, named_box(declared), actions, trials)
 
 
 class _Residuals:

@@ -30,24 +30,24 @@ from sbi_active.mujoco.simulator import MODEL, MujocoFunction
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
-__all__ = ["NamedBox", "Robot", "from_mjcf", "from_spec", "require_alike"]
+__all__ = ["Robot", "from_mjcf", "from_spec", "named_box", "require_alike"]
 
 
-class NamedBox(BoxUniform):
-    """A uniform prior on a box whose sides have names and units.
+def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
+    """Return a uniform prior whose sides have ``names`` and ``units``.
 
-    Attributes:
-        names: One a parameter.
-        units: One a parameter, "" for none.
+    It is sbi's own class, which a campaign's folder keeps and makes again.
+
+    Args:
+        parameters: With bounds, names and units.
     """
-
-    def __init__(self, parameters: Sequence[Bounded]) -> None:
-        self.names = tuple(p.name for p in parameters)
-        self.units = tuple(p.unit for p in parameters)
-        super().__init__(
-            torch.tensor([p.low for p in parameters]),
-            torch.tensor([p.high for p in parameters]),
-        )
+    box = BoxUniform(
+        torch.tensor([p.low for p in parameters]),
+        torch.tensor([p.high for p in parameters]),
+    )
+    vars(box)["names"] = tuple(p.name for p in parameters)
+    vars(box)["units"] = tuple(p.unit for p in parameters)
+    return box
 
 
 class Robot(NamedTuple):
@@ -55,13 +55,14 @@ class Robot(NamedTuple):
 
     Attributes:
         simulator: Runs MuJoCo; ``simulator.fn`` is a :class:`.MujocoFunction`.
-        prior: Uniform within the bounds of the parameters.
+        prior: Uniform within the bounds of the parameters, with ``names`` and
+            ``units``.
         actions: What the robot may do; None where only recordings say that.
         trials: The recordings; None where there are none.
     """
 
     simulator: SimulatorModel
-    prior: NamedBox
+    prior: BoxUniform
     actions: ActionSpace | None = None
     trials: Trials | None = None
 
@@ -157,7 +158,7 @@ def from_mjcf(
         sample_times=None if grid is None else torch.from_numpy(grid),
         inputs=space,
     )
-    prior = NamedBox(declared)
+    prior = named_box(declared)
     warn_of_idle(simulator, prior, actions, trials)
     return Robot(simulator, prior, actions, trials)
 

@@ -28,7 +28,7 @@ from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range
 from sbi_active.mujoco.residuals import free_parameters, from_residuals
-from sbi_active.mujoco.robot import NamedBox, Robot, require_alike
+from sbi_active.mujoco.robot import Robot, named_box, require_alike
 from sbi_active.mujoco.sensors import JointSensor
 from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunction
 from sbi_active.mujoco.transforms import Signal, SignalReadout
@@ -129,7 +129,7 @@ def from_sysid(
         sample_times=grid,
         inputs=space if isinstance(space, SignalActions) else None,
     )
-    prior = NamedBox(declared)
+    prior = named_box(declared)
     warn_of_idle(simulator, prior, space, trials)
     return Robot(simulator, prior, space, trials)
 

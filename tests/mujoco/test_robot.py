@@ -318,3 +318,18 @@ def test_models_with_and_without_a_payload_share_their_parameters():
     assert x[1].argmax() > x[0].argmax()
     with pytest.raises(ValueError, match="same joints"):
         from_mjcf([SPRING_MASS, CART_POLE], {"cart.mass": (0.5, 2)}, sensors=["slide"])
+
+
+def test_a_center_of_mass_moves_where_the_model_has_room_for_it():
+    ball = """<mujoco><option timestep="0.01"/><worldbody><body name="ball">
+      <joint name="hinge" axis="0 1 0" pos="0 0 .3"/><geom size=".1" mass="1"/>
+      </body></worldbody></mujoco>"""
+    given = {"sensors": ["hinge"], "times": TIMES, "start": {"hinge": 0.0}}
+    robot = from_mjcf(ball, {"ball.com_x": (-0.1, 0.1)}, noise=0.01, **given)
+    theta = torch.tensor([[0.05], [0.0]], dtype=torch.float64)
+    x = robot.simulator.mean(theta, torch.zeros(2, 1).double())
+    assert (x[1] == 0).all()
+    assert x[0].abs().max() > 0.2  # it swings around where it hangs, .165 rad away
+    sliding = ball.replace('axis="0 1 0" pos="0 0 .3"', 'type="slide" axis="1 0 0"')
+    with pytest.raises(ValueError, match="compiles as simple"):
+        from_mjcf(sliding, {"ball.com_x": (-0.1, 0.1)}, noise=0.01, **given)

@@ -13,6 +13,7 @@ from sbi.utils import BoxUniform
 
 from benchmarks.robots.models import SPRING_MASS
 from sbi_active import GaussianNoise
+from sbi_active.criticism import close_loop
 from sbi_active.mujoco import (
     belief_to_parameters,
     from_sysid,
@@ -272,3 +273,36 @@ def test_bad_logs_and_parameters_are_said():
         from_sysid(other, parameters())
     with pytest.raises(TypeError, match="expected ModelSequences"):
         from_sysid([SPRING_MASS], parameters())
+
+
+@pytest.mark.slow
+def test_a_friction_hidden_from_sysid_is_named():
+    """Two specs, recorded from ones with .15 N of dry friction, which theta lacks."""
+    rng = np.random.default_rng(0)
+    sd = np.array([0.002, 0.01])
+    groups = []
+    for text, name in ((SPRING_MASS, "bare"), (payload(SPRING_MASS), "payload")):
+        bare = sequences(text, name)
+        rubs = text.replace('damping="0.5"', 'damping="0.5" frictionloss="0.15"')
+        read = [
+            sysid.TimeSeries(
+                series.times,
+                series.data + sd * rng.standard_normal(series.data.shape),
+                series.signal_mapping,
+            )
+            for series in sequences(rubs, name).sensordata
+        ]
+        groups.append(
+            sysid.ModelSequences(
+                name, bare.spec, bare.sequence_name, bare.initial_state, bare.control,
+                read,
+            )
+        )  # fmt: skip
+    robot = from_sysid(groups, parameters(), noise=GaussianNoise(torch.tensor(sd)))
+    effects = mjcf_effects(
+        robot, include=["slide friction loss", "push *", "slide quad*", "*sensor delay"]
+    )
+    report = close_loop(
+        *robot[:2], robot.trials, effects=effects, evaluate=False, plan=False
+    )
+    assert report.verdict == "slide friction loss"

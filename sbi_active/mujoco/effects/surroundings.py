@@ -17,6 +17,7 @@ from sbi_active.mujoco.effects.writing import (
     QuantityChange,
 )
 from sbi_active.mujoco.models.names import element_id, names_of
+from sbi_active.mujoco.models.quantities import is_movable
 
 __all__ = ["of_bodies", "of_contacts", "of_surroundings"]
 
@@ -34,7 +35,8 @@ FEW_GEOMS = 6
 def of_bodies(group: Group, sizes: Nominal) -> Iterator[Effect]:
     """Yield the effects of bodies that share each phi, or of one."""
     model = sizes.model
-    i = element_id(model, "body", group.names[0])
+    first = group.names[0]
+    i = element_id(model, "body", first)
     mass = float(model.body_mass[i])
     radius = float(np.sqrt(model.body_inertia[i].sum() / (2 * mass)))
     yield model_effect(
@@ -45,7 +47,7 @@ def of_bodies(group: Group, sizes: Nominal) -> Iterator[Effect]:
         family="inertia",
         describe=f"{group.label} carries a mass spread like its own",
     )
-    if len(group.names) > 1:
+    if len(group.names) > 1 or not is_movable(model, first):
         return  # the axes of symmetric bodies need not be mirrored alike
     for axis in ("x", "y", "z"):
         yield model_effect(

@@ -12,7 +12,7 @@ from typing_extensions import override
 from sbi_active.mujoco.models.changes import ModelChange
 from sbi_active.mujoco.models.fields import Entry, add_to, field_of
 from sbi_active.mujoco.models.names import element_id, names_of
-from sbi_active.mujoco.models.quantities import ATTRIBUTES, Quantity
+from sbi_active.mujoco.models.quantities import ATTRIBUTES, FRAMES, Quantity, loosen
 from sbi_active.mujoco.models.spec import mujoco_of
 
 __all__ = [
@@ -48,6 +48,8 @@ class QuantityChange(ModelChange):
             i = 0 if self.kind == "option" else element_id(model, self.kind, name)
             for entry in ATTRIBUTES[self.kind][self.attribute](model, i):
                 add_to(model, entry, float(phi[0]) * entry.factor)
+            if self.attribute.startswith("com_") and phi[0]:
+                loosen(model, name)
 
 
 #: Fields of the quantities that effects change.
@@ -57,9 +59,9 @@ FIELDS = {
     ("joint", "armature"): ("dof_armature",),
     ("joint", "stiffness"): ("jnt_stiffness",),
     ("body", "mass"): ("body_mass", "body_inertia"),
-    ("body", "com_x"): ("body_ipos",),
-    ("body", "com_y"): ("body_ipos",),
-    ("body", "com_z"): ("body_ipos",),
+    ("body", "com_x"): ("body_ipos", *FRAMES),
+    ("body", "com_y"): ("body_ipos", *FRAMES),
+    ("body", "com_z"): ("body_ipos", *FRAMES),
     ("option", "density"): ("opt.density",),
     ("option", "viscosity"): ("opt.viscosity",),
 }

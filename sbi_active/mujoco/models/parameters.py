@@ -22,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.mujoco.models.fields import Entry, field_of, set_to
-from sbi_active.mujoco.models.quantities import Quantity, find_quantity
+from sbi_active.mujoco.models.quantities import (
+    FRAMES,
+    Quantity,
+    find_quantity,
+    is_movable,
+    loosen,
+)
 from sbi_active.mujoco.models.spec import mujoco_of
 
 __all__ = ["Bounded", "Writer", "bounded", "renew", "writer_of"]
@@ -125,9 +131,19 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
             found.append(Bounded(name, low, high, edit=rest[0]))
             continue
         quantity = find_quantity(model, rest[0] if rest else name)
+        if quantity.attribute.startswith("com_"):
+            _require_movable(model, quantity.name)
         unit = quantity.unit(model)
         found.append(Bounded(name, low, high, unit, quantity))
     return tuple(found)
+
+
+def _require_movable(model: Any, body: str) -> None:
+    if not is_movable(model, body):
+        raise ValueError(
+            f"expected a body whose center of mass can be written; got {body!r}, which "
+            "MuJoCo compiles as simple; give it simple='false' in the MJCF"
+        )
 
 
 def writer_of(
@@ -150,7 +166,7 @@ def writer_of(
     """
     if edit is None and all(p.edit is None for p in parameters):
         quantities = [p.quantity for p in parameters if p.quantity is not None]
-        return _Quantities([q.entries(model) for q in quantities])
+        return _Quantities(quantities, model)
 
     def compiled(theta: Array, source: Callable[[], Any] = spec) -> Any:
         edited = source()
@@ -164,6 +180,8 @@ def writer_of(
             if parameter.quantity is not None:
                 for entry in parameter.quantity.entries(changed):
                     set_to(changed, entry, float(value) * entry.factor)
+                if parameter.quantity.attribute.startswith("com_"):
+                    loosen(changed, parameter.quantity.name)
         renew(changed, mujoco_of().MjData(changed))
         return changed
 
@@ -192,9 +210,11 @@ def renew(model: Any, data: Any) -> None:
 class _Quantities:
     """Writes each parameter into the numbers that follow its quantity."""
 
-    def __init__(self, entries: Sequence[Sequence[Entry]]) -> None:
-        self.entries = [[*each] for each in entries]
-        self.fields = tuple({e.field: None for each in entries for e in each})
+    def __init__(self, quantities: Sequence[Quantity], model: Any) -> None:
+        self.entries = [q.entries(model) for q in quantities]
+        self.moved = [q.name for q in quantities if q.attribute.startswith("com_")]
+        fields = {e.field: None for each in self.entries for e in each}
+        self.fields = (*fields, *(FRAMES if self.moved else ()))
 
     def model(self, theta: Array) -> None:
         return None
@@ -203,6 +223,8 @@ class _Quantities:
         for each, value in zip(self.entries, theta.tolist(), strict=True):
             for entry in each:
                 set_to(model, entry, value * entry.factor)
+        for body in self.moved:
+            loosen(model, body)
 
 
 class _Affine:

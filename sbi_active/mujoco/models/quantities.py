@@ -42,7 +42,16 @@ from sbi_active.mujoco.models.fields import Entry, field_of
 from sbi_active.mujoco.models.names import element_id, names_of, require_name
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["ATTRIBUTES", "Quantity", "find_quantity", "is_hinge", "is_scalar"]
+__all__ = [
+    "ATTRIBUTES",
+    "FRAMES",
+    "Quantity",
+    "find_quantity",
+    "is_hinge",
+    "is_movable",
+    "is_scalar",
+    "loosen",
+]
 
 Entries = Callable[[Any, int], list[Entry]]
 
@@ -144,6 +153,28 @@ def find_quantity(model: Any, text: str) -> Quantity:
             f"expected one quantity {text!r}; got {len(found)}; pass one of {kinds}"
         )
     return found[0]
+
+
+def is_movable(model: Any, body: str) -> bool:
+    """Return whether a body's center of mass can be written.
+
+    Of a body that is compiled as simple its inertia matrix has no room for that.
+    """
+    return not int(model.body_simple[element_id(model, "body", body)])
+
+
+#: Fields that say that a frame is another's, and no longer hold for a center of mass.
+FRAMES = ("body_sameframe", "geom_sameframe")
+
+
+def loosen(model: Any, body: str) -> None:
+    """Tell MuJoCo that a body's center of mass may be anywhere, in place."""
+    i = element_id(model, "body", body)
+    same = mujoco_of().mjtSameFrame
+    own = model.geom_bodyid == i
+    inertial = int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT)
+    model.geom_sameframe[own & np.isin(model.geom_sameframe, inertial)] = 0
+    model.body_sameframe[i] = 0
 
 
 def _dof(field: str) -> Entries:
