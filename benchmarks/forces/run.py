@@ -212,10 +212,10 @@ def _held_out(
     loop: Criticism, names: tuple[str, ...], action: Tensor, clean: Tensor
 ) -> float:
     """Return the rms error of the mean prediction, in sensor deviations."""
-    model, _ = loop.add(names)
+    model, prior = loop.add(names)
     key = " + ".join(names) or "none"
     draws = torch.from_numpy(loop.trace().evidences[key].draws)[:50]
-    width = model.theta_dim if hasattr(model, "theta_dim") else draws.shape[1]
+    width = prior.event_shape[0]
     rows = draws[:, :width].repeat_interleave(len(action), 0)
     x = model.mean(rows, action.repeat(len(draws), 1)).double()
     mean = x.reshape(len(draws), len(action), -1).mean(0)

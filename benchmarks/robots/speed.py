@@ -26,7 +26,6 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
@@ -34,6 +33,7 @@ from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.effects.powers import PowerForce
+from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.threads import single_thread
 
 SECONDS, SHARED = 1.0, 8
@@ -47,6 +47,7 @@ MODELS = {
 
 def ways(xml: Any, joint: str, low: float, high: float, num: int) -> dict[str, Any]:
     """Return the ways of simulating rows, and how many steps each has."""
+    mujoco = mujoco_of()
     spec = mujoco.MjSpec.from_string(xml) if isinstance(xml, str) else xml
     model = spec.compile()
     joints = [model.joint(i).name for i in range(model.njnt)]
