@@ -143,6 +143,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--go2", type=Path)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
     options = parser.parse_args(arguments)
+    mujoco = mujoco_of()
     models: dict[str, Any] = dict(MODELS)
     if options.go2 is not None:
         spec = mujoco.MjSpec.from_file(str(options.go2))

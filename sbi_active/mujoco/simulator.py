@@ -15,6 +15,7 @@ from sbi_active.mujoco.models.changes import require_changes
 from sbi_active.mujoco.models.machine import Machine, Model, Rows
 from sbi_active.mujoco.models.names import names_of, require_name, start_places
 from sbi_active.mujoco.models.running import readings
+from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.readout import held, num_steps, sampled
 
 __all__ = ["MODEL", "RECORDING", "Channel", "MujocoFunction"]
@@ -95,6 +96,16 @@ class MujocoFunction:
     def model(self) -> Any:
         """The first model, as compiled."""
         return self.machines[0].model
+
+    @property
+    def joints(self) -> tuple[list[str], list[str]]:
+        """Names of the joints, and of those that slide; ``force_effects`` asks."""
+        names = names_of(self.model, "joint")
+        slide = int(mujoco_of().mjtJoint.mjJNT_SLIDE)
+        slides = [
+            n for n, k in zip(names, self.model.jnt_type, strict=True) if k == slide
+        ]
+        return names, slides
 
     def __call__(
         self,

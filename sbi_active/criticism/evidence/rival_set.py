@@ -53,8 +53,7 @@ NUM_DRAWS = 400
 FEW_TRIALS = 5
 #: Below this effective sample size importance sampling is not trusted.
 TOO_FEW = 20.0
-#: Nats by which a largest likelihood stays below another model's evidence, so that its
-#: own need not be precise.
+#: Nats of a largest likelihood below another's evidence: its own need not be precise.
 HOPELESS = 30.0
 #: Nats by which Laplace's evidence stays below another's, so that nobody samples.
 FAR_BEHIND = 15.0

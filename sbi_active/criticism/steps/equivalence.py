@@ -88,11 +88,11 @@ def equivalent_effects(
         votes += vote
     same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
     for i, j in zip(*np.nonzero(np.triu(same, 1)), strict=True):
-        pair = effects[i - 1], effects[j - 1]
+        one, other = effects[i - 1], effects[j - 1]
         if i > 0 and rivals.is_smooth:  # else a search would find the jumps
             same[i, j] = same[j, i] = all(
                 _imitates(a, b, simulator, rivals, coordinates.to_z(u[None]), unit)
-                for a, b in (pair, pair[::-1])
+                for a, b in ((one, other), (other, one))
                 for u in every_u[:NUM_FAR]
             )
     names = [NONE, *[e.name for e in effects]]

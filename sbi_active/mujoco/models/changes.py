@@ -8,10 +8,12 @@ Both are keyword arguments of a simulator's function, {change: phi}, with phi of
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sbi_active.criticism.forces.force import Force
 
 __all__ = ["Force", "Insertion", "ModelChange", "require_changes"]
 
@@ -63,28 +65,6 @@ class Insertion(ModelChange):
             data: At the start, its forces computed.
             phi: Shape (k,).
         """
-
-
-class Force(Protocol):
-    r"""A generalized force :math:`\tau = \tau(q, v, t; \phi)`, added at every step.
-
-    It is called once a step for many rows, before the step, and what it returns goes
-    into ``qfrc_applied``. It is hashable and can be pickled; rows are independent.
-
-    Args:
-        q: Positions of the joints, shape (n, nq), in the order of the model's ``qpos``.
-        v: Their velocities, shape (n, nv), in the order of its ``qvel``.
-        t: Time since the start of the trial, s.
-        phi: Shape (n, k). What depends on the number of the trial has it as a part of
-            phi: an effect's ``apply`` is told ``context.index``.
-
-    Returns:
-        Shape (n, nv), N or N m.
-    """
-
-    def __call__(self, q: Array, v: Array, t: float, phi: Array, /) -> Array:
-        """Return the forces."""
-        ...
 
 
 def require_changes(name: str, value: Any) -> dict[Any, Array]:

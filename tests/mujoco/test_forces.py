@@ -1,0 +1,69 @@
+"""Forces of the dictionary on the joints of an MJCF."""
+
+import numpy as np
+import pytest
+import torch
+
+from sbi_active.criticism import AugmentedSimulator, Trials
+from sbi_active.criticism.forces import force_effects
+from sbi_active.criticism.forces.trajectories import trajectories
+from sbi_active.mujoco import from_mjcf
+
+CART = """<mujoco><option timestep=".002"/><worldbody>
+<body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping=".5"/>
+<geom type="box" size=".1 .1 .1" mass="2"/>
+<body name="pole"><joint name="hinge" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass=".4"/></body></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def cart():
+    robot = from_mjcf(
+        CART,
+        {"rail.damping": (0.0, 1.0)},
+        sensors=["rail", "hinge"],
+        times=np.linspace(0.05, 0.5, 10),
+        start={"hinge": 0.8},
+        noise=1e-3,
+    )
+    x = robot.simulator.mean(torch.full((3, 1), 0.5), torch.zeros(3, 1))
+    times = robot.simulator.sample_times
+    return robot, Trials(torch.zeros(3, 1), x, sample_times=times)
+
+
+def test_forms_are_on_the_joints_of_the_model_in_their_units(cart):
+    robot, trials = cart
+    found = {
+        e.name: e for e in force_effects(robot.simulator, robot.prior, trials, seed=1)
+    }
+    assert found["sign v of rail"].units.endswith(" N")
+    assert found["sin 2q of hinge"].units.endswith(" N m")
+    assert found["q of hinge on rail"].family == "coupling with rail"
+    force = found["sin 2q of hinge"].apply.force
+    q, v = np.array([[0.0, np.pi / 4]]), np.zeros((1, 2))
+    applied = force(q, v, 0.0, np.array([[1.0, 0.0]]))
+    assert applied[0] == pytest.approx([0.0, force.size])
+
+
+def test_the_force_of_nominal_motion_is_inertia_times_acceleration(cart):
+    """The cart with its pole, where the pole's inertia is the smaller part."""
+    robot, trials = cart
+    found = trajectories(robot.simulator, robot.prior, trials)
+    rail = np.gradient(found.v, found.time, axis=1)[..., 0]
+    inertia = found.force[0] / np.sqrt(np.mean(rail**2))
+    assert 2.0 < inertia < 2.4  # with the pole free to turn, between the two masses
+
+
+def test_a_force_moves_the_robot_and_none_does_not(cart):
+    robot, trials = cart
+    effects = force_effects(
+        robot.simulator, robot.prior, trials, include="v|v| of hinge"
+    )
+    model = AugmentedSimulator(robot.simulator, effects)
+    theta, action = torch.full((2, 1), 0.5), torch.zeros(2, 1)
+    phi = torch.tensor([[0.0], [1.0]])
+    x = model.evaluate(theta, {"v|v| of hinge": phi}, action)
+    bare = robot.simulator.mean(theta, action)
+    assert torch.allclose(x[0], bare[0], atol=1e-9)
+    assert (x[1] - bare[1]).abs().max() > 1e-3
