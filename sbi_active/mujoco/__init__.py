@@ -6,6 +6,7 @@ tools. No inference, and no criticism of models, is done here. Needs
 ``sbi-active[mujoco]``.
 """
 
+from sbi_active.criticism.forces.library import force_effects
 from sbi_active.mujoco.beliefs import belief_to_parameters, randomization
 from sbi_active.mujoco.effects.library import mjcf_effects
 from sbi_active.mujoco.robot import Robot, from_mjcf
@@ -14,6 +15,7 @@ from sbi_active.mujoco.sysid import from_sysid
 __all__ = [
     "Robot",
     "belief_to_parameters",
+    "force_effects",
     "from_mjcf",
     "from_sysid",
     "mjcf_effects",

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from sbi_active.criticism import AugmentedSimulator, Trials
-from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.forces.trajectories import trajectories
-from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco import force_effects, from_mjcf
 
 CART = """<mujoco><option timestep=".002"/><worldbody>
 <body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping=".5"/>
@@ -34,9 +33,7 @@ def cart():
 
 def test_forms_are_on_the_joints_of_the_model_in_their_units(cart):
     robot, trials = cart
-    found = {
-        e.name: e for e in force_effects(robot.simulator, robot.prior, trials, seed=1)
-    }
+    found = {e.name: e for e in force_effects(robot, trials=trials, seed=1)}
     assert found["sign v of rail"].units.endswith(" N")
     assert found["sin 2q of hinge"].units.endswith(" N m")
     assert found["q of hinge on rail"].family == "coupling with rail"
@@ -44,6 +41,11 @@ def test_forms_are_on_the_joints_of_the_model_in_their_units(cart):
     q, v = np.array([[0.0, np.pi / 4]]), np.zeros((1, 2))
     applied = force(q, v, 0.0, np.array([[1.0, 0.0]]))
     assert applied[0] == pytest.approx([0.0, force.size])
+
+
+def test_a_robot_without_recordings_asks_for_trials(cart):
+    with pytest.raises(ValueError, match="expected a prior and trials; got None"):
+        force_effects(cart[0])
 
 
 def test_the_force_of_nominal_motion_is_inertia_times_acceleration(cart):

@@ -37,9 +37,9 @@ MARGIN = 0.1
 
 
 def force_effects(
-    simulator: SimulatorModel,
-    prior: Distribution,
-    trials: Trials,
+    simulator: Any,
+    prior: Distribution | None = None,
+    trials: Trials | None = None,
     *,
     joints: Sequence[str] | None = None,
     slides: Sequence[str] = (),
@@ -62,7 +62,7 @@ def force_effects(
     step. MuJoCo models of ``sbi_active.mujoco`` do.
 
     Args:
-        simulator: As above.
+        simulator: As above; a robot of ``sbi_active.mujoco`` brings prior and trials.
         prior: Of its parameters, at draws of which nominal trajectories are simulated.
         trials: Those to be explained, whose actions are taken.
         joints: Names, one a degree of freedom, in the order of v; None takes those of a
@@ -76,8 +76,9 @@ def force_effects(
         seed: Of the draws.
 
     Raises:
-        ValueError: If the simulator never asks for forces, the names are not one a
-            degree of freedom, or a pattern matches nothing.
+        ValueError: If prior or trials are missing, the simulator never asks for
+            forces, the names are not one a degree of freedom, or a pattern matches
+            nothing.
 
     Example:
         >>> from sbi_active import GaussianNoise
@@ -98,6 +99,15 @@ def force_effects(
         >>> len(found), found[6].name, found[6].family
         (33, 'sin 2q of hinge', 'force in q of hinge')
     """
+    if not isinstance(simulator, SimulatorModel):
+        prior = simulator.prior if prior is None else prior
+        trials = simulator.trials if trials is None else trials
+        simulator = simulator.simulator
+    if prior is None or trials is None:
+        raise ValueError(
+            "expected a prior and trials; got None; pass those that the closed loop "
+            "gets, or a robot with recordings"
+        )
     nominal = trajectories(simulator, prior, trials, seed=seed)
     known = _joints(simulator, nominal, joints, slides)
     center, span = _range_of(trials.index)
