@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.misfit.left_out import leave_out
 from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.rule import BETTER, predicts_better
+from sbi_active.criticism.misfit.rule import predicts_better
 from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.formulas import MARGIN, SAME, TERMS
@@ -28,6 +28,8 @@ Array = NDArray[Any]
 
 #: Share of the excess error on left-out parts that a guess may leave.
 REMAINS = 0.75
+#: Probability that it predicts a new part better, before all that were tried count.
+BETTER = 0.9
 
 
 def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
