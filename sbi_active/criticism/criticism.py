@@ -255,11 +255,10 @@ class Criticism:
             Without effects, the bare simulator and its prior.
         """
         names = self.trace().chosen if effects is None else (*effects,)
-        unknown = [n for n in names if n not in self.rivals.effects]
-        if unknown:
+        if lost := {*names} - {e.name for e in self.rivals.library}:
             raise ValueError(
                 f"expected effects among {', '.join(self.rivals.effects) or 'none'}; "
-                f"got {', '.join(unknown)}; declare them in Criticism(effects=...)"
+                f"got {', '.join(sorted(lost))}; declare them in Criticism(effects=...)"
             )
         declared = {e.name: e for e in self.effects}  # acting on x, not its summaries
         every = (*names, *[e.name for e in self.rivals.nuisances])
