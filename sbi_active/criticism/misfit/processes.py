@@ -131,28 +131,23 @@ class Errors:
         self.is_scored = np.ones(len(m), dtype=bool)
         if self.is_by_trial:
             self.is_scored = ~is_first_part(m, warm_up)
-        self.sizes = sizes_up_to(largest)
+        top = max(LARGEST, 2 * largest)
+        num = 1 + round(np.log(top / SMALLEST) / np.log(FACTOR))
+        self.sizes = np.geomspace(SMALLEST, top, num)
         span = np.median([np.ptp(m.time[at]) for at in self._blocks()])
         span = max(float(span), m.step)
         low, high = SAMPLE * m.step, max(TRIAL * span, 2 * SAMPLE * m.step)
         num = 2 + round(np.log(high / low) / np.log(APART))
         self.times = np.geomspace(low, high, num)
-        self._declare(cells)
-        self.patterns = self._by_pattern()
-
-    def _declare(self, cells: list[NoiseCell]) -> None:
-        self._cells = [_in_units(cell, self.unit) for cell in cells]
+        self._cells = [_in_units(cell, unit) for cell in cells]
         total = log_sum_exp(np.array([c.log_weight for c in self._cells]))
         self._log_cells = np.array([c.log_weight for c in self._cells]) - total
+        self.patterns = self._by_pattern()
 
     @property
     def num_processes(self) -> int:
         """Errors with a process: kernels, time scales and sizes."""
         return len(KERNELS) * len(self.times) * len(self.sizes)
-
-    def pieces(self, square: Array) -> Array:
-        """Return the errors of left-out parts that the choice compares, (f,)."""
-        return square
 
     def grams(self, rows: Array) -> Grams:
         """Return the Gram matrices of rows (N, k), the sensor's errors first."""
@@ -198,7 +193,7 @@ class Errors:
             folds: Parts that count, bool, shape (f,); None takes all.
             factor: On the scales of the effects' priors.
         """
-        use = np.ones(len(grams.count), bool) if folds is None else folds
+        use = np.ones(self.num_folds, bool) if folds is None else folds
         gram, log_det = grams.gram[:, use].sum(1), grams.log_det[:, use].sum(1)
         shift = np.eye(gram.shape[1])
         shift[1:, 0] = -model.center
@@ -218,7 +213,7 @@ class Errors:
         mean = p @ means
         off = means - mean
         cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
-        by_process = p.reshape(-1, len(self.times), len(self.sizes), len(WIDTHS))
+        by_process = p.reshape(len(KERNELS), len(self.times), len(self.sizes), -1)
         sizes, times = by_process.sum((0, 1, 3)), by_process.sum((0, 2, 3))
         middle = int(np.searchsorted(np.cumsum(times), 0.5))
         return Posterior(
@@ -254,13 +249,6 @@ class Errors:
                     bases.append((np.clip(values, 0, None), vectors))
             found.append((places, self.fold[places[:, 0]], bases))
         return found
-
-
-def sizes_up_to(largest: float) -> Array:
-    """Return sizes of the process, twice the residual's where that is large."""
-    top = max(LARGEST, 2 * largest)
-    num = 1 + round(np.log(top / SMALLEST) / np.log(FACTOR))
-    return np.geomspace(SMALLEST, top, num)
 
 
 def integrated(

@@ -19,7 +19,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Grams, Posterior
 from sbi_active.criticism.misfit.search import Search
-from sbi_active.criticism.misfit.sensor import has_time_axis, sensor_error
+from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.tracing import log_priors
@@ -60,8 +60,6 @@ def screen(rivals: RivalSet) -> Screening | None:
     """
     sensor = sensor_error(rivals)
     if len(rivals.effects) <= MANY or sensor is None:
-        return None
-    if not has_time_axis(rivals.measurements):
         return None
     unit, cells = sensor
     search = Search(rivals, unit, log_priors(rivals.library, ()), cells)

@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.least_squares import descend
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.across_trials import AcrossTrials
 from sbi_active.criticism.misfit.left_out import LeftOut, leave_out
 from sbi_active.criticism.misfit.linear import LinearModel, enlarged, linearize
 from sbi_active.criticism.misfit.processes import Errors, Grams, Posterior
-from sbi_active.criticism.misfit.sensor import has_time_axis
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 from sbi_active.criticism.rivals.rival import Rival
@@ -99,22 +97,14 @@ class Search:
         self._rivals: dict[ModelKey, Rival] = {}
         self._seed = derive_seed(self.rivals.seed, "misfit")
         bare = self._fit_bare()
-        self.errors = self._errors(bare.rms)
+        self.errors = Errors(
+            self.rivals.measurements,
+            self.unit,
+            self.cells,
+            largest=bare.rms,
+            warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
+        )
         self.keep(bare)
-
-    def _errors(self, largest: float) -> Errors:
-        """Return the errors that all models share, given the bare model's residual."""
-        rivals, m = self.rivals, self.rivals.measurements
-        if not has_time_axis(m):
-            return AcrossTrials(
-                *(m, self.unit, self.cells),
-                largest=largest,
-                action=rivals.scaled_actions(),
-                order=rivals.scaled_order(),
-                spread=rivals.spread,
-            )
-        warm_up = rivals.warm_up if rivals.nuisances else 0.0
-        return Errors(m, self.unit, self.cells, largest=largest, warm_up=warm_up)
 
     def keep(self, model: LinearModel) -> Candidate:
         """Record a fitted model with its evidence."""

@@ -7,18 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.processes import FEWEST
 from sbi_active.criticism.rivals.error_models import NoiseCell
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 
 Array = NDArray[Any]
 
 
-def sensor_error(
-    rivals: RivalSet, *, is_known: bool = False
-) -> tuple[Array, list[NoiseCell]] | None:
+def sensor_error(rivals: RivalSet) -> tuple[Array, list[NoiseCell]] | None:
     """Return the sensor's deviation (N,), and its error with what is unknown of it.
 
     None where the size of the sensor's error is not declared, x has no time axis, or
@@ -26,11 +22,9 @@ def sensor_error(
 
     Args:
         rivals: The models, with the noise as it was declared.
-        is_known: No model fits: then x needs no time axis, but six trials.
     """
     noise, m = rivals.model.noise, rivals.measurements
-    enough = has_time_axis(m) or (is_known and len(np.unique(m.trial)) >= FEWEST)
-    if noise is None or not enough:
+    if noise is None or not m.has_time or not np.isfinite(m.gap).any():
         return None
     measured = measurement_sds(noise, m)
     if measured is not None:
@@ -43,8 +37,3 @@ def sensor_error(
     if any(np.isfinite(c.df) or (c.sd != unit).any() for c in rivals.noise.cells):
         return None
     return unit, rivals.noise.cells
-
-
-def has_time_axis(m: Measurements) -> bool:
-    """Return whether errors can follow time."""
-    return m.has_time and bool(np.isfinite(m.gap).any())

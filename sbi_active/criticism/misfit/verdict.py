@@ -76,7 +76,7 @@ class Misfit:
 
         def score(c: Candidate) -> Scored:
             posterior = errors.posterior(c.model, c.grams, use)
-            square = errors.pieces(leave_out(c.model, errors, use).square)
+            square = leave_out(c.model, errors, use).square
             return Scored(c.log_prior + posterior.log_process, square, passes(c.model))
 
         return settled(self.search, score, self.equivalent).key
@@ -89,7 +89,7 @@ class Misfit:
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
                 log_p = c.log_prior + posterior.log_process
-                return Scored(log_p, errors.pieces(c.left.square), passes(c.model))
+                return Scored(log_p, c.left.square, passes(c.model))
 
             if settled(self.search, score, self.equivalent).key != self.choice.key:
                 return False
@@ -117,7 +117,7 @@ def find_misfit(
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
     """
-    sensor = sensor_error(rivals, is_known=is_known)
+    sensor = sensor_error(rivals)
     if sensor is None:
         return None
     unit, cells = sensor
@@ -131,8 +131,7 @@ def find_misfit(
         return None
 
     def score(c: Candidate) -> Scored:
-        square = search.errors.pieces(c.left.square)
-        return Scored(c.log_p, square, passes(c.model))
+        return Scored(c.log_p, c.left.square, passes(c.model))
 
     choice = settled(search, score, equivalent)
     log_p = [c.log_p for c in search.found.values()]

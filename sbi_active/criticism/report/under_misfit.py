@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.numbers import number, probability, stated
 from sbi_active.criticism.report.section import Section, joined, named_entries
@@ -97,9 +95,8 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         ]
         held = [] if m.held_out is None else [_size(report, m.held_out)]
         rows.append((*cells, *held))
-    scale = "time scale" if np.isfinite(misfit.time_scale) else "length"
     text = [
-        f"Every model carries a residual process of unknown size and {scale}, so "
+        "Every model carries a residual process of unknown size and time scale, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "
         "error on left-out "
         f"{misfit.left_out} is within a tenth of the smallest; P is among them. Errors "
@@ -107,7 +104,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
         "beyond it, as a share of the bare model's.",
         f"Beside the verdict's model the process has {misfit.size:.2g} times the "
-        f"sensor's standard deviation{_reach(misfit)}.",
+        f"sensor's standard deviation and a time scale of {number(misfit.time_scale)}.",
     ]
     items = [
         f"{n}: probability of the cause {_share(misfit, n)}, of a better prediction of "
@@ -122,13 +119,6 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         header=tuple(header),
         rows=tuple(rows),
     )
-
-
-def _reach(misfit: Misfit) -> str:
-    """Return how far the process reaches, where it follows time."""
-    if not np.isfinite(misfit.time_scale):
-        return ""
-    return f" and a time scale of {number(misfit.time_scale)}"
 
 
 def _share(misfit: Misfit, name: str) -> str:
