@@ -95,7 +95,8 @@ def test_methods(run, capsys):
 
 
 def test_closing_the_loop(run, capsys):
-    _, bare, _, drag, campaign, *motor = run("docs/closing_the_loop.md")
+    pages = run("docs/closing_the_loop.md")
+    _, bare, _, forces, starts, drag, campaign, *motor = pages
     printed = capsys.readouterr().out
     assert bare.report.verdict == "unexplained"
     assert printed.startswith("unexplained\nVerdict: drag (P ")
@@ -104,6 +105,8 @@ def test_closing_the_loop(run, capsys):
     assert table.loc["rmse", "after"] < 0.005 + 4 * 0.0018
     assert table.loc["rmse", "ratio"] < 0.5
     assert drag.page.exists()
+    assert starts.loop.trace().verdict == "drag"
+    assert "sin 2q of hinge" in [effect.name for effect in forces.effects]
     assert "alarm\n('drag',)\n" in printed
     *_, found, names = printed.splitlines()
     assert found == "dead zone"
