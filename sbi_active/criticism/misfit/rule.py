@@ -12,10 +12,12 @@ r"""What helps, and what is the cause, when every model is wrong.
     u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
 
 from mean squared errors M on left-out trials in sensor variances: of the model, of the
-model without the effect and of the bare one. Where the model's chi-square passes
-against the sensor nothing remains, and it is the inclusion probability itself. The
-thresholds and the .85 are empirical: evidence alone, or prediction alone, names a
-stand-in as surely as a cause.
+model without the effect and of the bare one. It is the smaller u of two sets: of what
+helps, and of what is left of it where each must predict better with a probability of
+.9, since two that imitate each other both look dispensable. Where the model's
+chi-square passes against the sensor nothing remains, and it is the inclusion
+probability itself. The thresholds and the .85 are empirical: evidence alone, or
+prediction alone, names a stand-in as surely as a cause.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
-INCLUDED, BETTER = 0.5, 0.8
+INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
 CERTAIN = 0.85  # probability of a cause that leaves nothing
 PASSES = 0.01  # tail probability of a chi-square against the sensor
@@ -112,9 +114,26 @@ def choose(
         n: sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
         for n in names
     }
-    key = next(iter(probabilities))
-    better: dict[str, float] = {}
-    while key.effects:
+    key, better = _pruned(models, next(iter(probabilities)), pooled, BETTER)
+    surer, _ = _pruned(models, key, pooled, SURE)
+    remains, cause = {}, {}
+    for n in key.effects:
+        # Beside one that hardly helps an effect may be missed less than it is alone.
+        found = [_remains(models, k, n) for k in (key, surer) if n in k.effects]
+        remains[n] = min(found)
+        share = 1.0 if models[key].passes else CERTAIN * (1 - remains[n])
+        cause[n] = inclusion[n] * share
+    return Choice(key, probabilities, inclusion, cause, better, remains)
+
+
+def _pruned(
+    models: Mapping[ModelKey, Scored],
+    key: ModelKey,
+    pooled: Mapping[str, float],
+    sure: float,
+) -> tuple[ModelKey, dict[str, float]]:
+    """Return the part of a set whose effects all help, and how surely each does."""
+    while True:
         better = {
             n: predicts_better(models[key].square, models[key.without(n)].square)
             for n in key.effects
@@ -126,27 +145,18 @@ def choose(
         failing = [
             n
             for n in key.effects
-            if pooled[n] < INCLUDED or (better[n] < BETTER and without[n] < most)
+            if pooled[n] < INCLUDED or (better[n] < sure and without[n] < most)
         ]
         if not failing:
-            break
+            return key, better
         key = key.without(min(failing, key=without.__getitem__))
-    own, bare = models[key], models[ModelKey()]
-    remains, cause = {}, {}
-    for n in key.effects:
-        other = models[key.without(n)]
-        u = max(own.excess / other.excess, own.excess / bare.excess)
-        remains[n] = float(np.clip(u, 0.0, 1.0))
-        share = 1.0 if own.passes else CERTAIN * (1 - remains[n])
-        cause[n] = inclusion[n] * share
-    return Choice(
-        key,
-        probabilities,
-        inclusion,
-        cause,
-        {n: better[n] for n in key.effects},
-        remains,
-    )
+
+
+def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:
+    """Return u, the share of the excess error that an effect of a set leaves."""
+    own, other, bare = models[key], models[key.without(name)], models[ModelKey()]
+    u = max(own.excess / other.excess, own.excess / bare.excess)
+    return float(np.clip(u, 0.0, 1.0))
 
 
 def admitted(models: Mapping[ModelKey, Scored]) -> list[ModelKey]:

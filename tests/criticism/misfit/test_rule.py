@@ -105,3 +105,16 @@ def test_what_doubles_the_error_helps_whatever_a_t_test_says():
     assert choose(several, "a").key == ModelKey(("a",))
     mild = Scored(0.0, np.array([9.0, 9.5, 9.0, 30.0]), False)
     assert choose({**several, ModelKey(): mild}, "a").key == ModelKey()
+
+
+def test_an_effect_that_hardly_helps_does_not_hide_the_cause_beside_it():
+    """Either of two explains most; b beside a predicts better by .85 only."""
+    several = models(none=(0.0, 101.0), a=(20.0, 11.0), b=(10.0, 12.0))
+    share = np.array([0.9, 1.04, 0.9, 1.04, 0.9, 1.04, 0.92, 1.04])
+    both = several[ModelKey(("a",))].square * share
+    several[ModelKey(("a", "b"))] = Scored(25.0, both, False)
+    found = choose(several, "ab")
+    assert 0.8 < found.better["b"] < 0.9
+    assert found.key == ModelKey(("a", "b"))
+    assert found.cause["a"] > 0.7  # by what it leaves without b
+    assert found.cause["b"] < 0.2
