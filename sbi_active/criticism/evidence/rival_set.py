@@ -47,8 +47,7 @@ from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorM
 
 Array = NDArray[Any]
 
-#: Draws that are kept of a model: a mean is then known to a 20th of a deviation.
-NUM_DRAWS = 400
+NUM_DRAWS = 400  # kept of a model; a mean is then known to a 20th of a deviation
 #: Trials from which their order may be what residuals follow.
 FEW_TRIALS = 5
 #: Below this effective sample size importance sampling is not trusted.
