@@ -118,7 +118,15 @@ def _calibration(rows: Sequence[Row]) -> list[str]:
         mean = f"{claimed[at].mean():.2f}" if at.any() else "-"
         text = f"claims of {low:g} to {min(high, 1):g}: mean {mean}, right "
         lines.append(text + rate(right[at] > 0))
-    return lines
+    wrong = [
+        f"{row['kind']} {row['case']} ({row['discrepancy'] or 'no discrepancy'})"
+        for row in rows
+        if any(
+            p >= CLAIM and name not in _true(row)
+            for name, p in json.loads(row["cause"]).items()
+        )
+    ]
+    return [*lines, f"wrong claims of {CLAIM:g} and more: {', '.join(wrong) or 'none'}"]
 
 
 def _coverage(groups: Mapping[str, list[Row]]) -> list[str]:
@@ -128,6 +136,15 @@ def _coverage(groups: Mapping[str, list[Row]]) -> list[str]:
         for column in ("theta_covered", "phi_covered"):
             cells = [r[column] for k in kinds for r in groups.get(k, []) if r[column]]
             pairs = [tuple(map(int, cell.split("/"))) for cell in cells]
+            hits = [i < k for k, n in pairs for i in range(n)]
+            what = column.removesuffix("_covered")
+            lines.append(f"90 % intervals of {what} {title}: {rate(hits)}")
+    # What depends on the state is what declared effects can imitate.
+    rows = [r for k in ("M", "E", "P") for r in groups.get(k, [])]
+    for title, is_form in (("beside a form", True), ("beside any other", False)):
+        own = [r for r in rows if (r["discrepancy"] == "form") == is_form]
+        for column in ("theta_covered", "phi_covered"):
+            pairs = [tuple(map(int, r[column].split("/"))) for r in own if r[column]]
             hits = [i < k for k, n in pairs for i in range(n)]
             what = column.removesuffix("_covered")
             lines.append(f"90 % intervals of {what} {title}: {rate(hits)}")

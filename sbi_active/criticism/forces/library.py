@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatch
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch.distributions import Distribution, Independent, Normal
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.patterns import picked, unmatched
 from sbi_active.criticism.forces.dictionary import (
     FORMS,
     FREE,
@@ -118,7 +118,16 @@ def force_effects(
             sized = _sized(force, nominal, scale)
             if sized is not None:
                 found.append(_effect(name, family, sized, center, span))
-    return _picked(found, include, exclude)
+    wanted, without = (
+        [patterns] if isinstance(patterns, str) else [*patterns]
+        for patterns in (include, exclude)
+    )
+    for pattern in unmatched(found, [*wanted, *without]):
+        raise ValueError(
+            f"expected patterns of names as in {found[0].name!r}; got {pattern!r}, "
+            "which matches none; correct it"
+        )
+    return picked(found, wanted, without)
 
 
 def _forces(
@@ -233,25 +242,3 @@ def _ends(values: Any) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
     margin = MARGIN * max(high - low, 1e-6)
     return low - margin, high + margin
-
-
-def _picked(
-    effects: list[Effect], include: str | Sequence[str], exclude: str | Sequence[str]
-) -> list[Effect]:
-    wanted, without = (
-        [patterns] if isinstance(patterns, str) else [*patterns]
-        for patterns in (include, exclude)
-    )
-    names = [e.name for e in effects]
-    for pattern in (*wanted, *without):
-        if not any(fnmatch(name, pattern) for name in names):
-            raise ValueError(
-                f"expected patterns of names as in {names[0]!r}; got {pattern!r}, "
-                "which matches none; correct it"
-            )
-    return [
-        e
-        for e in effects
-        if any(fnmatch(e.name, p) for p in wanted)
-        and not any(fnmatch(e.name, p) for p in without)
-    ]

@@ -15,6 +15,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
@@ -82,8 +83,7 @@ def trajectories(
     some = torch.linspace(0, len(trials) - 1, min(NUM_TRIALS, len(trials))).long()
     picked = trials.select(some.unique().tolist())
     generator = torch.Generator().manual_seed(seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+    with forked_generators(int(torch.randint(2**31, (), generator=generator))):
         theta = prior.sample(torch.Size([NUM_DRAWS])).double()
     time, q, v = _recorded(model, picked, theta, None)
     kept = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))

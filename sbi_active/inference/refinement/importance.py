@@ -29,17 +29,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
 from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.tempering import largest_power
-from sbi_active.inference.sampling.weights import (
-    effective_sample_size,
-    normalized,
-    precise_log_sum_exp,
-)
+from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
 Array = NDArray[Any]
 
@@ -99,7 +96,7 @@ class WeightedPool:
         """Log of the integral of prior times likelihood."""
         if not self.is_final.any():
             return -np.inf
-        return float(precise_log_sum_exp(self.log_weight) - np.log(self.num_final))
+        return float(logsumexp(self.log_weight) - np.log(self.num_final))
 
     @property
     def weight(self) -> Array:

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
+from scipy.special import gammaln, logsumexp
 from scipy.stats import chi, chi2
 from typing_extensions import override
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture, Particles
 from sbi_active.inference.sampling.student_mixture import Proposal
-from sbi_active.inference.sampling.weights import precise_log_sum_exp
 
 Array = NDArray[Any]
 
@@ -158,7 +157,7 @@ class RegionsProposal(Proposal):
                 for region in self.regions
             ]
         )
-        return precise_log_sum_exp(density) - np.log(len(self.regions))
+        return logsumexp(density, axis=0) - np.log(len(self.regions))
 
 
 def cover(

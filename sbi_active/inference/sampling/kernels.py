@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 from typing_extensions import override
 
 from sbi_active.inference.sampling.student_mixture import (
@@ -16,7 +17,6 @@ from sbi_active.inference.sampling.student_mixture import (
     log_student,
     student_steps,
 )
-from sbi_active.inference.sampling.weights import precise_log_sum_exp
 
 Array = NDArray[Any]
 
@@ -47,7 +47,7 @@ class KernelMixture(StudentMixture):
         step = np.tensordot(z, inverse, (1, 2)) - center  # (n, k, d)
         log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
         each = log_student((step**2).sum(-1), log_volume, z.shape[1])
-        return precise_log_sum_exp(each, axis=1) - np.log(len(self.means))
+        return np.asarray(logsumexp(each, axis=1)) - np.log(len(self.means))
 
 
 class KernelProposal(Defended):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -20,7 +21,6 @@ from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     normalized,
-    precise_log_sum_exp,
     systematic,
 )
 
@@ -57,9 +57,7 @@ class Particles:
     @property
     def log_normalizer(self) -> float:
         r""":math:`\log \frac1n \sum_i w_i`."""
-        return float(
-            precise_log_sum_exp(self.log_weight) - np.log(len(self.log_weight))
-        )
+        return float(logsumexp(self.log_weight) - np.log(len(self.log_weight)))
 
     @property
     def effective_sample_size(self) -> float:
@@ -124,7 +122,7 @@ class GaussianMixture:
             factor = np.linalg.cholesky(_positive(covariance) + floor * np.eye(d))
             log_weight = np.log(count / count.sum())
             joint = log_weight + _gaussian_log_prob(z, mean, factor)
-            total = precise_log_sum_exp(joint, axis=1)
+            total = np.asarray(logsumexp(joint, axis=1))
             share = np.exp(joint - total[:, None])
             if total.mean() - previous < 1e-3:
                 break
@@ -140,7 +138,7 @@ class GaussianMixture:
     def log_prob(self, points: Array) -> Array:
         """Return log densities, shape (n,)."""
         joint = self.log_weight + _gaussian_log_prob(points, self.mean, self.factor)
-        return precise_log_sum_exp(joint, axis=1)
+        return np.asarray(logsumexp(joint, axis=1))
 
     def assign(self, points: Array) -> NDArray[np.intp]:
         """Return the likeliest component of each point, shape (n,)."""
@@ -186,7 +184,7 @@ class WidenedMixture:
         y = z if self.unbounding is None else self.unbounding.to_line(z)
         square, log_volume = _mahalanobis(y, self.mixture.mean, self.factor)
         each = log_student(square, log_volume, z.shape[1]) + np.log(self.weight)
-        density = precise_log_sum_exp(each, axis=1)
+        density = np.asarray(logsumexp(each, axis=1))
         slope = 0.0 if self.unbounding is None else self.unbounding.log_slope(y)
         return density + slope
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.patterns import picked, unmatched
 from sbi_active.mujoco.effects.actuators import of_actuators
 from sbi_active.mujoco.effects.joints import of_joints
 from sbi_active.mujoco.effects.nominal import Nominal, nominal
@@ -83,16 +83,10 @@ def mjcf_effects(
     simulator, actions, trials = _simulator(model, actions, trials)
     sizes, call = nominal(simulator, trials, actions)
     every = [*_all(simulator, sizes, trials)]
-    names = [e.name for e in every]
-    for pattern in [*include, *exclude]:
-        if not any(fnmatchcase(name, pattern) for name in names):
-            require_name(pattern, names, "effect, or a pattern of some,")
-    kept = [
-        e
-        for e in every
-        if any(fnmatchcase(e.name, p) for p in include)
-        and not any(fnmatchcase(e.name, p) for p in exclude)
-    ]
+    for pattern in unmatched(every, [*include, *exclude]):
+        names = [e.name for e in every]
+        require_name(pattern, names, "effect, or a pattern of some,")
+    kept = picked(every, include, exclude)
     return _that_matter(simulator, kept, call)
 
 
