@@ -14,7 +14,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.evidence.fit import FirstLook, Fit
 from sbi_active.criticism.evidence.importance import (
     ENOUGH,
     MAX_ROUNDS,
@@ -63,6 +63,8 @@ UNLIKELY = 10.0
 FEW_PARTICLES, FEW_MOVES, TOLERATED = 50, 2, 2.0
 #: Nats by which an evidence is behind another, so that it need not be precise.
 BEHIND = 5.0
+#: The same where each trial has its own unknowns, among which particles are dear.
+SETTLED = 3.0
 #: Effective sample size that is enough where the simulator jumps, and the one below
 #: which importance sampling is not trusted there: tempering, which climbs over the same
 #: jumps, would have to do better.
@@ -102,6 +104,7 @@ class RivalSet:
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
+        look: What least squares found before; None where nobody looked.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
     """
@@ -128,6 +131,7 @@ class RivalSet:
         seed_of_trials = derive_seed(seed, "trials")
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
+        self.look: FirstLook | None = None
         self.warm_up = 0.0
         self._factors: tuple[Array, Array] | None = None
         self.noise = self.noise_of(self.measurements)
@@ -290,23 +294,16 @@ class RivalSet:
             search = THOROUGH if near is None else NESTED
         modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
         rng = np.random.default_rng(seed)
-        behind = self._behind(rival, modes.u)
+        behind, best = self._behind(rival, modes.u), self._best_evidence()
         if self.is_smooth and rival.key != ModelKey() and behind > 0:
             sample = laplace_sample(rival, modes, rng)
-            if -np.inf < sample.log_evidence < self._best_evidence() - FAR_BEHIND:
+            if -np.inf < sample.log_evidence < best - FAR_BEHIND:
                 return sample, "linear"
-        if self.is_smooth:
-            better = ridges
-            options: dict[str, Any] = {"dismissed": self._best_evidence() - BEHIND}
-            enough, too_few = ENOUGH, TOO_FEW
-        else:
-            better = regressions
-            enough, too_few = ENOUGH_ROUGH, TOO_FEW_ROUGH
-            options = {
-                "looks": range(MAX_ROUNDS),
-                "missed": np.inf,
-                "dismissed": self._best_evidence() - BEHIND,
-            }
+        better, enough, too_few = ridges, ENOUGH, TOO_FEW
+        options: dict[str, Any] = {"dismissed": best - BEHIND}
+        if not self.is_smooth:
+            better, enough, too_few = regressions, ENOUGH_ROUGH, TOO_FEW_ROUGH
+            options |= {"looks": range(MAX_ROUNDS), "missed": np.inf}
         sample = importance_sample(
             rival,
             modes.proposal,
@@ -317,8 +314,12 @@ class RivalSet:
         )
         if not behind < UNLIKELY or sample.effective_sample_size >= too_few:
             return sample, "least squares"
-        # Where the simulator jumps, all particles are dear, and most often behind.
-        for few in (False,) if self.is_smooth else (True, False):
+        most = sample.log_evidence + TOLERATED * sample.standard_error
+        if self.nuisances and most < best - SETTLED:
+            return sample, "least squares"
+        # Where the simulator jumps, or each trial has its own unknowns, all particles
+        # are dear, and most often behind.
+        for few in (True, False) if self.nuisances or not self.is_smooth else (False,):
             other = self._temper(rival, seed, few=few)
             both = np.hypot(sample.standard_error, other.standard_error)
             if sample.log_evidence > other.log_evidence + 2 * both:

@@ -149,6 +149,15 @@ class Search:
             self.keep(self._fit(key, known))
         return self.found[key]
 
+    def likeliest(self) -> str | None:
+        """Return the effect that alone is likeliest given the sensor's error."""
+
+        def log_p(name: str) -> float:
+            found = self.found[ModelKey((name,))]
+            return found.log_prior + found.posterior.log_sensor
+
+        return max(self.names, key=log_p, default=None)
+
     def _best(self, size: int) -> list[ModelKey]:
         """Return the sets to add to: the likeliest, and those that fit best.
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.evidence.fit import FirstLook
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.left_out import leave_out
@@ -124,6 +125,8 @@ def find_misfit(
     prior = log_priors(rivals.library, ())
     search = Search(rivals, unit, prior, cells)
     search.fit_singles()
+    square = search.found[ModelKey()].model.chi_square[0]
+    rivals.look = FirstLook(search.likeliest(), square)
     if not is_known and not _misses(search):
         return None
     search.fit_larger()

@@ -37,7 +37,8 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     one look at the data; the Bayes factor's bound holds at any stopping time.
 
     Before an alarm, the bare model's evidence is computed again by tempering, since a
-    mode that the least-squares search missed would be a false alarm.
+    mode that the least-squares search missed would be a false alarm. Among the unknowns
+    of many trials particles are dear, and a second search by least squares is asked.
 
     Args:
         rivals: The models.
@@ -47,23 +48,27 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
         Ville, Etude critique de la notion de collectif (1939), for any stopping time.
     """
     null = rivals.fit().evidence
-    # First what can explain anything: beside it, a hopeless effect is soon dismissed.
+    # First what is likeliest, then what can explain anything: beside them, a hopeless
+    # effect is soon dismissed.
     weights = alternatives([e.name for e in rivals.library], equivalent)
+    look = rivals.look
+    first = [] if look is None or look.likeliest is None else [look.likeliest]
     found = {
         name: log_evidence(rivals, ModelKey.of(name))
-        for name in (UNEXPLAINED, SCATTER, *rivals.effects)
+        for name in dict.fromkeys([*first, UNEXPLAINED, SCATTER, *rivals.effects])
     }
     others = [
         (found[name][0] + float(np.log(w)), found[name][1])
         for name, w in weights.items()
         if name in found  # what was screened out has no evidence to speak of
     ]
-    first = null.log_evidence
+    before = null.log_evidence
     log_b, error = bayes_factor(others, log_evidence(rivals))
     freedom = max(len(rivals.measurements) - num_determined(rivals), 1.0)
     level = LEVEL if rivals.has_known_noise else 0.0
     p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
-    if log_b - MARGIN * error > THRESHOLD or p_value < level:
+    is_alarm = log_b - MARGIN * error > THRESHOLD or p_value < level
+    if is_alarm and not (rivals.nuisances and _found_twice(rivals)):
         check = rivals.tempered().log_evidence
         null = rivals.fit().evidence
         log_b, error = bayes_factor(others, log_evidence(rivals))
@@ -79,11 +84,19 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
         degrees_of_freedom=freedom,
         p_value=p_value,
         level=level,
-        null_log_evidence=first,
+        null_log_evidence=before,
         null_cross_check=check,
         least_chi_square=least,
         lower_p_value=lower_p,
     )
+
+
+def _found_twice(rivals: RivalSet) -> bool:
+    """Return whether another search ended where the bare model was sampled."""
+    if rivals.look is None:
+        return False
+    own = rivals.fit().evidence.best_chi_square
+    return own < rivals.look.null_chi_square + 2 * THRESHOLD
 
 
 def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:

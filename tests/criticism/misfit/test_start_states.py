@@ -139,3 +139,14 @@ def test_a_warm_up_that_cannot_be(options, message):
 def test_a_warm_up_needs_nuisances():
     with pytest.raises(ValueError, match="effects of scope 'trial' with warm_up = 0.5"):
         Criticism(MODEL, PRIOR, trials()[0], effects=[DRAG], warm_up=0.5)
+
+
+def test_without_misfit_what_is_far_behind_is_not_sampled():
+    own, _ = trials(drag=1.2)
+    criticism = loop(own)
+    tracing = criticism.trace()
+    assert (tracing.verdict, tracing.misfit) == ("drag", None)
+    assert next(iter(criticism.rivals.fits)) == ModelKey()
+    assert tracing.evidences["unexplained"].engine == "linear"
+    assert tracing.evidences["drag"].effective_sample_size >= 50
+    assert criticism.detect().null_cross_check is None  # two searches agree
