@@ -5,11 +5,14 @@ for independent from trial to trial. The deviation is
 
 .. math::
     s^2 = \max(s_{GLS}, s_J)^2 + (\hat u_{LSQ} - \hat u_{GLS})^2
+        + (\hat u_{LSQ} - \hat u_{LSQ}')^2
 
 with that of generalized least squares given a residual process of which a part is
 shared by the trials, and the jackknife's over trials, :math:`s_J`: what weighting the
-same residuals differently moves a parameter by is an error of it too. The center is
-that of least squares, which predicts new trials better.
+same residuals differently moves a parameter by is an error of it too. So is what it
+moves by, to u', beside the further declared effects that predict new trials best:
+something undeclared may act as they do. The center is that of least squares, which
+predicts new trials better.
 """
 
 from __future__ import annotations
@@ -39,6 +42,8 @@ def covariance(
     left: LeftOut,
     errors: Errors,
     action: Array,
+    *,
+    moved: Array | float = 0.0,
 ) -> Array:
     """Return the covariance of a model's coordinates about its best fit, (d, d).
 
@@ -48,14 +53,17 @@ def covariance(
         left: Refits without each part of the trials.
         errors: Shared by all models.
         action: Of each trial, shape (t, action_dim).
+        moved: u' less u, shape (d,).
     """
     found = shared_process(model, errors, action)
     mean, cov = (posterior.mean, posterior.cov) if found is None else found
     mean = np.clip(mean, model.low, model.high)
     jackknife, apart = left.jackknife(), model.u - mean
     variance = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
-    # Parameters move together as in any of the three, whose sum is hardly wider.
-    total = cov + jackknife + np.outer(apart, apart)
+    moved = np.broadcast_to(moved, apart.shape)
+    variance = variance + moved**2
+    # Parameters move together as in any of the four, whose sum is hardly wider.
+    total = cov + jackknife + np.outer(apart, apart) + np.outer(moved, moved)
     sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))  # that of the prior
     scale = sd / np.sqrt(np.maximum(np.diag(total), 1e-300))
     return total * np.outer(scale, scale)

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.under_misfit import CERTAIN
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -38,7 +39,6 @@ Array = NDArray[Any]
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-CERTAIN = 0.85  # probability of a cause that leaves nothing
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 

@@ -176,9 +176,13 @@ class Search:
 
     def _shared(self, key: ModelKey) -> NDArray[np.bool_]:
         """Return the coordinates of a model that the bare one has."""
+        return self.columns(key, ModelKey())
+
+    def columns(self, key: ModelKey, part: ModelKey) -> NDArray[np.bool_]:
+        """Return the coordinates of a model that one with fewer effects has."""
         rival = self._rival(key)
         keep = np.ones(rival.dim, dtype=bool)
-        for name in key.effects:
+        for name in {*key.effects} - {*part.effects}:
             keep[rival.columns()[name]] = False
         return keep
 

@@ -66,8 +66,21 @@ class Misfit:
         action = self.rivals.trials.action.numpy()
         action = action[np.unique(self.rivals.measurements.trial)]
         return covariance(
-            found.model, found.posterior, found.left, self.search.errors, action
+            found.model,
+            found.posterior,
+            found.left,
+            self.search.errors,
+            action,
+            moved=self._moved(key),
         )
+
+    def _moved(self, key: ModelKey) -> Array:
+        """Return by how much the further effects that predict best move it, (d,)."""
+        found = self.search.found
+        larger = [k for k in found if {*key.effects} <= {*k.effects}]
+        best = min(larger, key=lambda k: found[k].left.mean_square)
+        moved = found[best].model.u[self.search.columns(best, key)]
+        return moved - found[key].model.u
 
     def selected_without(self, fold: int) -> ModelKey:
         """Return the model that is chosen without one part of the trials."""
