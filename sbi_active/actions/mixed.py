@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.space import ActionSpace
 from sbi_active.seeding import derive_seed
 
@@ -84,6 +85,38 @@ class MixedActions(ActionSpace):
         columns = torch.as_tensor(action).split([p.action_dim for p in self._parts], -1)
         each = [p.permits(c) for p, c in zip(self._parts, columns, strict=True)]
         return torch.stack(each).all(0)
+
+    @property
+    def input_times(self) -> Tensor:
+        """Grid of the signals, s, shape (m,)."""
+        return self._signals()[0].input_times
+
+    def inputs(self, action: Tensor) -> dict[str, Tensor]:
+        """Return the signals to play of the one part that has some, by name.
+
+        Args:
+            action: Of all parts, shape (n, action_dim) or (action_dim,).
+
+        Raises:
+            ValueError: If no part or several have signals.
+        """
+        space, entries = self._signals()
+        return space.inputs(torch.as_tensor(action)[..., entries])
+
+    def _signals(self) -> tuple[SignalActions, slice]:
+        """Return the part that has signals, and its entries of an action."""
+        found, begin = [], 0
+        for part in self._parts:
+            end = begin + part.action_dim
+            if isinstance(part, SignalActions):
+                found.append((part, slice(begin, end)))
+            begin = end
+        if len(found) != 1:
+            raise ValueError(
+                f"expected one part of signals; got {len(found)} in {self}; join one "
+                "SignalActions with what else is chosen"
+            )
+        return found[0]
 
     def listed(self) -> Tensor | None:
         """Return all combinations, the last part varying fastest."""

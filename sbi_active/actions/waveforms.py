@@ -109,6 +109,63 @@ def multisine(frequencies: Sequence[float], input: str = "input") -> Waveform:  
     return Waveform("multisine", input, every, {}, tuple(map(float, frequencies)))
 
 
+@dataclass(frozen=True)
+class Together:
+    """Signals of several inputs at once, the entries of one behind those of another.
+
+    Attributes:
+        parts: One an input.
+    """
+
+    parts: tuple[Waveform, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the entries of the action, with the input."""
+        return [f"{part.input} {name}" for part in self.parts for name in part.names]
+
+    @property
+    def units(self) -> list[str]:
+        """Their units."""
+        return [unit for part in self.parts for unit in part.units]
+
+    def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:
+        """Return the signals, {name: (n, m)}.
+
+        Args:
+            action: Shape (n, action_dim).
+            input_times: Shape (m,).
+        """
+        found: dict[str, Tensor] = {}
+        sizes = [len(part.names) for part in self.parts]
+        for part, entries in zip(self.parts, action.split(sizes, 1), strict=True):
+            found |= part(entries, input_times)
+        return found
+
+
+def together(*waveforms: Waveform) -> Together:
+    """Return the signals of several inputs, such as the joints of an arm, as one.
+
+    Args:
+        *waveforms: One an input.
+
+    Raises:
+        ValueError: If there is none, or two are of the same input.
+
+    Example:
+        >>> both = together(chirp("hip", amplitude=0.2), chirp("knee", amplitude=0.3))
+        >>> both.names[1:3]
+        ['hip end frequency', 'knee start frequency']
+    """
+    inputs = [waveform.input for waveform in waveforms]
+    if not inputs or len({*inputs}) < len(inputs):
+        raise ValueError(
+            f"expected waveforms of different inputs; got {inputs}; name the inputs, as "
+            "in chirp('knee')"
+        )
+    return Together(waveforms)
+
+
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """Inputs that were recorded; the action is their number.

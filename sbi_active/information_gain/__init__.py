@@ -12,6 +12,7 @@ from sbi_active.information_gain.estimators.contrastive import ContrastiveGain
 from sbi_active.information_gain.estimators.entropy import EntropyGain
 from sbi_active.information_gain.estimators.info_nce import InfoNCEGain
 from sbi_active.information_gain.estimators.likelihood import LikelihoodGain
+from sbi_active.information_gain.estimators.linear import LinearGain
 from sbi_active.information_gain.estimators.model_index import (
     ModelIndexGain,
     RivalSampler,
@@ -32,6 +33,7 @@ __all__ = [
     "InfoNCEGain",
     "InformationGainEstimator",
     "LikelihoodGain",
+    "LinearGain",
     "ModelIndexGain",
     "NestedGain",
     "ParameterGain",

@@ -9,10 +9,12 @@ tools. No inference, and no criticism of models, is done here. Needs
 from sbi_active.criticism.forces.library import force_effects
 from sbi_active.mujoco.beliefs import belief_to_parameters, randomization
 from sbi_active.mujoco.effects.library import mjcf_effects
+from sbi_active.mujoco.limits import MotionLimits
 from sbi_active.mujoco.robot import Robot, from_mjcf
 from sbi_active.mujoco.sysid import from_sysid
 
 __all__ = [
+    "MotionLimits",
     "Robot",
     "belief_to_parameters",
     "force_effects",

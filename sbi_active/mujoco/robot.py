@@ -10,7 +10,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.actions import ActionSpace
+from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.mujoco.idle import warn_of_idle
@@ -95,9 +95,9 @@ def from_mjcf(
             named by actuators, which are then the actions.
         sensors: Sensors of the MJCF that are read, None for all; also joints, as in
             "hinge" or "hinge velocity", for which it has no sensor.
-        actions: What is chosen in each trial where that is no signal: its names are
-            joints (start positions), joints with " velocity", or actuators (a control
-            that is held).
+        actions: What is chosen in each trial, beside a signal too: its names are
+            joints (start positions), joints with " velocity", actuators (a control
+            that is held), or "model".
         times: At which sensors are read, s from the start of a trial, shape (k,); None
             takes those of the inputs, of the recordings, or they come with the trials.
         noise: Of the sensors, as ``SimulatorModel`` takes it, or standard deviations by
@@ -133,7 +133,7 @@ def from_mjcf(
     machine = machines[0]
     channels = channels_of(machine.model, sensors)
     space, driven = _inputs(machine.model, inputs)
-    actions = _actions(machine.model, actions, space)
+    actions, roles = _actions(machine.model, actions, space)
     trials = None
     if recordings is not None:
         trials = trials_of(machine.model, recordings, channels, inputs=driven)
@@ -145,7 +145,7 @@ def from_mjcf(
     function = MujocoFunction(
         machines,
         channels,
-        roles=() if actions is None or space is not None else actions.names,
+        roles=roles,
         times=grid,
         start=_start(machine.model, start),
         threads=threads,
@@ -156,7 +156,7 @@ def from_mjcf(
         parameter_names=[p.name for p in declared],
         channel_names=[_labeled(c) for c in channels],
         sample_times=None if grid is None else torch.from_numpy(grid),
-        inputs=space,
+        inputs=None if space is None else actions,  # pyright: ignore[reportArgumentType]
     )
     prior = named_box(declared)
     warn_of_idle(simulator, prior, actions, trials)
@@ -214,23 +214,22 @@ def _inputs(model: Any, inputs: Any) -> tuple[SignalActions | None, list[str]]:
 
 def _actions(
     model: Any, actions: ActionSpace | None, space: SignalActions | None
-) -> ActionSpace | None:
-    """Return the actions, whose entries are known to the model."""
+) -> tuple[ActionSpace | None, tuple[str, ...]]:
+    """Return the actions, and what each entry sets in the model; "" for a signal's."""
+    if actions is None:
+        return space, ()
+    held = names_of(model, "actuator")
     if space is not None:
-        if actions is not None:
-            raise ValueError(
-                "expected signals or actions; got both; pass a generator that takes "
-                "all entries of the action"
-            )
-        return space
-    if actions is not None:
-        known = [*start_places(model), *names_of(model, "actuator"), MODEL]
-        for k, name in enumerate(actions.names):
-            require_name(name, known, "joint, a joint with ' velocity', or an actuator")
-            if name in names_of(model, "actuator"):
-                drawn = actions.sample((64,), seed=0)[:, k]
-                require_in_range(model, name, drawn.numpy(), "an action")
-    return actions
+        held = [n for n in held if n not in space.inputs(space.sample((1,), seed=0))]
+    known = [*start_places(model), *held, MODEL]
+    for k, name in enumerate(actions.names):
+        require_name(name, known, "joint, a joint with ' velocity', or an actuator")
+        if name in held:
+            drawn = actions.sample((64,), seed=0)[:, k]
+            require_in_range(model, name, drawn.numpy(), "an action")
+    if space is None:
+        return actions, (*actions.names,)
+    return MixedActions(space, actions), (*[""] * space.action_dim, *actions.names)
 
 
 def _start(

@@ -11,7 +11,7 @@ from sbi_active.mujoco.models.quantities import is_hinge, is_scalar
 from sbi_active.mujoco.models.spec import Source, mujoco_of
 from sbi_active.mujoco.simulator import Channel
 
-__all__ = ["JointSensor", "added_sensors", "channels_of"]
+__all__ = ["ActuatorSensor", "JointSensor", "added_sensors", "channels_of"]
 
 VELOCITY = " velocity"
 
@@ -34,6 +34,24 @@ class JointSensor:
             type=kinds.mjSENS_JOINTVEL if is_speed else kinds.mjSENS_JOINTPOS,
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             objname=self.joint,
+        )
+
+
+@dataclass(frozen=True)
+class ActuatorSensor:
+    """Adds a sensor of an actuator's force or torque."""
+
+    name: str
+    actuator: str
+
+    def __call__(self, spec: Any) -> None:
+        """Add it to a spec."""
+        mujoco = mujoco_of()
+        spec.add_sensor(
+            name=self.name,
+            type=mujoco.mjtSensor.mjSENS_ACTUATORFRC,
+            objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
+            objname=self.actuator,
         )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.actions.mixed import MixedActions
 from sbi_active.actions.signals import SignalActions
 
 #: Names of these arguments.
@@ -58,7 +59,9 @@ def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> Non
             )
 
 
-def require_taken(inputs: SignalActions | None, conditions: tuple[str, ...]) -> None:
+def require_taken(
+    inputs: SignalActions | MixedActions | None, conditions: tuple[str, ...]
+) -> None:
     """Raise where signals are given that a function does not take."""
     if inputs is not None and "inputs" not in conditions:
         raise ValueError(
@@ -67,7 +70,9 @@ def require_taken(inputs: SignalActions | None, conditions: tuple[str, ...]) -> 
         )
 
 
-def played(space: SignalActions, action: Tensor, dtype: torch.dtype) -> dict[str, Any]:
+def played(
+    space: SignalActions | MixedActions, action: Tensor, dtype: torch.dtype
+) -> dict[str, Any]:
     """Return the signals of actions as inputs and input_times.
 
     Args:

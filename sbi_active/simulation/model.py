@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.actions.mixed import MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_seeds
@@ -71,8 +72,9 @@ class SimulatorModel:
             trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
-        inputs: Where actions are parameters of a signal, their space: ``fn`` receives
-            its signals as ``inputs``, unless trials bring those that were recorded.
+        inputs: Where actions are parameters of a signal, alone or beside others, their
+            space: ``fn`` receives its signals as ``inputs``, unless trials bring those
+            that were recorded.
 
     Attributes:
         noise: With the time stamps, where there are any.
@@ -103,7 +105,7 @@ class SimulatorModel:
         parameter_names: Sequence[str] | None = None,
         channel_names: Sequence[str] | None = None,
         sample_times: Tensor | None = None,
-        inputs: SignalActions | None = None,
+        inputs: SignalActions | MixedActions | None = None,
     ) -> None:
         self.fn = fn
         self.is_batched = batched

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from sbi_active.actions import BoxActions, MixedActions, SignalActions
-from sbi_active.actions.waveforms import chirp, multisine, recorded, step
+from sbi_active.actions.waveforms import chirp, multisine, recorded, step, together
 from sbi_active.criticism import Trials
+from sbi_active.simulation import SimulatorModel
 
 TIMES = torch.linspace(0, 2, 201)
 
@@ -153,3 +154,43 @@ def test_signals_can_be_pickled():
 def test_bad_signals(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_signals_of_several_inputs_are_one_action():
+    space = SignalActions(
+        together(chirp("hip", amplitude=0.2), multisine([1.0, 2.0], "knee")),
+        [0.1, 1.0, 0.0, 0.0],
+        [1.0, 5.0, 0.3, 0.3],
+        input_times=TIMES,
+        amplitude={"knee": 0.4},
+    )
+    assert space.names[:3] == [
+        "hip start frequency",
+        "hip end frequency",
+        "knee amplitude at 1 Hz",
+    ]
+    action = torch.tensor([[0.5, 3.0, 0.1, 0.2]])
+    played = space.inputs(action)
+    alone = chirp("hip", amplitude=0.2)(action[:, :2], TIMES)["hip"]
+    assert torch.equal(played["hip"], alone)
+    assert [*played] == ["hip", "knee"]
+    with pytest.raises(ValueError, match="waveforms of different inputs; got"):
+        together(chirp("knee"), step("knee"))
+
+
+def test_signals_beside_a_category_are_played_by_the_simulator():
+    space = MixedActions(chirps(), BoxActions(0.0, 1.0, names=["payload"]))
+    action = torch.tensor([[2.0, 4.0, 0.5]])
+    assert torch.equal(
+        space.inputs(action)["voltage"], chirps().inputs(action[:, :2])["voltage"]
+    )
+    assert space.input_times.shape == TIMES.shape
+
+    def follow(theta, action, *, inputs, input_times):
+        return theta * inputs["voltage"] + action[:, 2:]
+
+    model = SimulatorModel(follow, noise=0.1, inputs=space)
+    x = model.mean(torch.ones(1, 1), action)
+    assert torch.allclose(x, space.inputs(action)["voltage"] + 0.5)
+    with pytest.raises(ValueError, match="one part of signals; got 0 in MixedActions"):
+        MixedActions(BoxActions(0.0, 1.0)).inputs(torch.zeros(1, 1))

@@ -16,6 +16,7 @@ from sbi_active.information_gain.estimators.contrastive import ContrastiveGain
 from sbi_active.information_gain.estimators.entropy import EntropyGain
 from sbi_active.information_gain.estimators.info_nce import InfoNCEGain
 from sbi_active.information_gain.estimators.likelihood import LikelihoodGain
+from sbi_active.information_gain.estimators.linear import LinearGain
 from sbi_active.information_gain.estimators.nested import NestedGain
 from sbi_active.information_gain.estimators.posterior import PosteriorGain
 from sbi_active.information_gain.estimators.ratio import RatioGain
@@ -30,6 +31,7 @@ ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
     "entropy": EntropyGain,
     "info_nce": InfoNCEGain,
     "likelihood": LikelihoodGain,
+    "linear": LinearGain,
     "nested": NestedGain,
     "posterior": PosteriorGain,
     "ratio": RatioGain,

@@ -19,9 +19,9 @@ from sbi_active.information_gain.estimators.entropy import (
     with_control,
 )
 from sbi_active.information_gain.estimators.evidence import Evidence, log_belief
-from sbi_active.information_gain.estimators.learning_error import learning_error
 from sbi_active.information_gain.fits.completeness import completeness
 from sbi_active.information_gain.fits.emulator import MeanEmulator
+from sbi_active.information_gain.fits.learning_error import learning_error
 from sbi_active.information_gain.fits.presence import (
     presence_information,
     presence_notes,

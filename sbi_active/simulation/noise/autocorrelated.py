@@ -232,6 +232,23 @@ def innovations(
         :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero where not observed, shapes (n,
         T, rest).
     """
+    change, variance = chained(residual, tau, times)
+    observed = ~change.isnan()
+    square, log_factor = change.square() / variance, variance.log()
+    return torch.where(observed, square, 0.0), torch.where(observed, log_factor, 0.0)
+
+
+def chained(
+    residual: Tensor, tau: Tensor, times: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    r"""Return what is new at each time, and its variance in those of the residual.
+
+    Arguments are those of :func:`innovations`.
+
+    Returns:
+        :math:`e_t - \rho e_s`, NaN where not observed, and :math:`1 - \rho^2`, shapes
+        (n, T, rest).
+    """
     e = residual.flatten(2) if residual.ndim > 2 else residual[..., None]
     stamp = time_stamps(times, residual.shape).to(e.device)[..., None].expand(e.shape)
     observed = ~e.isnan()
@@ -245,9 +262,7 @@ def innovations(
     ratio = step / tau[:, None, None]
     rho, variance = torch.exp(-ratio), -torch.expm1(-2 * ratio)
     past = torch.where(first, 0.0, e.gather(1, source))
-    square = (e - rho * past).square() / variance
-    log_factor = torch.where(observed, variance.log(), 0.0)
-    return torch.where(observed, square, 0.0), log_factor
+    return e - rho * past, variance
 
 
 def time_stamps(times: Tensor | None, shape: Sequence[int]) -> Tensor:

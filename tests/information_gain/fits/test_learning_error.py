@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sbi_active.information_gain.estimators.learning_error import learning_error
+from sbi_active.information_gain.fits.learning_error import learning_error
 
 N, SLOPE = 5_000, 1.7
 

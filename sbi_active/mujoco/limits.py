@@ -1,0 +1,223 @@
+"""Which actions keep a robot within its limits: they are played in simulation first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.mujoco.models.machine import Machine
+from sbi_active.mujoco.models.names import names_of, require_name
+from sbi_active.mujoco.models.quantities import is_scalar
+from sbi_active.mujoco.robot import Robot
+from sbi_active.mujoco.sensors import (
+    ActuatorSensor,
+    JointSensor,
+    channels_of,
+)
+from sbi_active.mujoco.simulator import MujocoFunction
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import SimulatorModel
+
+__all__ = ["MotionLimits"]
+
+Array = NDArray[Any]
+
+#: Readings of all rows that are in memory at once.
+NUMBERS = 20_000_000
+
+
+class MotionLimits:
+    """A constraint on actions: joints and actuators stay within limits when played.
+
+    As ``constraint=`` of a :class:`.Campaign` or a designer it lets through actions
+    whose motion, simulated at draws from the belief, stays within every limit at each
+    step, and in which no state diverges. The draws are few and the model is not the
+    robot: leave a margin, and keep the robot's own guards.
+
+    Args:
+        robot: Of :func:`.from_mjcf` or :func:`.from_sysid`.
+        position: Limits (low, high) by joint, rad or m; None takes the ranges of those
+            joints that are limited in the MJCF. ``{}`` for none.
+        velocity: Largest speed by joint, rad/s or m/s.
+        torque: Largest force by actuator, N m or N, of the actuator's own; None takes
+            the ``forcerange`` of the MJCF where it has one.
+        belief: Of the parameters; None takes the prior.
+        num_draws: Of the parameters. The first alone refuses most.
+        seed: Of the draws.
+
+    Raises:
+        ValueError: If a name does not exist, a limit is not positive or empty, or there
+            is no limit at all.
+
+    Example:
+        >>> from sbi_active import DiscreteActions
+        >>> from sbi_active.mujoco import from_mjcf
+        >>> robot = from_mjcf(
+        ...     '''<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom
+        ...     type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/></body>
+        ...     </worldbody></mujoco>''',
+        ...     {"hinge.damping": (0.0, 0.1)}, sensors=["hinge"], noise=0.01,
+        ...     times=[1.0], actions=DiscreteActions([0.2, 1.5], names=["hinge"]))
+        >>> limits = MotionLimits(robot, position={"hinge": (-1.0, 1.0)})
+        >>> limits(torch.tensor([[0.2], [1.5]]))
+        tensor([ True, False])
+        >>> sorted(limits.extremes(torch.tensor([[0.2]])))
+        ['hinge']
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        position: Mapping[str, tuple[float, float]] | None = None,
+        velocity: Mapping[str, float] | None = None,
+        torque: Mapping[str, float] | None = None,
+        belief: Distribution | None = None,
+        num_draws: int = 8,
+        seed: int = 0,
+    ) -> None:
+        function = robot.simulator.fn
+        if not isinstance(function, MujocoFunction):
+            raise ValueError(
+                f"expected a robot that runs MuJoCo; got {type(function).__name__}; "
+                "pass what from_mjcf or from_sysid returned"
+            )
+        model = function.model
+        if position is None:
+            position = _ranges(model, "joint", model.jnt_limited, model.jnt_range)
+        if torque is None:
+            own = model.actuator_forcelimited, model.actuator_forcerange
+            forces: Mapping[str, Any] = _ranges(model, "actuator", *own)
+        else:
+            forces = torque
+        joints = [j for j in names_of(model, "joint") if is_scalar(model, j)]
+        actuators = names_of(model, "actuator")
+        #: Sensor to add, label, lowest and highest value.
+        watched = [
+            *_watched(position, joints, "", "joint"),
+            *_watched(velocity or {}, joints, " velocity", "joint"),
+            *_watched(forces, actuators, " torque", "actuator"),
+        ]
+        if not watched:
+            raise ValueError(
+                "expected limits of positions, velocities or torques; got none, nor "
+                "has the MJCF; pass, say, position={'hinge': (-1.0, 1.0)}"
+            )
+        self._labels = [label for _, label, _, _ in watched]
+        self._low = np.array([low for *_, low, _ in watched])
+        self._high = np.array([high for *_, high in watched])
+        self._run = _with_sensors(robot.simulator, [edit for edit, *_ in watched])
+        self._times = _every_step(robot.simulator, model.opt.timestep)
+        with forked_generators(seed):
+            drawn = (belief or robot.prior).sample((num_draws,))
+        self._theta = drawn.double()
+
+    def __call__(self, action: Tensor) -> Tensor:
+        """Return which of actions (n, action_dim) stay within all limits, bool (n,)."""
+        action = torch.as_tensor(action).double()
+        inside = np.ones(len(action), dtype=bool)
+        # Most that leave their limits do so at any parameters.
+        for theta in (self._theta[:1], self._theta[1:]):
+            place = np.flatnonzero(inside)
+            if not len(place) or not len(theta):
+                break
+            low, high = self._reached(action[place], theta)
+            within = (low >= self._low) & (high <= self._high)  # no for NaN
+            inside[place] = within.all(1)
+        return torch.from_numpy(inside)
+
+    def extremes(self, action: Tensor) -> dict[str, tuple[Array, Array]]:
+        """Return the lowest and highest value of what is limited, over all draws.
+
+        Args:
+            action: Shape (n, action_dim).
+
+        Returns:
+            By name of a joint, of one with " velocity", or of an actuator with
+            " torque": both of shape (n,); NaN where a state diverges.
+        """
+        low, high = self._reached(torch.as_tensor(action).double(), self._theta)
+        return {label: (low[:, k], high[:, k]) for k, label in enumerate(self._labels)}
+
+    def _reached(self, action: Tensor, theta: Tensor) -> tuple[Array, Array]:
+        """Return lowest and highest readings, each of shape (n, limits)."""
+        num = len(theta)
+        size = max(1, NUMBERS // (num * len(self._times) * len(self._labels)))
+        lows, highs = [], []
+        for some in action.split(size):
+            rows = theta.repeat(len(some), 1), some.repeat_interleave(num, 0)
+            times = torch.from_numpy(self._times).expand(len(rows[0]), -1)
+            x = self._run(*rows, times=times).double().numpy()
+            x = x.reshape(len(some), num * len(self._times), -1)
+            lows.append(x.min(1))
+            highs.append(x.max(1))
+        return np.concatenate(lows), np.concatenate(highs)
+
+
+def _ranges(
+    model: Any, kind: str, is_limited: Any, ranges: Any
+) -> dict[str, tuple[float, float]]:
+    """Return the ranges of those elements of a model that are limited."""
+    every = zip(names_of(model, kind), is_limited, ranges, strict=True)
+    return {name: (float(a), float(b)) for name, limited, (a, b) in every if limited}
+
+
+def _watched(
+    limits: Mapping[str, Any], known: list[str], what: str, kind: str
+) -> list[tuple[Any, str, float, float]]:
+    """Return the sensor, the label and the limits of each."""
+    found = []
+    for name, limit in limits.items():
+        require_name(name, known, kind)
+        low, high = limit if isinstance(limit, tuple) else (-limit, limit)
+        if not low < high or math.isinf(low) and math.isinf(high):
+            raise ValueError(
+                f"expected limits of {name}{what} that leave room; got {limit}; pass "
+                "(low, high), or one positive number for both sides"
+            )
+        label = name + what
+        sensor = f"limit of {label}"  # beside one that the MJCF may have
+        if kind == "actuator":
+            edit: Any = ActuatorSensor(sensor, name)
+        else:
+            edit = JointSensor(sensor, name, is_speed=bool(what))
+        found.append((edit, label, float(low), float(high)))
+    return found
+
+
+def _with_sensors(simulator: SimulatorModel, edits: list[Any]) -> SimulatorModel:
+    """Return a simulator that reads what is limited, and nothing else."""
+    function: MujocoFunction = simulator.fn  # pyright: ignore[reportAssignmentType]
+    machines = [
+        Machine(m.source.edited(*edits), m.parameters, edit=m.edit)
+        for m in function.machines
+    ]
+    names = [edit.name for edit in edits]
+    own = MujocoFunction(
+        machines,
+        channels_of(machines[0].model, names),
+        roles=function.roles,
+        start=function.start,
+        threads=function.threads,
+        recorded=function.recorded,
+    )
+    return SimulatorModel(own, inputs=simulator.inputs)
+
+
+def _every_step(simulator: SimulatorModel, step: float) -> Array:
+    """Return the times of all steps of a trial, s, shape (k,)."""
+    grids = [simulator.sample_times]
+    if simulator.inputs is not None:
+        grids.append(simulator.inputs.input_times)
+    known = torch.cat([grid.flatten() for grid in grids if grid is not None])
+    first = 0.0
+    if simulator.inputs is not None:
+        first = float(simulator.inputs.input_times[0])
+    return first + step * np.arange(int((float(known.max()) - first) / step + 1.5))

@@ -1,0 +1,138 @@
+"""Actions that keep a robot within its limits, and those that do not."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.robots.models import ARM, PENDULUM
+from sbi_active import BoxActions, DiscreteActions, InformationGainDesigner
+from sbi_active.actions import MixedActions, SignalActions
+from sbi_active.actions.waveforms import chirp, together
+from sbi_active.mujoco import MotionLimits, from_mjcf
+
+TIMES = torch.arange(0, 1.0, 0.01, dtype=torch.float64)
+SIGNALS = SignalActions(
+    together(
+        chirp("shoulder servo", start_frequency=0.5),
+        chirp("elbow servo", amplitude=0.2, start_frequency=0.5, end_frequency=2.0),
+    ),
+    [0.05, 1.0],
+    [1.5, 4.0],
+    input_times=TIMES,
+)
+LOAD = (
+    '<body name="load" pos=".3 0 0"><geom size=".03" mass=".5"/></body></body></body>'
+)
+
+
+def arm(**options):
+    given = {
+        "parameters": {"shoulder.damping": (0.05, 0.5), "lower.mass": (0.3, 1.0)},
+        "sensors": ["shoulder", "elbow"],
+        "noise": 0.001,
+        "inputs": SIGNALS,
+    }
+    return from_mjcf(options.pop("spec", ARM), **{**given, **options})
+
+
+def test_limits_are_those_of_the_motion_itself():
+    robot = arm()
+    action = torch.tensor([[0.1, 2.0], [1.2, 3.0]])
+    limits = MotionLimits(
+        robot,
+        position={"shoulder": (-0.6, 0.6)},
+        velocity={"elbow": 20.0},
+        torque={"shoulder servo": 200.0},
+        num_draws=3,
+    )
+    assert limits(action).tolist() == [True, False]
+    reached = limits.extremes(action)
+    assert [*reached] == ["shoulder", "elbow velocity", "shoulder servo torque"]
+    # What the sensors read at the same parameters.
+    theta = limits._theta.repeat(2, 1)
+    x = robot.simulator.mean(theta, action.double().repeat_interleave(3, 0))
+    shoulder = x[..., 0].reshape(2, -1)
+    low, high = reached["shoulder"]
+    assert np.allclose(low, shoulder.min(1).values, atol=2e-3)
+    assert np.allclose(high, shoulder.max(1).values, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("limit", "kept"),
+    [
+        ({"velocity": {"shoulder": 3.0}}, [True, False]),
+        ({"torque": {"shoulder servo": 12.0}}, [True, False]),
+        ({"velocity": {"shoulder": 100.0}}, [True, True]),
+    ],
+)
+def test_each_kind_of_limit_refuses(limit, kept):
+    limits = MotionLimits(arm(), position={}, num_draws=2, **limit)
+    assert limits(torch.tensor([[0.1, 1.0], [1.5, 4.0]])).tolist() == kept
+
+
+def test_ranges_of_the_mjcf_are_the_default():
+    limited = ARM.replace('axis="0 1 0" damping', 'axis="0 1 0" range="-20 20" damping')
+    limited = "<mujoco>" + limited.split(">", 1)[1]
+    robot = arm(spec=limited.replace("<option", '<compiler angle="degree"/><option'))
+    limits = MotionLimits(robot)
+    assert [*limits.extremes(torch.tensor([[0.1, 1.0]]))] == ["shoulder", "elbow"]
+    assert limits(torch.tensor([[0.1, 1.0], [1.5, 2.0]])).tolist() == [True, False]
+
+
+def test_a_state_that_diverges_is_refused():
+    explicit = PENDULUM.replace("implicitfast", "Euler").replace("0.01", "0.05", 1)
+    robot = from_mjcf(
+        explicit,
+        {"hinge.stiffness": (1e6, 2e6)},  # far beyond what the step can follow
+        actions=DiscreteActions([[0.0], [1.0]], names=["hinge"]),
+        times=[20.0],
+        noise=0.01,
+    )
+    limits = MotionLimits(robot, position={"hinge": (-1e300, 1e300)})
+    action = torch.tensor([[0.0], [1.0]])
+    assert np.isnan(limits.extremes(action)["hinge"][0]).tolist() == [False, True]
+    assert limits(action).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("limit", "message"),
+    [
+        ({}, "expected limits of positions, velocities or torques; got none"),
+        ({"position": {"sholder": (-1.0, 1.0)}}, "shoulder"),
+        ({"velocity": {"shoulder": -1.0}}, "limits of shoulder velocity that leave"),
+        ({"position": {"shoulder": (1.0, -1.0)}}, "limits of shoulder that leave room"),
+        ({"torque": {"shoulder": 1.0}}, "shoulder servo"),
+    ],
+)
+def test_limits_that_cannot_be(limit, message):
+    with pytest.raises(ValueError, match=message):
+        MotionLimits(arm(), **limit)
+
+
+def test_a_designer_proposes_within_the_limits_and_chooses_the_payload():
+    payload = ARM.replace("</body>\n    </body>", LOAD)
+    assert payload != ARM
+    robot = arm(
+        spec=[ARM, payload], actions=DiscreteActions([0.0, 1.0], names=["model"])
+    )
+    assert isinstance(robot.actions, MixedActions)
+    assert robot.actions.names[-1] == "model"
+    action = torch.tensor([[0.5, 2.0, 0.0], [0.5, 2.0, 1.0]])
+    x = robot.simulator.mean(torch.tensor([[0.1, 0.5]]).expand(2, -1), action)
+    assert float((x[0] - x[1]).abs().max()) > 0.01
+    limits = MotionLimits(robot, position={"shoulder": (-0.6, 0.6)}, num_draws=2)
+    pool = robot.actions.sample((12,), seed=0)
+    designer = InformationGainDesigner(
+        DiscreteActions(pool, names=robot.actions.names),
+        num_samples=40,
+        estimator="linear",
+    )
+    design = designer.select(
+        None, robot.simulator, belief=robot.prior, constraint=limits, seed=0
+    )
+    assert limits(design.action[None]).all()
+    assert not limits(pool).all()
+    best = design.expected_information_gain.max()
+    assert float(best) > 4.0
+    with pytest.raises(ValueError, match="elbow servo|shoulder"):
+        arm(actions=BoxActions(-1.0, 1.0, names=["elbow servo"]))
