@@ -160,7 +160,7 @@ def together(*waveforms: Waveform) -> Together:
     inputs = [waveform.input for waveform in waveforms]
     if not inputs or len({*inputs}) < len(inputs):
         raise ValueError(
-            f"expected waveforms of different inputs; got {inputs}; name the inputs, as "
+            f"expected waveforms of different inputs; got {inputs}; name them, as "
             "in chirp('knee')"
         )
     return Together(waveforms)
