@@ -69,7 +69,10 @@ def log_evidence(
             for s in SCALES
         ]
         mixture = log_sum_exp(np.stack(log_p), axis=0) - np.log(len(SCALES))
-        log_w = log_w + mixture - effect.log_prob(phi).double().numpy()
+        declared = effect.log_prob(phi).double().numpy()
+        # A mode at a bound may round to beyond, where no scale has a density.
+        inside = np.isfinite(declared)
+        log_w[inside] += mixture[inside] - declared[inside]
     change = log_sum_exp(log_w)
     num = len(sample.weights)
     effective = np.exp(2 * change - log_sum_exp(2 * log_w))

@@ -5,7 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import multivariate_normal
-from torch.distributions import Independent, Normal, Uniform
+from torch.distributions import HalfNormal, Independent, Normal, Uniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
@@ -98,6 +98,20 @@ def test_a_bounded_prior_says_what_is_possible():
     assert value == pytest.approx(
         some.fit(ModelKey(("curve",))).evidence.log_evidence, abs=1e-9
     )
+
+
+def test_a_draw_that_rounds_to_beyond_its_prior_takes_no_evidence_away():
+    own = {f: getattr(CURVE, f) for f in ("hook", "null", "apply")}
+    prior = Independent(HalfNormal(torch.tensor([0.7])), 1)
+    key, some = ModelKey(("curve",)), rivals()
+    some.effects["curve"] = Effect("curve", prior=prior, **own)
+    fit = some.fit(key)
+    before, _ = log_evidence(some, key)
+    weights = fit.sample.weights
+    least = np.where(weights > 0, weights, np.inf).argmin()
+    fit.sample.u[least, -1] = fit.rival.coordinates.low[-1] - 1e-9
+    after, _ = log_evidence(some, key)
+    assert after == pytest.approx(before, abs=0.2)
 
 
 @pytest.mark.parametrize("names", MODELS)
