@@ -1,0 +1,262 @@
+r"""Draws of parameters of a linear model with unknown errors and doubtful effects.
+
+.. math::
+    r(u) = r_0 + J u, \qquad r_c \sim \mathcal N(0, \sigma_c^2 C_{h_c})
+
+in every channel c, with u = (theta, phi) between bounds. An effect is absent, phi at
+its null, unless it is there: what may be missing widens the intervals by as much as the
+logs leave it open, and hardly where they exclude it. Blocks of the Gibbs sampler are
+the errors' shape and size by channel, each effect's presence with all of u summed out,
+and u along the eigenvectors of its precision.
+
+References:
+    George & McCulloch, Statistica Sinica 7 (1997), for the presence of variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, ndtr, ndtri
+
+from sbi_active.criticism.identification.errors import Grams, Hypotheses
+
+Array = NDArray[Any]
+
+#: Chains, their sweeps, and those that are left out of them.
+CHAINS, SWEEPS, BURNT = 64, 80, 20
+#: Prior probability that no doubtful effect is there.
+NONE = 0.5
+#: Factor on the deviation of an effect's prior, as its scale is a guess.
+WIDER = 1.0
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What is known of u before the logs, d coordinates from where they are zero.
+
+    Attributes:
+        low: Shape (d,).
+        high: Shape (d,).
+        center: Of a Gaussian prior, shape (d,).
+        precision: Of it, 0 for uniform ones, shape (d,).
+        null: Of effects, shape (d,); 0 for others.
+        effect: Number of the effect that a coordinate belongs to, -1 for theta, (d,).
+    """
+
+    low: Array
+    high: Array
+    center: Array
+    precision: Array
+    null: Array
+    effect: NDArray[np.int64]
+
+    @property
+    def num_effects(self) -> int:
+        """Number of doubtful effects."""
+        return int(self.effect.max(initial=-1)) + 1
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Of the posterior.
+
+    Attributes:
+        u: Shape (n, d).
+        present: Whether each effect is there, bool, shape (n, e).
+        errors: Hypothesis of each channel, shape (n, c).
+        size: Deviation of each channel's errors, shape (n, c).
+    """
+
+    u: Array
+    present: NDArray[np.bool_]
+    errors: NDArray[np.int64]
+    size: Array
+
+
+def sample(
+    channels: Sequence[Grams],
+    hypotheses: Hypotheses,
+    unknowns: Unknowns,
+    known_size: Sequence[float | None],
+    rng: np.random.Generator,
+) -> Draws:
+    """Return posterior draws.
+
+    Args:
+        channels: Gram matrices of (r_0, J) by channel.
+        hypotheses: Of the errors.
+        unknowns: Priors.
+        known_size: Deviation of the white part by channel; None where it is unknown.
+        rng: Source of the draws.
+    """
+    p, d = unknowns, len(unknowns.low)
+    sums = [g.total for g in channels]
+    u = np.clip(np.zeros((CHAINS, d)), p.low, p.high)
+    present = np.ones((CHAINS, p.num_effects), dtype=bool)
+    kept: list[tuple[Array, ...]] = []
+    for sweep in range(SWEEPS):
+        precision = np.zeros((CHAINS, d, d))
+        linear = np.zeros((CHAINS, d))
+        chosen, sizes = [], []
+        for (gram, log_det, count), size in zip(sums, known_size, strict=True):
+            h, variance = _errors(gram, log_det, count, hypotheses, size, u, rng)
+            precision += gram[h][:, 1:, 1:] / variance[:, None, None]
+            linear -= gram[h][:, 1:, 0] / variance[:, None]
+            chosen.append(h)
+            sizes.append(np.sqrt(variance))
+        for e in rng.permutation(p.num_effects):
+            present[:, e] = _present(precision, linear, p, present, int(e), rng)
+        u = _moved(u, precision, linear, p, present, rng)
+        if sweep >= BURNT:
+            parts = (u, present, np.stack(chosen, 1), np.stack(sizes, 1))
+            kept.append(tuple(part.copy() for part in parts))
+    return Draws(*(np.concatenate(part) for part in zip(*kept, strict=True)))
+
+
+def _errors(
+    gram: Array,
+    log_det: Array,
+    count: int,
+    hypotheses: Hypotheses,
+    size: float | None,
+    u: Array,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.intp], Array]:
+    """Return the shape and the variance of one channel's errors, given u."""
+    one = np.concatenate([np.ones((len(u), 1)), u], 1)
+    square = np.einsum("ni,hij,nj->nh", one, gram, one, optimize=True)
+    square = np.maximum(square, TINY)
+    log_p = hypotheses.log_prior - 0.5 * log_det
+    if size is None:  # with the variance summed out, p(v) = 1 / v
+        log_p = log_p - 0.5 * count * np.log(square)
+    else:
+        every = size**2 / hypotheses.share
+        log_p = log_p - 0.5 * (square / every + count * np.log(every))
+    h = _picked(log_p, rng)
+    if size is not None:
+        return h, size**2 / hypotheses.share[h]
+    rows = np.arange(len(u))
+    return h, square[rows, h] / (2 * rng.gamma(0.5 * count, size=len(u)))
+
+
+def _present(
+    precision: Array,
+    linear: Array,
+    p: Unknowns,
+    present: NDArray[np.bool_],
+    effect: int,
+    rng: np.random.Generator,
+) -> NDArray[np.bool_]:
+    """Return whether an effect is there, given which others are."""
+    log_z = []
+    for there in (False, True):
+        some = present.copy()
+        some[:, effect] = there
+        log_z.append(_log_evidence(precision, linear, p, some))
+    prior = NONE ** (1 / p.num_effects)
+    log_odds = log_z[1] - log_z[0] + np.log1p(-prior) - np.log(prior)
+    return rng.random(len(present)) < 1 / (1 + np.exp(np.clip(-log_odds, -700, 700)))
+
+
+def _conditional(
+    precision: Array, linear: Array, p: Unknowns, present: NDArray[np.bool_]
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Return what is free given what is absent: precision, linear part, mask, rest.
+
+    Coordinates that are absent have a precision of one apart from all others, and stand
+    at their null; ``rest`` is the log density that these have.
+    """
+    free = np.ones((len(linear), len(p.low)), dtype=bool)
+    own = p.effect >= 0
+    free[:, own] = present[:, p.effect[own]]
+    absent = np.where(free, 0.0, p.null)
+    at_null = np.einsum("nij,nj->ni", precision, absent)
+    rest = (absent * (linear - 0.5 * at_null)).sum(1)
+    own_precision = np.where(own, p.precision / WIDER**2, p.precision)
+    full = precision * (free[:, :, None] & free[:, None, :])
+    full = full + np.where(free, own_precision, 1.0)[:, None] * np.eye(len(own))
+    rhs = np.where(free, linear - at_null + own_precision * p.center, 0.0)
+    # Each effect's prior is a normalized density; theta is in every model.
+    log_prior = 0.5 * np.log(np.maximum(own_precision, TINY))
+    log_prior = log_prior - 0.5 * own_precision * p.center**2
+    scale = 1 / np.sqrt(np.maximum(own_precision, TINY))
+    log_prior = log_prior - _log_inside(p.center, scale, p.low, p.high)
+    rest = rest + (np.where(own, log_prior, 0.0) * free).sum(1)
+    return full, rhs, free, rest
+
+
+def _log_evidence(
+    precision: Array, linear: Array, p: Unknowns, present: NDArray[np.bool_]
+) -> Array:
+    """Return the log evidence of which effects are there, up to what all share."""
+    full, rhs, free, rest = _conditional(precision, linear, p, present)
+    ridge = 1e-10 * np.einsum("nii->ni", full)[:, :, None] * np.eye(len(p.low))
+    cov = np.linalg.inv(full + ridge)
+    mean = np.einsum("nij,nj->ni", cov, rhs)
+    sd = np.sqrt(np.maximum(np.einsum("nii->ni", cov), TINY))
+    inside = _log_inside(mean, sd, p.low, p.high)
+    log_z = rest + 0.5 * (mean * rhs).sum(1) + 0.5 * np.linalg.slogdet(cov)[1]
+    return log_z + np.where(free, inside, 0.0).sum(1)
+
+
+def _moved(
+    u: Array,
+    precision: Array,
+    linear: Array,
+    p: Unknowns,
+    present: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> Array:
+    """Return u drawn along the eigenvectors of its precision, within its bounds."""
+    full, rhs, free, _ = _conditional(precision, linear, p, present)
+    u = np.where(free, u, p.null)
+    values, vectors = np.linalg.eigh(full)
+    for j in range(u.shape[1]):
+        e = np.where(free, vectors[:, :, j], 0.0)
+        e = np.where(np.abs(e) < 1e-12, 0.0, e)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([(p.low - u) / e, (p.high - u) / e])
+        ends = np.where(e == 0, np.array([-np.inf, np.inf])[:, None, None], ends)
+        low = np.minimum(ends.min(0).max(1), 0.0)
+        high = np.maximum(ends.max(0).min(1), 0.0)
+        slope = (e * (rhs - np.einsum("nij,nj->ni", full, np.where(free, u, 0)))).sum(1)
+        sd = 1 / np.sqrt(np.maximum(values[:, j], 1e-12))
+        step = _truncated(slope * sd**2, sd, low, high, rng)
+        step = np.where((e != 0).any(1), step, 0.0)
+        u = np.clip(u + step[:, None] * e, p.low, p.high)
+        u = np.where(free, u, p.null)
+    return u
+
+
+def _truncated(
+    mean: Array, sd: Array, low: Array, high: Array, rng: np.random.Generator
+) -> Array:
+    """Return normal draws between bounds."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    flip = a > 0  # in the lower tail, where small shares are exact
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    share = ndtr(a) + (ndtr(b) - ndtr(a)) * rng.random(len(mean))
+    z = np.clip(ndtri(np.clip(share, 1e-300, 1 - 1e-16)), a, b)
+    return mean + sd * np.where(flip, -z, z)
+
+
+def _log_inside(mean: Array, sd: Array, low: Array, high: Array) -> Array:
+    """Return the log probability of a normal variable between bounds."""
+    a, b = (low - mean) / sd, (high - mean) / sd
+    flip = a > 0
+    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
+    upper, lower = log_ndtr(b), log_ndtr(a)
+    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
+
+
+def _picked(log_p: Array, rng: np.random.Generator) -> NDArray[np.intp]:
+    p = np.exp(log_p - log_p.max(1, keepdims=True))
+    steps = np.cumsum(p, 1)
+    place = (steps < rng.random((len(p), 1)) * steps[:, -1:]).sum(1)
+    return np.minimum(place, p.shape[1] - 1)
