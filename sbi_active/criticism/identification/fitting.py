@@ -38,6 +38,10 @@ TRIED = 0.05
 #: Times that the model is linearized anew, and a move that is worth it, in posterior
 #: deviations.
 LINEARIZED, MOVED = 4, 0.3
+#: Sweeps of the sampler before the last, and then.
+FEW, MANY = 15, 40
+#: Probability from which an effect is fitted.
+LIKELY = 0.1
 #: Smallest residual that a channel is taken to have, in its own deviations.
 SMALLEST = 1e-9
 
@@ -65,6 +69,22 @@ class Fitted:
     hypotheses: Hypotheses
     draws: Draws
     aliases: tuple[str, ...]
+
+    @property
+    def mean(self) -> Array:
+        """Posterior mean, effects that are hardly there at their null, shape (d,)."""
+        mean, null = self.u + self.draws.u.mean(0), _null(self.rival)
+        share = self.draws.present.mean(0)
+        for k, place in enumerate(_effects(self.rival)):
+            if share[k] <= LIKELY:
+                mean[place] = null[place]
+        c = self.rival.coordinates
+        return np.clip(mean, c.low, c.high)
+
+    @property
+    def move(self) -> Array:
+        """From where it is linear to its mean, in posterior deviations, shape (d,)."""
+        return np.abs(self.mean - self.u) / (self.draws.u.std(0) + 1e-12)
 
 
 def fitted(
@@ -109,66 +129,98 @@ def fitted(
             spread=spread[channel],
         )
 
-    bare = rival(())
+    bare, whole = rival(()), rival(doubtful)
     u, unit = _searched(bare, spread, seed)
-    kept, aliases = _told_apart(bare, rival, doubtful, u, unit)
-    whole = bare
-    if kept:
-        whole = rival(kept)
-        own = sum(bare.coordinates.joint.sizes)
-        start = np.zeros(whole.dim)
-        start[:own] = u[:own]
-        start[whole.dim - (bare.dim - own) :] = u[own:]
-        null = _null(whole)
-        for place in _effects(whole):
-            low, high = whole.coordinates.low[place], whole.coordinates.high[place]
-            step = np.where(null[place] + TRIED > high, -TRIED, TRIED)
-            start[place] = np.clip(null[place] + step, low, high)
-        u, unit = _improved(whole, start[None], unit)
+    lift = _Lift.of(bare, whole)
+    aliases = _aliases(whole, lift(u), unit)
+    if aliases:
+        doubtful = [e for e in doubtful if e.name not in aliases]
+        whole = rival(doubtful)
+        lift = _Lift.of(bare, whole)
     found = Fitted(
         whole,
-        u,
+        lift(u),
         np.empty((0, 0)),
         unit,
-        _unknowns(whole, u),
+        _unknowns(whole, lift(u)),
         Hypotheses.of(simulator.measurements),
         Draws(*[np.empty(0)] * 4),
         tuple(aliases),
     )
-    return _linearized(found, known_sd, rng)
+    there: list[str] = []
+    for again in range(LINEARIZED):
+        last = again == LINEARIZED - 1
+        found = _linearized(found, known_sd, rng, few=True)
+        share = found.draws.present.mean(0)
+        before = there
+        there = [e.name for e, p in zip(doubtful, share, strict=True) if p > LIKELY]
+        if there != before:
+            own = rival([e for e in doubtful if e.name in there])
+            lift = _Lift.of(own, whole)
+            u, unit = _improved(own, lift.back(found.mean)[None], found.unit)
+            found = replace(found, u=lift(u), unit=unit)
+        elif last or found.move.max() < MOVED:
+            break
+        else:
+            found = replace(found, u=found.mean)
+    return _linearized(found, known_sd, rng, few=False)
+
+
+@dataclass(frozen=True)
+class _Lift:
+    """From the coordinates of a model to those of one with more effects, and back.
+
+    Attributes:
+        null: Of the larger model, with its effects at their null, nearly, shape (d,).
+        shared: Places that the smaller one has, in its order.
+    """
+
+    null: Array
+    shared: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, small: Rival, large: Rival) -> _Lift:
+        shared = np.ones(large.dim, dtype=bool)
+        for effect, place in zip(large.effects, _effects(large), strict=True):
+            shared[place] = effect in small.effects
+        return cls(_null(large), np.flatnonzero(shared))
+
+    def __call__(self, u: Array) -> Array:
+        found = self.null.copy()
+        found[self.shared] = u
+        return found
+
+    def back(self, u: Array) -> Array:
+        return u[self.shared]
 
 
 def _linearized(
-    found: Fitted, known_sd: Array | None, rng: np.random.Generator
+    found: Fitted, known_sd: Array | None, rng: np.random.Generator, *, few: bool
 ) -> Fitted:
-    """Return a fit that is linear where the posterior is."""
-    m = found.rival.simulator.measurements
-    places = _effects(found.rival)
-    null = _null(found.rival)
-    for again in range(LINEARIZED):
-        unit = found.unit
-        r, jacobian = found.rival.jacobian(
-            found.u[None], lambda r, unit=unit: r / unit, STEP
-        )
-        rows = np.concatenate([r[0][:, None], jacobian[0]], 1)
-        scale = [float(unit[m.channel == c][0]) for c in range(int(m.channel.max()) + 1)]
-        known = [None if known_sd is None else sd / s for sd, s in zip(
-            [None] * len(scale) if known_sd is None else known_sd, scale, strict=True)]
-        unknowns = _unknowns(found.rival, found.u)
-        channels = grams(rows, m, found.hypotheses, m.trial)
-        draws = sample(channels, found.hypotheses, unknowns, known, rng)
-        found = replace(found, rows=rows, unknowns=unknowns, draws=draws)
-        mean, sd = draws.u.mean(0), draws.u.std(0) + 1e-12
-        there = found.u + mean
-        for k, place in enumerate(places):
-            if draws.present[:, k].mean() < 0.5:
-                there[place] = null[place]
-        move = np.abs(there - found.u) / sd
-        if again == LINEARIZED - 1 or move.max() < MOVED:
-            return found
-        c = found.rival.coordinates
-        found = replace(found, u=np.clip(there, c.low, c.high))
-    return found
+    """Return a fit that is linear at its u, with draws."""
+    rival, unit = found.rival, found.unit
+    m = rival.simulator.measurements
+    step = np.full(rival.dim, STEP)
+    null = _null(rival)
+    for place in _effects(rival):
+        # A chord where an effect is absent: many are flat at their null.
+        step[place] = np.where(found.u[place] == null[place], TRIED, STEP)
+    r, jacobian = rival.jacobian(found.u[None], lambda r: r / unit, step)
+    rows = np.concatenate([r[0][:, None], jacobian[0]], 1)
+    scale = [float(unit[m.channel == c][0]) for c in range(int(m.channel.max()) + 1)]
+    known: list[float | None] = [None] * len(scale)
+    if known_sd is not None:
+        known = [float(sd) / s for sd, s in zip(known_sd, scale, strict=True)]
+    unknowns = _unknowns(rival, found.u)
+    draws = sample(
+        grams(rows, m, found.hypotheses, m.trial),
+        found.hypotheses,
+        unknowns,
+        known,
+        rng,
+        sweeps=FEW if few else MANY,
+    )
+    return replace(found, rows=rows, unknowns=unknowns, draws=draws)
 
 
 def _searched(bare: Rival, spread: Array, seed: int) -> tuple[Array, Array]:
@@ -202,37 +254,26 @@ def _improved(rival: Rival, u: Array, unit: Array) -> tuple[Array, Array]:
     return u[0], np.maximum(rms, SMALLEST * spread)
 
 
-def _told_apart(
-    bare: Rival, rival: Any, effects: Sequence[Effect], u: Array, unit: Array
-) -> tuple[list[Effect], list[str]]:
-    """Return the effects that no change of the parameters imitates, and the others."""
-    if not effects:
-        return [], []
-    whole = rival(effects)
-    own = sum(bare.coordinates.joint.sizes)
-    at = _null(whole)
-    at[:own] = u[:own]
-    at[whole.dim - (bare.dim - own) :] = u[own:]
-    c = whole.coordinates
-    at = np.clip(at, c.low, c.high)
-    _, jacobian = whole.jacobian(at[None], lambda r: r / unit, TRIED)
-    jacobian = jacobian[0]
+def _aliases(whole: Rival, u: Array, unit: Array) -> list[str]:
+    """Return the effects that a change of the parameters imitates."""
     places = _effects(whole)
+    if not places:
+        return []
+    _, jacobian = whole.jacobian(u[None], lambda r: r / unit, TRIED)
+    jacobian = jacobian[0]
     rest = np.ones(whole.dim, dtype=bool)
     for place in places:
         rest[place] = False
     basis, triangle = np.linalg.qr(jacobian[:, rest])
     size = np.abs(np.diag(triangle))
     basis = basis[:, size > 1e-9 * max(size.max(initial=0.0), 1e-300)]
-    kept, aliases = [], []
-    for effect, place in zip(effects, places, strict=True):
+    found = []
+    for effect, place in zip(whole.effects, places, strict=True):
         column = jacobian[:, place]
         left = column - basis @ (basis.T @ column)
-        if np.linalg.norm(left) > ALIAS * np.linalg.norm(column):
-            kept.append(effect)
-        else:
-            aliases.append(effect.name)
-    return kept, aliases
+        if np.linalg.norm(left) <= ALIAS * np.linalg.norm(column):
+            found.append(effect.name)
+    return found
 
 
 def _effects(rival: Rival) -> list[slice]:

@@ -27,12 +27,10 @@ from sbi_active.criticism.identification.errors import Grams, Hypotheses
 
 Array = NDArray[Any]
 
-#: Chains, their sweeps, and those that are left out of them.
-CHAINS, SWEEPS, BURNT = 64, 80, 20
+#: Chains, and the sweeps that are left out of them.
+CHAINS, BURNT = 64, 15
 #: Prior probability that no doubtful effect is there.
 NONE = 0.5
-#: Factor on the deviation of an effect's prior, as its scale is a guess.
-WIDER = 1.0
 TINY = 1e-300
 
 
@@ -85,8 +83,10 @@ def sample(
     unknowns: Unknowns,
     known_size: Sequence[float | None],
     rng: np.random.Generator,
+    *,
+    sweeps: int,
 ) -> Draws:
-    """Return posterior draws.
+    """Return posterior draws, of 64 chains.
 
     Args:
         channels: Gram matrices of (r_0, J) by channel.
@@ -94,13 +94,14 @@ def sample(
         unknowns: Priors.
         known_size: Deviation of the white part by channel; None where it is unknown.
         rng: Source of the draws.
+        sweeps: Of each chain, after those that are left out.
     """
     p, d = unknowns, len(unknowns.low)
     sums = [g.total for g in channels]
     u = np.clip(np.zeros((CHAINS, d)), p.low, p.high)
     present = np.ones((CHAINS, p.num_effects), dtype=bool)
     kept: list[tuple[Array, ...]] = []
-    for sweep in range(SWEEPS):
+    for sweep in range(BURNT + sweeps):
         precision = np.zeros((CHAINS, d, d))
         linear = np.zeros((CHAINS, d))
         chosen, sizes = [], []
@@ -178,14 +179,13 @@ def _conditional(
     absent = np.where(free, 0.0, p.null)
     at_null = np.einsum("nij,nj->ni", precision, absent)
     rest = (absent * (linear - 0.5 * at_null)).sum(1)
-    own_precision = np.where(own, p.precision / WIDER**2, p.precision)
     full = precision * (free[:, :, None] & free[:, None, :])
-    full = full + np.where(free, own_precision, 1.0)[:, None] * np.eye(len(own))
-    rhs = np.where(free, linear - at_null + own_precision * p.center, 0.0)
-    # Each effect's prior is a normalized density; theta is in every model.
-    log_prior = 0.5 * np.log(np.maximum(own_precision, TINY))
-    log_prior = log_prior - 0.5 * own_precision * p.center**2
-    scale = 1 / np.sqrt(np.maximum(own_precision, TINY))
+    full = full + np.where(free, p.precision, 1.0)[:, None] * np.eye(len(own))
+    rhs = np.where(free, linear - at_null + p.precision * p.center, 0.0)
+    # An effect's prior is a normalized density; theta is in every model.
+    log_prior = 0.5 * np.log(np.maximum(p.precision, TINY))
+    log_prior = log_prior - 0.5 * p.precision * p.center**2
+    scale = 1 / np.sqrt(np.maximum(p.precision, TINY))
     log_prior = log_prior - _log_inside(p.center, scale, p.low, p.high)
     rest = rest + (np.where(own, log_prior, 0.0) * free).sum(1)
     return full, rhs, free, rest
