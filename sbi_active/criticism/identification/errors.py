@@ -75,6 +75,12 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.share)
 
+    def only(self, place: int) -> Hypotheses:
+        """Return a single one."""
+        one = slice(place, place + 1)
+        parts = (self.share, self.time, self.smooth, self.log_prior)
+        return Hypotheses(*(part[one] for part in parts))
+
     def transition(self, gap: float) -> Array:
         """Return how the state moves on over a gap, shape (h, 2, 2); the first is x."""
         move = np.zeros((len(self), 2, 2))
@@ -209,3 +215,15 @@ class Filter:
         if key not in self._known:
             self._known[key] = self.hypotheses.transition(gap)
         return self._known[key]
+
+
+def whitened(
+    rows: Array, measurements: Measurements, hypotheses: Hypotheses, chosen: Array
+) -> Array:
+    """Return rows (N, k) in the metric of one hypothesis a channel, shape (c,)."""
+    m, found = measurements, np.empty_like(rows)
+    first = np.flatnonzero(~np.isfinite(m.gap))
+    for at in np.split(np.arange(len(m)), first[1:]):
+        one = Filter(hypotheses.only(int(chosen[m.channel[at[0]]])))
+        found[at] = one(rows[at][None], m.time[at])[0, 0]
+    return found
