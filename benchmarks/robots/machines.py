@@ -29,10 +29,7 @@ CONDITIONS = {
     "AR .98": (0.98, 0.0),
     "friction .3": (0.0, 0.3),
     "friction 1": (0.0, 1.0),
-    "lag": (0.0, 0.0),
 }
-#: Time constant of drives that lag, s.
-LAG = 0.03
 #: Where the files of a robot leg in air are, beside the project.
 GO2 = Path(__file__).parents[2] / "../shared/data/go2_in_air/go2_in_air.xml"
 #: Sines of a control, and the frequencies that they may have, Hz.
@@ -129,9 +126,8 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
         control = _sines(times, machine.drive, rng)
         data.qpos[:] = home + np.array(machine.start) * rng.uniform(-1, 1, model.nq)
         start = sysid.create_initial_state(model, data.qpos, 0 * data.qvel, data.act)
-        moved = _lagging(control, model.opt.timestep) if condition == "lag" else control
         state, sensor = mujoco.rollout.rollout(
-            model, mujoco.MjData(model), start, moved[:-1]
+            model, mujoco.MjData(model), start, control[:-1]
         )
         read = sensor[0, :: machine.every].copy()
         errors = _errors(read.shape, correlation, rng)
@@ -157,14 +153,6 @@ def _sines(
         angle = 2 * np.pi * frequency * times[:, None] + phase
         found.append(center + size * np.sin(angle) @ share)
     return np.stack(found, 1)
-
-
-def _lagging(control: Array, step: float) -> Array:
-    """Return what drives that follow their control late make of it."""
-    found, share = control.copy(), 1 - np.exp(-step / LAG)
-    for k in range(1, len(found)):
-        found[k] = found[k - 1] + share * (control[k] - found[k - 1])
-    return found
 
 
 def _errors(

@@ -130,7 +130,7 @@ def identify(
     seed = derive_seed(seed, "identify")
     found = fitted(model, prior, some, beside, known_sd=known_sd, seed=seed)
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    own = int(found.rival.coordinates.joint.sizes[0])
+    own = found.rival.theta_dim
     u, effective, is_linear = _weighed(found, rng)
     parts = spread(found)
     notes = []

@@ -111,8 +111,7 @@ def sample(
             linear -= gram[h][:, 1:, 0] / variance[:, None]
             chosen.append(h)
             sizes.append(np.sqrt(variance))
-        for e in rng.permutation(p.num_effects):
-            present[:, e] = _present(precision, linear, p, present, int(e), rng)
+        present = _present(precision, linear, p, present, rng)
         u = _moved(u, precision, linear, p, present, rng)
         if sweep >= BURNT:
             parts = (u, present, np.stack(chosen, 1), np.stack(sizes, 1))
@@ -151,18 +150,24 @@ def _present(
     linear: Array,
     p: Unknowns,
     present: NDArray[np.bool_],
-    effect: int,
     rng: np.random.Generator,
 ) -> NDArray[np.bool_]:
-    """Return whether an effect is there, given which others are."""
-    log_z = []
-    for there in (False, True):
-        some = present.copy()
-        some[:, effect] = there
-        log_z.append(_log_evidence(precision, linear, p, some))
-    prior = NONE ** (1 / p.num_effects)
-    log_odds = log_z[1] - log_z[0] + np.log1p(-prior) - np.log(prior)
-    return rng.random(len(present)) < 1 / (1 + np.exp(np.clip(-log_odds, -700, 700)))
+    """Return which effects are there, one after the other given all others."""
+    if not p.num_effects:
+        return present
+    present = present.copy()
+    absent = NONE ** (1 / p.num_effects)
+    log_odds = np.log1p(-absent) - np.log(absent)
+    log_z = _log_evidence(precision, linear, p, present)
+    for e in rng.permutation(p.num_effects):
+        other = present.copy()
+        other[:, e] = ~present[:, e]
+        log_other = _log_evidence(precision, linear, p, other)
+        gain = log_other - log_z + np.where(other[:, e], log_odds, -log_odds)
+        flip = rng.random(len(gain)) < 1 / (1 + np.exp(np.clip(-gain, -700, 700)))
+        present[flip, e] = other[flip, e]
+        log_z = np.where(flip, log_other, log_z)
+    return present
 
 
 def _conditional(

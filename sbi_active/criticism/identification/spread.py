@@ -63,9 +63,8 @@ def spread(found: Fitted) -> Spread:
         found: The model, linear.
     """
     m, draws = found.rival.simulator.measurements, found.draws
-    c = found.rival.coordinates
-    own = int(c.joint.sizes[0])
-    free = c.trial_of() < 0
+    own = found.rival.theta_dim
+    free = found.rival.coordinates.trial_of() < 0
     effect = found.unknowns.effect
     likely = draws.present.mean(0) > 0.5
     free &= (effect < 0) | likely[effect] if len(likely) else True
