@@ -52,7 +52,7 @@ FIELDS = ("machine", "condition", "seed", "way", "parameter", "truth", "low", "h
 FIELDS = (*FIELDS, "cpu_seconds", "verdict", "warned")
 LEVEL, FIRST = 0.95, 2000
 #: Effects among which the loop looks.
-LIBRARY = ("* friction loss", "* damping", "* stiffness", "* armature")
+LIBRARY = ("* friction loss", "* quadratic damping", "* quadratic stiffness")
 
 Intervals = dict[str, tuple[float, float]]
 

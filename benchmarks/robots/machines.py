@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +212,21 @@ READ_ARM = """<sensor><jointpos name="shoulder" joint="shoulder"/>
 <jointpos name="elbow" joint="elbow"/></sensor></mujoco>"""
 
 
+def swimmer() -> Any:
+    """Return gymnasium's swimmer, three links that float in a viscous medium."""
+    import mujoco
+
+    found = find_spec("gymnasium")
+    if found is None or found.origin is None:
+        raise ImportError("needs gymnasium; run pip install gymnasium")
+    assets = Path(found.origin).parent / "envs/mujoco/assets"
+    spec = mujoco.MjSpec.from_file(str(assets / "swimmer.xml"))
+    for number, motor in enumerate(spec.actuators):
+        motor.name = f"motor {number + 1}"
+    _read_joints(spec)
+    return spec
+
+
 def go2_leg() -> Any:
     """Return the front left leg of a Go2 with its drives, Kp 20 and Kd 1.5."""
     import mujoco
@@ -225,6 +241,14 @@ def go2_leg() -> Any:
     for motor in spec.actuators:
         motor.set_to_position(kp=20.0, kv=1.5)
         motor.forcerange, motor.ctrlrange = motor.ctrlrange.copy(), [-4.0, 4.0]
+    _read_joints(spec)
+    spec.option.timestep = 0.002
+    return spec
+
+
+def _read_joints(spec: Any) -> None:
+    import mujoco
+
     for joint in spec.joints:
         spec.add_sensor(
             name=f"read {joint.name}",
@@ -232,8 +256,6 @@ def go2_leg() -> Any:
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             objname=joint.name,
         )
-    spec.option.timestep = 0.002
-    return spec
 
 
 MACHINES = {
@@ -287,5 +309,18 @@ MACHINES = {
         num=4,
         seconds=2.0,
         every=5,
+    ),
+    "swimmer": Machine(
+        swimmer,
+        {
+            "gear": Unknown(75.0, 300.0, (100.0, 200.0), _gain("motor 1")),
+            "damping": Unknown(0.0, 40.0, (2.0, 12.0), _damping("motor1_rot")),
+            "armature": Unknown(0.0, 10.0, (0.2, 3.0), _armature("motor1_rot")),
+        },
+        drive=((0.3, 0.0), (0.3, 0.0)),
+        start=(0.0, 0.0, 0.0, 0.1, 0.1),
+        noise=(0.005, 0.005, 0.005, 0.005, 0.005),
+        rough=(("motor1_rot", "motor2_rot"), 10.0),
+        every=2,
     ),
 }

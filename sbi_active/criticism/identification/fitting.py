@@ -113,6 +113,12 @@ def fitted(
     simulator = TrialSimulator(
         AugmentedSimulator(model, beside, next_index=index), trials, seed=seed
     )
+    if not simulator.measurements.has_time or not len(simulator.measurements):
+        raise ValueError(
+            "expected trajectories with sample times; got outcomes without a time "
+            "axis, or none; give sample_times to the simulator or the trials, or use "
+            "Campaign"
+        )
     channel = simulator.measurements.channel
     x = simulator.measurements.x
     num = int(channel.max()) + 1

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.distributions import Distribution
-from typing_extensions import override
 
 from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.trial_conditions import conditions_for
 from sbi_active.criticism.identification.errors import whitened
 from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
-from sbi_active.seeding import derive_seed
+from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 
 Array = NDArray[Any]
@@ -66,10 +66,6 @@ class IdentifiedBelief(KernelBelief):
         assert self.parameter_names is not None
         each = zip(self.parameter_names, ends, strict=True)
         return {name: (low, high) for name, (low, high) in each}
-
-    @override
-    def _sample(self, num_samples: int) -> torch.Tensor:
-        return super()._sample(num_samples)
 
 
 def identify(
@@ -125,8 +121,9 @@ def identify(
         {'theta_1': 0.8}
     """
     model, known_sd = _with_noise(model, prior, trials)
-    require_fitting(model, prior, trials, beside, None)
     some = trials.fit
+    if int(some.valid.sum()) > 1:  # a single log is as good, if it is long
+        require_fitting(model, prior, trials, beside, None)
     seed = derive_seed(seed, "identify")
     found = fitted(model, prior, some, beside, known_sd=known_sd, seed=seed)
     rng = np.random.default_rng(derive_seed(seed, "draws"))
@@ -155,14 +152,18 @@ def identify(
             "linear model; use Campaign, or a narrower prior"
         )
     notes += _at_bounds(found, u, names)
-    belief.diagnostics = Diagnostics(trustworthy=True).warned(*notes).extended(
-        num_simulations=found.rival.simulator.num_simulations,
-        effective_sample_size=effective,
-        beside=_beside(found),
-        aliases=found.aliases,
-        errors=_errors(found, model),
-        disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
-        is_linear=is_linear,
+    belief.diagnostics = (
+        Diagnostics(trustworthy=True)
+        .warned(*notes)
+        .extended(
+            num_simulations=found.rival.simulator.num_simulations,
+            effective_sample_size=effective,
+            beside=_beside(found),
+            aliases=found.aliases,
+            errors=_errors(found, model),
+            disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
+            is_linear=is_linear,
+        )
     )
     return belief
 
@@ -174,6 +175,15 @@ def _with_noise(
     noise = model.noise
     num = int(np.prod(trials.x.shape[2:]))
     if noise is None:
+        with forked_generators(0, "random"):
+            theta = prior.sample(torch.Size([len(trials)]))
+        run = conditions_for(model, trials, torch.arange(len(trials)), theta.dtype)
+        action = trials.action.to(theta.dtype)
+        if not model.is_deterministic(theta, action, **run):
+            raise ValueError(
+                "expected a deterministic simulator; got a random one; use Campaign, "
+                "which learns what it returns, or fix its seed and declare noise="
+            )
         model = copy.copy(model)
         model.noise = GaussianNoise(1.0)
         return model, None
@@ -205,9 +215,7 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     true = found.rival.residual(found.u + u)[0] / found.unit
     linear = found.rows[:, 0] + u @ found.rows[:, 1:].T
     chosen = np.array([np.bincount(h).argmax() for h in draws.errors.T])
-    both = whitened(
-        np.concatenate([true, linear]).T, m, found.hypotheses, chosen
-    )
+    both = whitened(np.concatenate([true, linear]).T, m, found.hypotheses, chosen)
     size = np.median(draws.size, 0)[m.channel]
     square = ((both / size[:, None]) ** 2).sum(0)
     return 0.5 * (square[len(at) :] - square[: len(at)])
@@ -255,5 +263,7 @@ def _at_bounds(found: Fitted, u: Array, names: Sequence[str]) -> list[str]:
             continue
         near = max((place < EDGE).mean(), (place > 1 - EDGE).mean())
         if near > AT_EDGE:
-            notes.append(f"{name} is at a bound of its prior; move the bound, or say why")
+            notes.append(
+                f"{name} is at a bound of its prior; move the bound, or say why"
+            )
     return notes

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr, ndtri
 
 from sbi_active.criticism.identification.errors import Grams, Hypotheses
+from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 
 Array = NDArray[Any]
 
@@ -191,7 +191,7 @@ def _conditional(
     log_prior = 0.5 * np.log(np.maximum(p.precision, TINY))
     log_prior = log_prior - 0.5 * p.precision * p.center**2
     scale = 1 / np.sqrt(np.maximum(p.precision, TINY))
-    log_prior = log_prior - _log_inside(p.center, scale, p.low, p.high)
+    log_prior = log_prior - log_inside(p.center, scale, p.low, p.high)
     rest = rest + (np.where(own, log_prior, 0.0) * free).sum(1)
     return full, rhs, free, rest
 
@@ -205,7 +205,7 @@ def _log_evidence(
     cov = np.linalg.inv(full + ridge)
     mean = np.einsum("nij,nj->ni", cov, rhs)
     sd = np.sqrt(np.maximum(np.einsum("nii->ni", cov), TINY))
-    inside = _log_inside(mean, sd, p.low, p.high)
+    inside = log_inside(mean, sd, p.low, p.high)
     log_z = rest + 0.5 * (mean * rhs).sum(1) + 0.5 * np.linalg.slogdet(cov)[1]
     return log_z + np.where(free, inside, 0.0).sum(1)
 
@@ -232,32 +232,11 @@ def _moved(
         high = np.maximum(ends.max(0).min(1), 0.0)
         slope = (e * (rhs - np.einsum("nij,nj->ni", full, np.where(free, u, 0)))).sum(1)
         sd = 1 / np.sqrt(np.maximum(values[:, j], 1e-12))
-        step = _truncated(slope * sd**2, sd, low, high, rng)
+        step = truncated_normal(slope * sd**2, sd, low, high, rng)
         step = np.where((e != 0).any(1), step, 0.0)
         u = np.clip(u + step[:, None] * e, p.low, p.high)
         u = np.where(free, u, p.null)
     return u
-
-
-def _truncated(
-    mean: Array, sd: Array, low: Array, high: Array, rng: np.random.Generator
-) -> Array:
-    """Return normal draws between bounds."""
-    a, b = (low - mean) / sd, (high - mean) / sd
-    flip = a > 0  # in the lower tail, where small shares are exact
-    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
-    share = ndtr(a) + (ndtr(b) - ndtr(a)) * rng.random(len(mean))
-    z = np.clip(ndtri(np.clip(share, 1e-300, 1 - 1e-16)), a, b)
-    return mean + sd * np.where(flip, -z, z)
-
-
-def _log_inside(mean: Array, sd: Array, low: Array, high: Array) -> Array:
-    """Return the log probability of a normal variable between bounds."""
-    a, b = (low - mean) / sd, (high - mean) / sd
-    flip = a > 0
-    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
-    upper, lower = log_ndtr(b), log_ndtr(a)
-    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
 
 
 def _picked(log_p: Array, rng: np.random.Generator) -> NDArray[np.intp]:
