@@ -38,7 +38,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchmarks.criticism.scores import counted
+from benchmarks.criticism.intervals import wilson
 from benchmarks.robots.machines import CONDITIONS, MACHINES, Machine, Set, recorded
 from sbi_active import GaussianNoise
 from sbi_active.criticism import close_loop
@@ -48,8 +48,10 @@ from sbi_active.mujoco.identification import identify_robot
 from sbi_active.threads import single_thread
 
 RESULTS = Path(__file__).parent / "results/coverage.csv"
-FIELDS = ("machine", "condition", "seed", "way", "parameter", "truth", "low", "high")
-FIELDS = (*FIELDS, "cpu_seconds", "verdict", "warned")
+FIELDS: list[str] = [
+    *("machine", "condition", "seed", "way", "parameter", "truth", "low", "high"),
+    *("cpu_seconds", "verdict", "warned"),
+]
 LEVEL, FIRST = 0.95, 2000
 #: Effects among which the loop looks.
 LIBRARY = ("* friction loss", "* quadratic damping", "* quadratic stiffness")
@@ -161,26 +163,24 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
     for key, own in rows.groupby(keys, sort=False):
         inside = (own.low <= own.truth) & (own.truth <= own.high)
         width = (own.high - own.low) / 2
-        names = own.parameter.unique()
-        each = [
-            f"{inside[own.parameter == n].mean():.2f} ({_short(width, own, n)})"
-            for n in names
-        ]
-        cpu = own[own.parameter == names[0]].cpu_seconds
+        each = []
+        for name in own.parameter.unique():
+            some = own.parameter == name
+            each.append(
+                f"{name} {inside[some].mean():.2f} ({width[some].median():.2g})"
+            )
+        cpu = own.drop_duplicates("seed").cpu_seconds
+        low, high = wilson(int(inside.sum()), len(inside))
         found.append(
             dict(zip(keys, key, strict=True))
             | {
                 "sets": own.seed.nunique(),
-                "coverage": counted(int(inside.sum()), len(inside)),
+                "coverage": f"{inside.mean():.2f} ({low:.2f} to {high:.2f})",
                 "by parameter (median half width)": ", ".join(each),
                 "CPU s": f"{cpu.mean():.2f}",
             }
         )
     return pd.DataFrame(found)
-
-
-def _short(width: pd.Series, own: pd.DataFrame, name: str) -> str:
-    return f"{width[own.parameter == name].median():.2g}"
 
 
 def missing(machine: str) -> str:

@@ -150,7 +150,7 @@ def fitted(
         unit,
         _unknowns(whole, lift(u)),
         Hypotheses.of(simulator.measurements),
-        Draws(*[np.empty(0)] * 4),
+        Draws.none(whole.dim),
         tuple(aliases),
     )
     there: list[str] = []

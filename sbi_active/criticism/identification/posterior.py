@@ -76,6 +76,12 @@ class Draws:
     errors: NDArray[np.int64]
     size: Array
 
+    @classmethod
+    def none(cls, dim: int) -> Draws:
+        """Return no draws of u with d coordinates."""
+        shape, whole = (0, 0), np.empty((0, 0), dtype=np.int64)
+        return cls(np.empty((0, dim)), np.empty(shape, dtype=bool), whole, whole * 1.0)
+
 
 def sample(
     channels: Sequence[Grams],

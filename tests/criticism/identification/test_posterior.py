@@ -32,7 +32,7 @@ def unknowns(low=-np.inf, effect=(-1, -1, 0)):
     )
 
 
-def draws(grams, own, size=1.0, seed=0):
+def draws(grams, own, size: float | None = 1.0, seed=0):
     rng = np.random.default_rng(seed)
     return sample([grams], WHITE, own, [size], rng, sweeps=60)
 
