@@ -26,7 +26,7 @@ from sbi_active.simulation import GaussianNoise, SimulatorModel
 Array = NDArray[Any]
 
 #: Draws at which the linear model is compared with the simulator, the deviation of the
-#: log likelihood ratio up to which it will do, nats, and the draws that are weighed
+#: log density ratio up to which it will do, nats, and the draws that are weighed
 #: where it will not.
 NUM_CHECKED, LINEAR, NUM_WEIGHED = 16, 0.5, 400
 #: Effective draws below which a belief is not to be trusted.
@@ -209,7 +209,7 @@ def _weighed(found: Fitted, rng: np.random.Generator) -> tuple[Array, float, boo
 
 
 def _log_ratio(found: Fitted, at: Array) -> Array:
-    """Return the log likelihood of draws beside that of the linear model, (k,)."""
+    """Return the log density of draws beside that of the linear model, (k,)."""
     m, draws = found.rival.simulator.measurements, found.draws
     u = draws.u[at]
     true = found.rival.residual(found.u + u)[0] / found.unit
@@ -218,7 +218,10 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     both = whitened(np.concatenate([true, linear]).T, m, found.hypotheses, chosen)
     size = np.median(draws.size, 0)[m.channel]
     square = ((both / size[:, None]) ** 2).sum(0)
-    return 0.5 * (square[len(at) :] - square[: len(at)])
+    p, c = found.unknowns, found.rival.coordinates
+    gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
+    prior = c.log_prob(np.clip(found.u + u, c.low, c.high)) - gaussian
+    return 0.5 * (square[len(at) :] - square[: len(at)]) + prior - prior.mean()
 
 
 def _reflected(u: Array, low: Array, high: Array) -> Array:

@@ -148,3 +148,28 @@ def test_what_it_does_not_take():
     belief = identify(model(), PRIOR, trials)
     with pytest.raises(ValueError, match="between 0 and 1; got 95"):
         belief.interval(95)
+
+
+def test_a_prior_of_any_shape_counts():
+    """Draws of a gain that nothing tells are those of its skewed prior."""
+    own = torch.distributions.Independent(
+        torch.distributions.Gamma(torch.tensor([3.0, 30.0]), torch.tensor([1.0, 30.0])),
+        1,
+    )
+
+    def deaf(theta, action):
+        rest = TRUTH[1:].expand(len(theta), 2)
+        return mean(torch.cat([theta[:, :1], rest], 1), action) * TRUTH[2]
+
+    names = ["frequency", "nothing"]
+    deaf_model = SimulatorModel(deaf, sample_times=TIMES, parameter_names=names)
+    x = deaf(TRUTH.expand(4, -1), ACTION)
+    trials = Trials(ACTION, x + errors(tuple(x.shape), 0.0, 0))
+    belief = identify(deaf_model, own, trials)
+    low, high = belief.interval()["nothing"]
+    expected = np.quantile(
+        np.random.default_rng(0).gamma(30, 1 / 30, 10**5), [0.025, 0.975]
+    )
+    assert [low, high] == pytest.approx(expected, abs=0.12)
+    low, high = belief.interval(0.999)["frequency"]
+    assert low < 3.0 < high
