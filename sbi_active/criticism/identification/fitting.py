@@ -121,7 +121,12 @@ def fitted(
         )
     channel = simulator.measurements.channel
     x = simulator.measurements.x
-    num = int(channel.max()) + 1
+    num = int(np.prod(trials.x.shape[2:]))
+    if lost := [c for c in range(num) if not (channel == c).any()]:
+        raise ValueError(
+            f"expected some measured numbers in every channel; got none in channel "
+            f"{lost[0]}; leave it out of x"
+        )
     spread = np.array([max(x[channel == c].std(), 1e-300) for c in range(num)])
 
     def rival(effects: Sequence[Effect]) -> Rival:

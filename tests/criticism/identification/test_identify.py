@@ -145,6 +145,10 @@ def test_what_it_does_not_take():
     flat = SimulatorModel(lambda t, a: t[:, :2] * a, noise=GaussianNoise(0.1))
     with pytest.raises(ValueError, match="trajectories with sample times"):
         identify(flat, PRIOR, Trials(ACTION, ACTION * TRUTH[:2]))
+    x = recorded()
+    x[..., 1] = torch.nan
+    with pytest.raises(ValueError, match="got none in channel 1; leave it out"):
+        identify(model(), PRIOR, Trials(ACTION, x))
     belief = identify(model(), PRIOR, trials)
     with pytest.raises(ValueError, match="between 0 and 1; got 95"):
         belief.interval(95)
