@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
 from sbi_active.criticism.evidence.least_squares import descend
 from sbi_active.criticism.identification.errors import Hypotheses, grams
 from sbi_active.criticism.identification.posterior import Draws, Unknowns, sample
@@ -20,12 +22,15 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
 
 #: Draws of the prior that are screened, starts among them, and those that go on.
 NUM_SCREENED, NUM_STARTS, NUM_KEPT = 40, 4, 2
+#: Trials in which effects are compared with the simulator at their null.
+NUM_CHECKED = 4
 #: Iterations along a secant, full ones, and how often the channels' sizes follow.
 SECANT, FULL, ROUNDS = 5, 5, 3
 #: Of finite differences, in deviations of the prior.
@@ -110,9 +115,13 @@ def fitted(
     index = int(trials.index.max()) + 1
     nuisances = [e for e in beside if e.scope == "trial"]
     doubtful = [e for e in beside if e.scope == "campaign"]
-    simulator = TrialSimulator(
-        AugmentedSimulator(model, beside, next_index=index), trials, seed=seed
-    )
+    some = torch.arange(min(NUM_CHECKED, len(trials)))
+    with forked_generators(seed, "check"):
+        theta = prior.sample(torch.Size([len(some)]))
+    run = conditions_of_trials(trials, some, model)
+    check = (theta, trials.action[some].to(theta.dtype), run)
+    augmented = AugmentedSimulator(model, beside, check=check, next_index=index)
+    simulator = TrialSimulator(augmented, trials, seed=seed)
     if not simulator.measurements.has_time or not len(simulator.measurements):
         raise ValueError(
             "expected trajectories with sample times; got outcomes without a time "

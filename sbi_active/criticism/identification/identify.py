@@ -123,7 +123,7 @@ def identify(
     model, known_sd = _with_noise(model, prior, trials)
     some = trials.fit
     if int(some.valid.sum()) > 1:  # a single log is as good, if it is long
-        require_fitting(model, prior, trials, beside, None)
+        require_fitting(model, prior, trials, (), None)
     seed = derive_seed(seed, "identify")
     found = fitted(model, prior, some, beside, known_sd=known_sd, seed=seed)
     rng = np.random.default_rng(derive_seed(seed, "draws"))
