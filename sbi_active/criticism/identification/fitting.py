@@ -31,8 +31,9 @@ Array = NDArray[Any]
 NUM_SCREENED, NUM_STARTS, NUM_KEPT = 40, 4, 2
 #: Trials in which effects are compared with the simulator at their null.
 NUM_CHECKED = 4
-#: Iterations along a secant, full ones, and how often the channels' sizes follow.
-SECANT, FULL, ROUNDS = 5, 5, 3
+#: Iterations along a secant, full ones, how often at most the channels' sizes follow,
+#: and by what share they fall where they do again.
+SECANT, FULL, ROUNDS, WORTH = 5, 5, 10, 0.01
 #: Of finite differences, in deviations of the prior.
 STEP = 1e-4
 #: Share of a column that is no combination of the parameters' own, below which an
@@ -42,7 +43,7 @@ ALIAS = 0.02
 TRIED = 0.05
 #: Times that the model is linearized anew, and a move that is worth it, in posterior
 #: deviations.
-LINEARIZED, MOVED = 4, 0.3
+LINEARIZED, MOVED = 6, 0.3
 #: Sweeps of the sampler before the last, and then.
 FEW, MANY = 15, 40
 #: Probability from which an effect is fitted.
@@ -259,19 +260,23 @@ def _searched(bare: Rival, spread: Array, seed: int) -> tuple[Array, Array]:
 def _improved(rival: Rival, u: Array, unit: Array) -> tuple[Array, Array]:
     """Return the best of some starts, every channel weighed by its own residual."""
     channel = rival.simulator.measurements.channel
-    spread = rival.spread
-    for _ in range(ROUNDS):
+    count = np.bincount(channel)
+
+    def sizes(u: Array) -> Array:
         r = rival.residual(u)[0]
         best = r[np.argmin(((r / unit) ** 2).sum(1))]
-        count = np.bincount(channel)
         rms = np.sqrt(np.bincount(channel, best**2) / count)[channel]
-        unit = np.maximum(rms, SMALLEST * spread)
-        own = unit
+        return np.maximum(rms, SMALLEST * rival.spread)
+
+    unit = sizes(u)
+    for again in range(ROUNDS):
+        own, before = unit, np.log(unit).mean()
         u, cost = descend(rival, u, lambda r, own=own: r / own, STEP, FULL)
         u = u[[int(np.argmin(cost))]]
-    r = rival.residual(u)[0][0]
-    rms = np.sqrt(np.bincount(channel, r**2) / np.bincount(channel))[channel]
-    return u[0], np.maximum(rms, SMALLEST * spread)
+        unit = sizes(u)
+        if again and before - np.log(unit).mean() < WORTH:
+            break
+    return u[0], unit
 
 
 def _aliases(whole: Rival, u: Array, unit: Array) -> list[str]:

@@ -29,8 +29,11 @@ Array = NDArray[Any]
 #: log density ratio up to which it will do, nats, and the draws that are weighed
 #: where it will not.
 NUM_CHECKED, LINEAR, NUM_WEIGHED = 16, 0.5, 400
-#: Effective draws below which a belief is not to be trusted.
-FEWEST = 50
+#: Effective draws below which a belief is not to be trusted, and those that weights
+#: leave at least.
+FEWEST, FEWEST_KEPT = 50, 100
+#: From a bound, in deviations of the prior.
+INSIDE = 1e-6
 #: Share of the draws within this share of the prior's range from a bound that is told.
 EDGE, AT_EDGE = 0.01, 0.05
 
@@ -202,10 +205,22 @@ def _weighed(found: Fitted, rng: np.random.Generator) -> tuple[Array, float, boo
         return every.copy(), float(len(every)), True
     some = order[:NUM_WEIGHED]
     log_w = _log_ratio(found, some)
+    effective = _effective(log_w)
+    # Few draws would make for a narrow interval: rather that of the linear model.
+    power = 1.0
+    while _effective(power * log_w) < FEWEST_KEPT:
+        power *= 0.8
+    picked = rng.choice(len(some), size=len(every), p=_shares(power * log_w))
+    return every[some[picked]].copy(), effective, False
+
+
+def _shares(log_w: Array) -> Array:
     w = np.exp(log_w - log_w.max())
-    w = w / w.sum()
-    picked = rng.choice(len(some), size=len(every), p=w)
-    return every[some[picked]].copy(), float(1 / (w**2).sum()), False
+    return w / w.sum()
+
+
+def _effective(log_w: Array) -> float:
+    return float(1 / (_shares(log_w) ** 2).sum())
 
 
 def _log_ratio(found: Fitted, at: Array) -> Array:
@@ -220,8 +235,11 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     square = ((both / size[:, None]) ** 2).sum(0)
     p, c = found.unknowns, found.rival.coordinates
     gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
-    prior = c.log_prob(np.clip(found.u + u, c.low, c.high)) - gaussian
-    return 0.5 * (square[len(at) :] - square[: len(at)]) + prior - prior.mean()
+    # At a bound, where absent effects stand, rounding would be outside.
+    inside = np.clip(found.u + u, c.low + INSIDE, c.high - INSIDE)
+    log_w = c.log_prob(inside) - gaussian
+    log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
+    return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
 
 
 def _reflected(u: Array, low: Array, high: Array) -> Array:
