@@ -1,7 +1,7 @@
 """Coverage of 95 % intervals beside those of ``mujoco.sysid``, in logs with a truth.
 
     python -m benchmarks.robots.coverage run --machine spring-mass --seeds 2000 2200
-    python -m benchmarks.robots.coverage show
+    python -m benchmarks.robots.coverage show [--by-parameter]
 
 Sets are made by :mod:`.machines`: white noise, noise of autocorrelation .9 and .98, and
 white noise beside dry friction that the model lacks. On each set, in one process:
@@ -183,6 +183,31 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
+def summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return coverage over all parameters and the cost, one row a condition.
+
+    Args:
+        rows: As they are written.
+    """
+    found = []
+    for (machine, condition), own in rows.groupby(["machine", "condition"], sort=False):
+        row: dict[str, Any] = {"machine": machine, "condition": condition}
+        for way in ("sysid", "ours", "bare", "loop"):
+            some = own[own.way == way]
+            inside = (some.low <= some.truth) & (some.truth <= some.high)
+            row[way] = f"{inside.mean():.2f}" if len(some) else "-"
+            if way == "loop" and len(some):
+                row[way] += f" ({some.seed.nunique()} sets)"
+        ours, theirs = (
+            own[own.way == way].drop_duplicates("seed").cpu_seconds.mean()
+            for way in ("ours", "sysid")
+        )
+        row["sets"] = own[own.way == "ours"].seed.nunique()
+        row["CPU s, sysid and ours"] = f"{theirs:.1f}, {ours:.1f}"
+        found.append(row)
+    return pd.DataFrame(found)
+
+
 def missing(machine: str) -> str:
     """Return why a machine cannot be made here, or ""."""
     try:
@@ -204,12 +229,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--machine", choices=[*MACHINES], default="spring-mass")
     parser.add_argument("--conditions", nargs="+", default=[*CONDITIONS])
     parser.add_argument("--seeds", nargs=2, type=int, default=(FIRST, FIRST + 200))
+    parser.add_argument("--by-parameter", action="store_true")
     parser.add_argument("--loop", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     if options.what == "show":
         rows = pd.read_csv(options.out)
-        print(table(rows[rows.seed >= FIRST]).to_markdown(index=False))
+        told = table if options.by_parameter else summary
+        print(
+            told(rows[rows.seed >= FIRST]).to_markdown(
+                index=False, disable_numparse=True
+            )
+        )
         return
     if words := missing(options.machine):
         print(words, file=sys.stderr)

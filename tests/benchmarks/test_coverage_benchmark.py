@@ -49,8 +49,10 @@ def test_rows_are_run_once_and_told(tmp_path, capsys):
     main([*command, "--out", str(out)])
     assert len(pd.read_csv(out)) == len(rows)
     capsys.readouterr()
+    main(["show", "--by-parameter", "--out", str(out)])
+    assert "| ours  | 1      | 1.00 (0.34 to 1.00)" in capsys.readouterr().out
     main(["show", "--out", str(out)])
-    assert "| ours  |      1 | 1.00 (0.34 to 1.00)" in capsys.readouterr().out
+    assert "| friction 1  | 0.00    | 1.00   | 1.00" in capsys.readouterr().out
 
 
 def test_the_table_counts():
