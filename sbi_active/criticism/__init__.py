@@ -10,7 +10,6 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.generic import generic_effects
 from sbi_active.criticism.effects.joint_prior import joint_prior
-from sbi_active.criticism.identification import identify
 from sbi_active.criticism.loop import close_loop
 from sbi_active.criticism.report.report import Report
 from sbi_active.renamed import former_names
@@ -24,7 +23,6 @@ __all__ = [
     "Trials",
     "close_loop",
     "generic_effects",
-    "identify",
     "joint_prior",
 ]
 

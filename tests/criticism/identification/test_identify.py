@@ -7,7 +7,8 @@ from sbi.utils import BoxUniform
 from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials, identify
+from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism.identification import identify
 from sbi_active.mujoco import randomization
 
 TIMES = torch.arange(120, dtype=torch.float64) / 20
