@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
 from sbi_active.criticism.steps.nuisances import is_first_part
+from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -267,21 +267,10 @@ def integrated(
     some = np.isfinite(low) | np.isfinite(high)
     if some.any():
         own = np.sqrt(np.einsum("hii->hi", cov))[:, some]
-        inside = _log_inside(mean[:, some], own, low[some], high[some])
-        before = _log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
+        inside = log_inside(mean[:, some], own, low[some], high[some])
+        before = log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
         log_z = log_z + inside.sum(1) - before.sum()
     return log_z, mean, cov
-
-
-def _log_inside(mean: Array, sd: Array, low: Array, high: Array) -> Array:
-    """Return the log probability of a normal variable between bounds."""
-    a, b = (low - mean) / sd, (high - mean) / sd
-    # In the lower tail, where the logarithm of a small share is exact.
-    with np.errstate(invalid="ignore"):
-        flip = a + b > 0
-    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
-    upper, lower = log_ndtr(b), log_ndtr(a)
-    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
 
 
 def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:

@@ -149,18 +149,21 @@ class Rival:
         """Return log p(z) with respect to u, shape (n,)."""
         return self.coordinates.log_prob(u)
 
-    def jacobian(self, u: Array, whiten: Whitener, step: float) -> tuple[Array, Array]:
+    def jacobian(
+        self, u: Array, whiten: Whitener, step: float | Array
+    ) -> tuple[Array, Array]:
         """Return whitened residuals and their derivatives by finite differences.
 
         Args:
             u: Shape (n, dim).
             whiten: Maps (..., N) to (..., N).
-            step: In u.
+            step: In u, one or one a coordinate, shape (dim,).
 
         Returns:
             Shapes (n, N) and (n, N, dim).
         """
         c = self.coordinates
+        step = np.broadcast_to(step, (self.dim,))
         groups = [g for g in c.groups() if self.searched[g > 0].any()]
         sign = np.where(u + step > c.high, -1.0, 1.0)
         stack = [u, *[u + step * sign * g for g in groups]]
@@ -169,7 +172,7 @@ class Rival:
         trial_of, trial = c.trial_of(), self.simulator.measurements.trial
         jac = np.zeros((*r[0].shape, self.dim))
         for k, group in enumerate(groups):
-            change = (r[k + 1] - r[0]) / step
+            change = (r[k + 1] - r[0]) / step[group > 0][0]
             for j in np.flatnonzero(group):
                 part = sign[:, j, None] * change
                 mine = trial_of[j] < 0

@@ -33,10 +33,13 @@ from sbi_active.mujoco.robot import Robot, from_spec
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["mjcf_effects"]
+__all__ = ["likely_effects", "mjcf_effects"]
 
 #: Change of x by a prior deviation, in deviations of x, that counts as none.
 NOTHING = 1e-9
+#: Patterns of effects that robots most often have, and of others that these fit.
+LIKELY = ("* friction loss", "* quadratic damping", "* stiffness", "* lag")
+UNLIKELY = ("* sensor lag", "* cubic *", "* quadratic stiffness", "all *")
 
 
 def mjcf_effects(
@@ -87,6 +90,19 @@ def mjcf_effects(
         names = [e.name for e in every]
         require_name(pattern, names, "effect, or a pattern of some,")
     kept = picked(every, include, exclude)
+    return _that_matter(simulator, kept, call)
+
+
+def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
+    """Return what joints and drives most often have and an MJCF does not say.
+
+    Args:
+        robot: From its MJCF.
+        trials: Whose actions and inputs say how it moves.
+    """
+    simulator, actions, trials = _simulator(robot, None, trials)
+    sizes, call = nominal(simulator, trials, actions)
+    kept = picked(_all(simulator, sizes, trials), LIKELY, UNLIKELY)
     return _that_matter(simulator, kept, call)
 
 

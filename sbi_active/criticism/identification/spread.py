@@ -1,0 +1,105 @@
+r"""What single parts of the trials say beside all of them.
+
+Where the model is right, parameters fitted to single trials differ by no more than
+their errors allow. Where it is wrong they follow what it lacks: beside dry friction
+nobody declared, damping falls as the motion grows. The spread between trials is then a
+measure of how far all of them may be off, and it does not average out.
+
+References:
+    DerSimonian & Laird, Controlled Clinical Trials 7 (1986).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.identification.errors import grams
+from sbi_active.criticism.identification.fitting import Fitted
+
+Array = NDArray[Any]
+
+#: Parts of the trials at least, for which trials are divided in time.
+FEWEST = 4
+#: Tail probability below which they disagree.
+LEVEL = 0.01
+#: Deviations between parts by which all of them may be off.
+WIDER = 3.0
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How parts of the trials disagree.
+
+    Attributes:
+        p_value: Of each parameter being the same in all parts, shape (d,).
+        deviation: Of the parts from their mean, as far as it is none of their errors,
+            shape (f, d), such that normal multiples of them add up to the spread.
+    """
+
+    p_value: Array
+    deviation: Array
+
+    @property
+    def disagree(self) -> bool:
+        """Whether some parameter is not the same in all parts."""
+        return float(self.p_value.min(initial=1.0)) * len(self.p_value) < LEVEL
+
+    def widen(self, u: Array, rng: np.random.Generator) -> Array:
+        """Return draws (n, d) as far off as the parts are from each other."""
+        weight = rng.standard_normal((len(u), len(self.deviation)))
+        return u + WIDER * weight @ self.deviation
+
+
+def spread(found: Fitted) -> Spread:
+    """Return how parts of the trials disagree about theta.
+
+    Args:
+        found: The model, linear.
+    """
+    m, draws = found.rival.simulator.measurements, found.draws
+    own = found.rival.theta_dim
+    free = found.rival.coordinates.trial_of() < 0
+    effect = found.unknowns.effect
+    likely = draws.present.mean(0) > 0.5
+    free &= (effect < 0) | likely[effect] if len(likely) else True
+    precision, linear = 0.0, 0.0
+    rows = found.rows[:, np.append(True, free)]
+    for k, gram in enumerate(grams(rows, m, found.hypotheses, _parts(m))):
+        h = int(np.bincount(draws.errors[:, k]).argmax())
+        variance = np.mean(draws.size[draws.errors[:, k] == h, k] ** 2)
+        precision = precision + gram.gram[h][:, 1:, 1:] / variance
+        linear = linear - gram.gram[h][:, 1:, 0] / variance
+    precision, linear = np.asarray(precision), np.asarray(linear)
+    total = precision.sum(0)
+    ridge = np.diag(1e-6 * np.diag(total) + 1e-12)
+    best = np.linalg.solve(total + ridge, linear.sum(0))
+    cov = np.linalg.inv(precision + ridge)
+    each = best + np.einsum("fij,fj->fi", cov, linear - precision @ best)
+    each, sd = each[:, :own], np.sqrt(np.einsum("fii->fi", cov))[:, :own]
+    weight = 1 / sd**2
+    mean = (weight * each).sum(0) / weight.sum(0)
+    square, freedom = (weight * (each - mean) ** 2).sum(0), len(each) - 1
+    of_parts = weight.sum(0) - (weight**2).sum(0) / weight.sum(0)
+    variance = np.maximum(square - freedom, 0.0) / np.maximum(of_parts, 1e-300)
+    # Of their own deviations, those that are far off by their errors count less.
+    off = np.sqrt(weight) * (each - mean)
+    off = off / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
+    return Spread(chi2.sf(square, max(freedom, 1)), off * np.sqrt(variance))
+
+
+def _parts(m: Measurements) -> NDArray[np.int64]:
+    """Return the part of each number: trials, or parts of them where they are few."""
+    _, trial = np.unique(m.trial, return_inverse=True)
+    each = -(-FEWEST // (int(trial.max()) + 1))
+    place = np.zeros(len(m), dtype=np.int64)
+    for t in range(int(trial.max()) + 1):
+        time = m.time[trial == t]
+        edges = np.linspace(time.min(), time.max(), each + 1)[1:-1]
+        place[trial == t] = np.searchsorted(edges, time, side="right")
+    return trial * each + place

@@ -1,0 +1,180 @@
+"""A belief from trajectories of an oscillator, which is solved in closed form."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism.identification import identify
+from sbi_active.mujoco import randomization
+
+TIMES = torch.arange(120, dtype=torch.float64) / 20
+PRIOR = BoxUniform(torch.tensor([1.0, 0.0, 0.5]), torch.tensor([6.0, 1.0, 2.0]))
+TRUTH = torch.tensor([3.0, 0.2, 1.2], dtype=torch.float64)
+ACTION = torch.tensor([[0.5], [1.0], [1.5], [2.0]], dtype=torch.float64)
+
+
+def mean(theta, action):
+    """Return position, times a gain, and its integral in another unit."""
+    frequency, decay, gain = (theta[:, [k]] for k in range(3))
+    x = action * torch.exp(-decay * TIMES) * torch.cos(frequency * TIMES)
+    return torch.stack([gain * x, 50 * x.cumsum(1) / 20], -1)
+
+
+def model(noise=None, fn=mean):
+    names = ["frequency", "decay", "gain"]
+    return SimulatorModel(fn, noise=noise, sample_times=TIMES, parameter_names=names)
+
+
+def errors(shape, correlation, seed):
+    e = np.random.default_rng(seed).standard_normal(shape)
+    for k in range(1, shape[1]):
+        e[:, k] = correlation * e[:, k - 1] + np.sqrt(1 - correlation**2) * e[:, k]
+    return torch.from_numpy(e) * torch.tensor([0.02, 1.0])
+
+
+def recorded(correlation=0.0, seed=0, extra=0.0):
+    x = mean(TRUTH.expand(4, -1), ACTION) + extra
+    return x + errors(tuple(x.shape), correlation, seed)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.95])
+def test_intervals_hold_in_channels_of_different_units(correlation):
+    """10 sets: 30 intervals, of which fewer than 25 hold once in 300 times."""
+    inside = []
+    for seed in range(10):
+        x = recorded(correlation, seed)
+        found = identify(model(), PRIOR, Trials(ACTION, x), seed=seed).interval()
+        ends = zip(found.values(), TRUTH.tolist(), strict=True)
+        inside += [low <= t <= high for (low, high), t in ends]
+    assert sum(inside) >= 25
+
+
+def test_errors_are_told_by_channel():
+    belief = identify(model(), PRIOR, Trials(ACTION, recorded(0.9)))
+    errors = [*belief.diagnostics.errors.values()]
+    assert errors[0]["sd"] == pytest.approx(0.02, rel=0.4)
+    assert errors[1]["sd"] == pytest.approx(1.0, rel=0.4)
+    for e in errors:  # .9 from sample to sample last .47 s
+        assert e["white"] < 0.2
+        assert 0.2 < e["time"] < 1.2
+    assert belief.diagnostics.trustworthy
+    assert set(randomization(belief).ranges[0.9]) == {"frequency", "decay", "gain"}
+    spread = belief.sample(torch.Size([4000])).double().std(0)
+    assert spread.numpy() == pytest.approx(belief.draws.std(0).numpy(), rel=0.1)
+
+
+def test_declared_white_errors_have_their_size():
+    """Three times what it is in truth: intervals are three times as wide."""
+    trials = Trials(ACTION, recorded())
+    sizes = [torch.tensor([0.02, 1.0]), torch.tensor([0.06, 3.0])]
+    widths = []
+    for sd in sizes:
+        found = identify(model(GaussianNoise(sd)), PRIOR, trials).interval()
+        widths.append([high - low for low, high in found.values()])
+    assert np.divide(widths[1], widths[0]) == pytest.approx(3.0, rel=0.2)
+
+
+def test_gaps_and_a_single_log_will_do():
+    x = recorded()[2:3]
+    x[0, 30:50, 0] = torch.nan
+    belief = identify(model(), PRIOR, Trials(ACTION[2:3], x))
+    for (low, high), truth in zip(belief.interval(0.999).values(), TRUTH, strict=True):
+        assert low < truth < high
+        assert high - low < 0.2
+
+
+def test_what_nothing_tells_keeps_its_prior():
+    def deaf(theta, action):
+        return mean(
+            torch.cat([theta[:, :2], TRUTH[2].expand(len(theta), 1)], 1), action
+        )
+
+    belief = identify(model(fn=deaf), PRIOR, Trials(ACTION, recorded()))
+    low, high = belief.interval()["gain"]
+    assert low == pytest.approx(0.5 + 0.025 * 1.5, abs=0.05)
+    assert high == pytest.approx(2.0 - 0.025 * 1.5, abs=0.05)
+    low, high = belief.interval()["frequency"]
+    assert high - low < 0.05
+
+
+def test_a_bound_is_kept_and_told():
+    prior = BoxUniform(torch.tensor([1.0, 0.25, 0.5]), torch.tensor([6.0, 1.0, 2.0]))
+    belief = identify(model(), prior, Trials(ACTION, recorded()))
+    assert belief.draws[:, 1].min() >= 0.25
+    assert any("decay is at a bound" in w for w in belief.diagnostics.warnings)
+
+
+def test_what_may_be_there_is_found_or_not():
+    """A shift of the position beside it: found, and theta as narrow as before."""
+
+    def shift(x, phi, action, context):
+        return x + phi[:, None] * torch.tensor([1.0, 0.0], dtype=x.dtype)
+
+    bias = Effect(
+        "bias", hook="observation", prior=Normal(0.0, 0.5), null=0.0, apply=shift
+    )
+    extra = torch.tensor([0.1, 0.0])
+    for there in (False, True):
+        trials = Trials(ACTION, recorded(extra=extra if there else 0.0))
+        belief = identify(model(), PRIOR, trials, beside=[bias])
+        assert belief.diagnostics.beside["bias"] == pytest.approx(float(there), abs=0.2)
+        for (low, high), t in zip(belief.interval(0.999).values(), TRUTH, strict=True):
+            assert low < t < high
+
+
+def test_trials_that_disagree_widen_it():
+    """A stiffening spring nobody declared: frequency grows with the amplitude."""
+    theta = TRUTH.repeat(4, 1)
+    theta[:, 0] += 0.2 * ACTION[:, 0]
+    x = mean(theta, ACTION)
+    belief = identify(model(), PRIOR, Trials(ACTION, x + errors(tuple(x.shape), 0, 1)))
+    assert any("disagree" in w for w in belief.diagnostics.warnings)
+    assert not belief.diagnostics.trustworthy
+    low, high = belief.interval()["frequency"]
+    assert low < 3.0 < high
+
+
+def test_what_it_does_not_take():
+    trials = Trials(ACTION, recorded())
+    noisy = model(fn=lambda t, a: mean(t, a) + 0.1 * torch.randn(len(t), 120, 2))
+    with pytest.raises(ValueError, match="deterministic simulator; got a random"):
+        identify(noisy, PRIOR, trials)
+    flat = SimulatorModel(lambda t, a: t[:, :2] * a, noise=GaussianNoise(0.1))
+    with pytest.raises(ValueError, match="trajectories with sample times"):
+        identify(flat, PRIOR, Trials(ACTION, ACTION * TRUTH[:2]))
+    x = recorded()
+    x[..., 1] = torch.nan
+    with pytest.raises(ValueError, match="got none in channel 1; leave it out"):
+        identify(model(), PRIOR, Trials(ACTION, x))
+    belief = identify(model(), PRIOR, trials)
+    with pytest.raises(ValueError, match="between 0 and 1; got 95"):
+        belief.interval(95)
+
+
+def test_a_prior_of_any_shape_counts():
+    """Draws of a gain that nothing tells are those of its skewed prior."""
+    own = torch.distributions.Independent(
+        torch.distributions.Gamma(torch.tensor([3.0, 30.0]), torch.tensor([1.0, 30.0])),
+        1,
+    )
+
+    def deaf(theta, action):
+        rest = TRUTH[1:].expand(len(theta), 2)
+        return mean(torch.cat([theta[:, :1], rest], 1), action) * TRUTH[2]
+
+    names = ["frequency", "nothing"]
+    deaf_model = SimulatorModel(deaf, sample_times=TIMES, parameter_names=names)
+    x = deaf(TRUTH.expand(4, -1), ACTION)
+    trials = Trials(ACTION, x + errors(tuple(x.shape), 0.0, 0))
+    belief = identify(deaf_model, own, trials)
+    low, high = belief.interval()["nothing"]
+    expected = np.quantile(
+        np.random.default_rng(0).gamma(30, 1 / 30, 10**5), [0.025, 0.975]
+    )
+    assert [low, high] == pytest.approx(expected, abs=0.12)
+    low, high = belief.interval(0.999)["frequency"]
+    assert low < 3.0 < high

@@ -1,0 +1,54 @@
+"""A robot's parameters from logs of one that has dry friction besides."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from benchmarks.robots.models import PENDULUM
+from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco.identification import identify_robot
+
+TRUTH = 0.03
+
+
+def log(start, rng, friction):
+    text = PENDULUM.replace("0.03", f'{TRUTH}" frictionloss="{friction}')
+    own = mujoco.MjModel.from_xml_string(text)
+    data, angles = mujoco.MjData(own), []
+    data.qpos[0] = start
+    for _ in range(200):
+        angles.append(data.qpos[0] + 0.005 * rng.standard_normal())
+        mujoco.mj_step(own, data)
+    time = 0.01 * np.arange(200)
+    begin = np.full(100, start)
+    return {"time": time[::2], "encoder": angles[::2], "start hinge": begin}
+
+
+def robot(friction):
+    rng = np.random.default_rng(3)
+    logs = [log(start, rng, friction) for start in (0.6, -1.2, 1.5, -0.9)]
+    unknown = {"hinge.damping": (0.0, 0.3)}
+    return from_mjcf(PENDULUM, unknown, recordings=logs, noise=0.005)
+
+
+def test_undeclared_friction_is_beside_it():
+    for friction in (0.0, 0.05):
+        belief = identify_robot(robot(friction))
+        low, high = belief.interval()["hinge.damping"]
+        assert low < TRUTH < high
+        assert high - low < 0.03
+        share = belief.diagnostics.beside["hinge friction loss"]
+        assert share == pytest.approx(float(friction > 0), abs=0.2)
+
+
+def test_without_anything_beside_it_is_wide_and_says_so():
+    belief = identify_robot(robot(0.05), beside=())
+    low, high = belief.interval()["hinge.damping"]
+    assert low < TRUTH < high
+    assert "disagree about hinge.damping" in belief.diagnostics.warnings[0]
+
+
+def test_it_needs_recordings():
+    bare = from_mjcf(PENDULUM, {"hinge.damping": (0.0, 0.3)}, times=[0.1, 0.2])
+    with pytest.raises(ValueError, match="a robot with recordings; got none"):
+        identify_robot(bare)
