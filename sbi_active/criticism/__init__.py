@@ -10,6 +10,7 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.generic import generic_effects
 from sbi_active.criticism.effects.joint_prior import joint_prior
+from sbi_active.criticism.identification.identify import identify
 from sbi_active.criticism.loop import close_loop
 from sbi_active.criticism.report.report import Report
 from sbi_active.renamed import former_names
@@ -23,6 +24,7 @@ __all__ = [
     "Trials",
     "close_loop",
     "generic_effects",
+    "identify",
     "joint_prior",
 ]
 

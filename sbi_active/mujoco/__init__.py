@@ -9,6 +9,7 @@ tools. No inference, and no criticism of models, is done here. Needs
 from sbi_active.criticism.forces.library import force_effects
 from sbi_active.mujoco.beliefs import belief_to_parameters, randomization
 from sbi_active.mujoco.effects.library import mjcf_effects
+from sbi_active.mujoco.identification import identify_robot
 from sbi_active.mujoco.limits import MotionLimits
 from sbi_active.mujoco.robot import Robot, from_mjcf
 from sbi_active.mujoco.sysid import from_sysid
@@ -20,6 +21,7 @@ __all__ = [
     "force_effects",
     "from_mjcf",
     "from_sysid",
+    "identify_robot",
     "mjcf_effects",
     "randomization",
 ]
