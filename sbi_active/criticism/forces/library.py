@@ -26,6 +26,8 @@ from sbi_active.simulation import SimulatorModel
 
 #: How families of forces begin: their forms are alternatives of one cause.
 FAMILY = "force in "
+#: The same, of forces that depend on another joint.
+COUPLING = "coupling with "
 #: Prior deviation of a force, in root mean squares of what the motion takes.
 SHARE = 0.2
 #: On a slide the unit of q is what 90 % of the time lies within, by this.
@@ -130,6 +132,11 @@ def force_effects(
     return picked(found, wanted, without)
 
 
+def is_force(effect: Effect) -> bool:
+    """Return whether an effect is a force of the dictionary."""
+    return str(effect.family).startswith((FAMILY, COUPLING))
+
+
 def _forces(
     joint: Joint, joints: Sequence[Joint], nominal: Trajectories, *, free: bool
 ) -> Iterator[tuple[str, str, FormForce]]:
@@ -144,7 +151,7 @@ def _forces(
         for form in ("q", "v"):
             name = f"{form} of {other.name} on {joint.name}"
             force = FormForce(joint, form, 1.0, horizon, other)
-            yield name, f"coupling with {joint.name}", force
+            yield name, f"{COUPLING}{joint.name}", force
     if free:
         for what in FREE:
             depends = "q and v" if what == "q times v" else what
