@@ -40,6 +40,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.screening.by_sensor import BySensor
 from sbi_active.criticism.screening.screening import worth_fitting
+from sbi_active.criticism.screening.stand_ins import judged
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
@@ -55,6 +56,8 @@ if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
 
 FEWEST_TRIALS = 4  # to leave one out
+#: Posterior draws that predict held-out trials, of models by linear evidence.
+FEW_DRAWS = 60
 NUM_OTHERS = 3  # models besides those with an effect: none and two catch-alls
 
 
@@ -314,7 +317,8 @@ class Criticism:
         tracing, trials = self.trace(), self._parts[1]
         held_out = trials.held_out
         if held_out is not None:
-            return evaluate_held_out(self.rivals, tracing, held_out)
+            few = {"num_draws": FEW_DRAWS} if self._few is not None else {}
+            return evaluate_held_out(self.rivals, tracing, held_out, **few)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
         linear = self._by_sensor if tracing.misfit is None else self._misfit
@@ -323,6 +327,17 @@ class Criticism:
         return evaluate_left_out(
             trials.fit, self._fold, show_progress=self.show_progress
         )
+
+    def judged(self, evaluation: Evaluation | None) -> Tracing:
+        """Return what was traced, unless trials that had no part in it speak against.
+
+        Effects with which these are predicted worse are withdrawn, and forces of the
+        dictionary that leave more than the sensor's error are called stand-ins.
+
+        Args:
+            evaluation: The error before and after; None where nobody asked.
+        """
+        return judged(self.rivals, self.trace(), evaluation)
 
     def _fitting(
         self, what: str, total: int | None = None

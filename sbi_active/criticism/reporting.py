@@ -24,7 +24,6 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.screening.screening import Screening
 from sbi_active.criticism.steps.evaluation import evaluate_held_out
-from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.steps.leave_one_out import leave_one_out
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.progress import stage
@@ -44,7 +43,7 @@ class Steps(Protocol):
     screening: Screening | None
     digest: str
 
-    def trace(self) -> Tracing: ...  # noqa: D102
+    def judged(self, evaluation: Evaluation | None) -> Tracing: ...  # noqa: D102
 
     def detect(self) -> Detection: ...  # noqa: D102
 
@@ -76,7 +75,7 @@ def report_of(
         designed: The same.
         exploratory: The same.
     """
-    tracing = unless_refuted(loop.trace(), evaluation)
+    tracing = loop.judged(evaluation)
     if tracing.refuted and held_out is not None:
         evaluation = evaluate_held_out(loop.rivals, tracing, held_out)
     simulator, prior = loop.add(tracing.chosen)

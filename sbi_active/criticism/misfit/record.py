@@ -108,6 +108,7 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
         guesses=() if choice.key.effects else guess_residual(search),
         beside=tuple(n for n in choice.key.effects if n not in named),
         misfit=found,
+        p_value=misfit.model(choice.key).chi_square[2],
     )
 
 
