@@ -170,6 +170,7 @@ class Criticism:
             self.rivals, self.screening, self._few = worth_fitting(
                 RivalSet(own, prior, measured.fit, some, actions=actions, seed=seed)
             )
+        self._fewer = {} if self._few is None else {"num_draws": FEW_DRAWS}
         self.rivals.warm_up = require_warm_up(warm_up, measured, some)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
@@ -236,7 +237,7 @@ class Criticism:
         """Return which effect the data point to."""
         misfit = self.misfit()
         if self._tracing is None and misfit is not None:
-            self._tracing = traced(misfit, self._parts[1].held_out)
+            self._tracing = traced(misfit, self._parts[1].held_out, **self._fewer)
         if self._tracing is None:
             detection, groups = self.detect(), self.equivalent()
             if self._by_sensor is not None:
@@ -254,7 +255,7 @@ class Criticism:
             if self._misfit is not None:
                 self._residuals = None
                 self.rivals.fits.clear()
-                tracing = traced(self._misfit, self._parts[1].held_out)
+                tracing = traced(self._misfit, self._parts[1].held_out, **self._fewer)
             elif tracing.verdict == UNEXPLAINED and not tracing.chosen:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
@@ -317,8 +318,7 @@ class Criticism:
         tracing, trials = self.trace(), self._parts[1]
         held_out = trials.held_out
         if held_out is not None:
-            few = {"num_draws": FEW_DRAWS} if self._few is not None else {}
-            return evaluate_held_out(self.rivals, tracing, held_out, **few)
+            return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
         linear = self._by_sensor if tracing.misfit is None else self._misfit

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.misfit.linear import LinearModel, enlarged, linearize
-from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
+from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.screening.library import Library
@@ -32,8 +32,12 @@ SECANT, ROUNDS = 5, 4
 #: A fall of the sum of squares that is worth another linearization, in units of the
 #: residual's own variance.
 WORTH = 0.3
-#: Models beside which larger ones are looked for, and larger ones that are fitted.
-NUM_BASES, NUM_PAIRS, NUM_LARGER = 3, 10, 4
+#: Models beside which larger ones are looked for, larger ones that are fitted, and
+#: effects of one at most: forces of a dictionary add up to anything.
+NUM_BASES, NUM_PAIRS, NUM_LARGER, MAX_EFFECTS = 3, 10, 2, 3
+#: Nats by which linear evidence puts a larger model behind one that is fitted, so that
+#: it is not fitted.
+BEHIND = 10.0
 #: Tail probability of a chi-square from which nothing larger than a pair is looked for.
 PASSES = 0.01
 
@@ -92,7 +96,8 @@ class FewSimulations(Search):
                     scores[key] = max(value, scores.get(key, -np.inf))
             most = NUM_PAIRS if size == 2 else NUM_LARGER
             for key in sorted(scores, key=scores.__getitem__)[::-1][:most]:
-                self.fit_set(key)
+                if scores[key] > max(map(_by_either, self.found.values())) - BEHIND:
+                    self.fit_set(key)
 
     def _explains(self) -> bool:
         """Return whether a model leaves no more than the sensor's error."""
@@ -212,6 +217,10 @@ def _promised(model: LinearModel) -> float:
 
 def _by_sensor(c: Candidate) -> float:
     return c.log_prior + c.posterior.log_sensor
+
+
+def _by_either(c: Candidate) -> float:
+    return c.log_prior + c.posterior.log_evidence
 
 
 def _by_process(c: Candidate) -> float:

@@ -16,6 +16,9 @@ from sbi_active.criticism.steps.combinations import log_prior
 
 Array = NDArray[Any]
 
+#: Effects whose Gram matrices are computed together.
+TOGETHER = 12
+
 
 class Library:
     """A model at its best fit, with a column of every effect that it lacks.
@@ -52,6 +55,15 @@ class Library:
         """Return phi where an effect's column was taken, and that, (k,) and (N, k)."""
         model, own = self._singles[name], self._blocks[name]
         return model.u[own], model.jacobian[:, own]
+
+    def look_at_each(self) -> None:
+        """Compute the posterior of each effect alone, several at a time."""
+        for start in range(0, len(self.names), TOGETHER):
+            some = self.names[start : start + TOGETHER]
+            self.prepare(some)
+            for name in some:
+                self._posterior((name,))
+        self._grams, self._places = None, {}
 
     def score(self, names: tuple[str, ...]) -> float:
         """Return the log posterior probability of a set, unnormalized."""

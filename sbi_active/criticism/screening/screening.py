@@ -25,6 +25,8 @@ MANY = 24
 BEST, NUM_PAIRS, CLOSEST = 8, 6, 4
 #: Effects whose linear optimum is simulated, and whose pairs are compared.
 TRIED, PAIRED = 20, 60
+#: The latter, where fits take few simulations and time counts.
+FEW_PAIRED = 30
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,9 @@ def worth_fitting(
     if any(map(is_force, rivals.library)) and sensor is not None:
         unit, cells = sensor
         few = FewSimulations(rivals, unit, log_priors(rivals.library, ()), cells)
-        found = _best_of(few.library) if len(rivals.effects) > MANY else None
+        found = (
+            _best_of(few.library, FEW_PAIRED) if len(rivals.effects) > MANY else None
+        )
         if found is not None:
             few.restrict(found.kept)
             rivals.effects = {n: rivals.effects[n] for n in found.kept}
@@ -95,14 +99,14 @@ def worth_fitting(
     return own, found, None
 
 
-def _best_of(linear: Library) -> Screening | None:
+def _best_of(linear: Library, num_paired: int = PAIRED) -> Screening | None:
     """Return which effects of a library are worth a fit; None for all."""
     rivals = linear.search.rivals
     singles = {n: linear.score((n,)) for n in linear.names}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     best = dict(singles)
     pairs: dict[tuple[str, ...], float] = {}
-    paired = [n for n in linear.names if n in ranked[:PAIRED]]
+    paired = [n for n in linear.names if n in ranked[:num_paired]]
     linear.prepare(paired)
     for pair in combinations(paired, 2):
         value = linear.score(pair)

@@ -16,6 +16,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.progress import stage
+from sbi_active.simulation import GaussianNoise
 
 Array = NDArray[Any]
 #: The models fitted to some trials, and what was traced in them.
@@ -58,14 +59,17 @@ def evaluate_held_out(
 
 
 def _is_known(rivals: RivalSet) -> bool:
-    """Return whether errors are declared, and independent of each other."""
-    return rivals.has_known_noise and not any(c.rho.any() for c in rivals.noise.cells)
+    """Return whether errors are Gaussian of a declared size."""
+    return (
+        isinstance(rivals.model.noise, GaussianNoise) and len(rivals.noise.scales) < 2
+    )
 
 
 def tail(prediction: Prediction, trials: Trials) -> float:
     r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
 
-    With S the covariance of the predictions over the posterior, and R the noise.
+    With S the covariance of the predictions over the posterior, and R the noise, whose
+    errors are taken as independent.
 
     Args:
         prediction: Of some trials.
