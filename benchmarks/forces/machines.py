@@ -202,8 +202,8 @@ def cart_pole() -> Machine:
         _carried,
         lambda act: np.stack([np.zeros(len(act)), act[:, 0]], 1),
         _pushed,
-        step=0.0125,
-        steps=200,
+        step=0.025,
+        steps=100,
     )
     return Machine(
         "cart-pole",
@@ -222,8 +222,8 @@ def spring_mass() -> Machine:
         _sprung,
         lambda act: np.zeros((len(act), 1)),
         lambda act, t: act[:, 0] * np.sin(act[:, 1] * t),
-        step=0.02,
-        steps=200,
+        step=0.04,
+        steps=100,
     )
     return Machine(
         "spring-mass",
@@ -237,7 +237,7 @@ def spring_mass() -> Machine:
     )
 
 
-ARM = """<mujoco><option timestep=".01" integrator="implicitfast"/><worldbody>
+ARM = """<mujoco><option timestep=".02" integrator="implicitfast"/><worldbody>
 <body name="upper"><joint name="shoulder" axis="0 1 0" damping=".3"/>
 <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass="1.5"/>
 <body name="fore" pos="0 0 -.4"><joint name="elbow" axis="0 1 0" damping=".1"/>

@@ -171,6 +171,8 @@ class Criticism:
                 RivalSet(own, prior, measured.fit, some, actions=actions, seed=seed)
             )
         self._fewer = {} if self._few is None else {"num_draws": FEW_DRAWS}
+        # Each model's held-out errors would take as much as the verdict.
+        self._scored = measured.held_out if self._few is None else None
         self.rivals.warm_up = require_warm_up(warm_up, measured, some)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
@@ -237,7 +239,7 @@ class Criticism:
         """Return which effect the data point to."""
         misfit = self.misfit()
         if self._tracing is None and misfit is not None:
-            self._tracing = traced(misfit, self._parts[1].held_out, **self._fewer)
+            self._tracing = traced(misfit, self._scored)
         if self._tracing is None:
             detection, groups = self.detect(), self.equivalent()
             if self._by_sensor is not None:
@@ -255,7 +257,7 @@ class Criticism:
             if self._misfit is not None:
                 self._residuals = None
                 self.rivals.fits.clear()
-                tracing = traced(self._misfit, self._parts[1].held_out, **self._fewer)
+                tracing = traced(self._misfit, self._scored)
             elif tracing.verdict == UNEXPLAINED and not tracing.chosen:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing

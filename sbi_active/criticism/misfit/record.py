@@ -26,7 +26,6 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
-from sbi_active.criticism.steps.predictive import NUM_DRAWS as NUM_PREDICTED
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import (
     credible_set,
@@ -69,15 +68,12 @@ def detected(misfit: Misfit) -> Detection:
     )
 
 
-def traced(
-    misfit: Misfit, held_out: Trials | None, *, num_draws: int = NUM_PREDICTED
-) -> Tracing:
+def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
     """Return the verdict, and record the models behind it with posterior draws.
 
     Args:
         misfit: The models and what helps.
         held_out: Trials on which the recorded models are scored; None for none.
-        num_draws: With which each is.
     """
     rivals, search, choice = misfit.rivals, misfit.search, misfit.choice
     if getattr(rivals.model.noise, "measurement_sd", None) is None:
@@ -89,7 +85,7 @@ def traced(
     evidences = {}
     for key in dict.fromkeys([*tabled, *singles, *weights]):
         evidences[str(key)] = _record(misfit, key)
-    models = [_scored(misfit, key, held_out, num_draws) for key in tabled]
+    models = [_scored(misfit, key, held_out) for key in tabled]
     found = _found(misfit, tuple(models), weights)
     named = found.named
     probabilities = {str(k): choice.probabilities.get(k, 0.0) for k in tabled}
@@ -194,9 +190,7 @@ def _found(
     )
 
 
-def _scored(
-    misfit: Misfit, key: ModelKey, held_out: Trials | None, num_draws: int
-) -> ModelError:
+def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelError:
     """Return a model's errors on trials that it was not fitted to."""
     search, rivals = misfit.search, misfit.rivals
     left, bare = (search.found[k].left for k in (key, ModelKey()))
@@ -208,16 +202,14 @@ def _scored(
         name=str(key),
         probability=misfit.choice.probabilities.get(key, 0.0),
         left_out=np.sqrt(own),
-        held_out=(
-            None if held_out is None else _held_out(misfit, key, held_out, num_draws)
-        ),
+        held_out=None if held_out is None else _held_out(misfit, key, held_out),
         remains=float(min(excess, 1.0)),
     )
 
 
-def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials, num_draws: int) -> Array:
+def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
-    prediction = predict(misfit.rivals, held_out, key=key, num_draws=num_draws)
+    prediction = predict(misfit.rivals, held_out, key=key)
     m = Measurements.of(held_out, is_sequence=True)
     channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
     channel[m.position] = m.channel

@@ -159,6 +159,7 @@ class BySensor:
             for name, effect in rivals.effects.items()
             if name in evidences
         )
+        fitted = found[ModelKey(verdict.effects)]
         tracing = Tracing(
             verdict=str(verdict),
             chosen=verdict.effects,
@@ -174,18 +175,13 @@ class BySensor:
             beside=beside,
             outliers=self._outliers() if detection.alarm else {},
             needed=self._needed(verdict),
-            **self._fit_of(ModelKey(verdict.effects)),
+            p_value=fitted.model.chi_square[2],
+            log_process=fitted.posterior.log_process - fitted.posterior.log_sensor,
             trial_names=dict(
                 zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
             ),
         )
         return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
-
-    def _fit_of(self, key: ModelKey) -> dict[str, float]:
-        """Return how well a model fits, as :class:`.Tracing` has it."""
-        c = self.search.found[key]
-        beside = c.posterior.log_process - c.posterior.log_sensor
-        return {"p_value": c.model.chi_square[2], "log_process": beside}
 
     def _log_bayes_factor(self, log_z: dict[ModelKey, float]) -> float:
         weights = alternatives([e.name for e in self.rivals.library], ())
