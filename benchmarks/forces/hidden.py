@@ -105,7 +105,7 @@ def draw(
     """
     if kind == "clean":
         return Hidden()
-    forms = {e.name: e.apply.force for e in effects if not e.name.startswith("free")}
+    forms = {e.name: e.apply.key for e in effects if not e.name.startswith("free")}
     if kind == "magnet":
         forms = {n: f for n, f in forms.items() if n.startswith("sin 2q")}
     if kind == "outside":
