@@ -114,8 +114,11 @@ class FewSimulations(Search):
 
     def _beside(self, base: ModelKey, size: int) -> dict[ModelKey, float]:
         """Return linear log posteriors of larger sets beside a model."""
-        library = Library(self, base) if base.effects else self.library
-        names = [n for n in self.names if n not in base.effects]
+        # A free shape beside a form of its kind says nothing, and costs columns.
+        if any(map(self._free, base.effects)):
+            return {}
+        names = [n for n in self.names if n not in base.effects and not self._free(n)]
+        library = Library(self, base, names) if base.effects else self.library
         if base.effects:
             library.prepare(names)
         found = {}
@@ -125,6 +128,10 @@ class FewSimulations(Search):
             if key not in self.found:
                 found[key] = library.score(new)
         return found
+
+    def _free(self, name: str) -> bool:
+        effect = self.rivals.effects[name]
+        return is_force(effect) and effect.phi_dim > 1
 
     # The fits.
 

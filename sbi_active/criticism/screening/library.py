@@ -28,11 +28,18 @@ class Library:
     Args:
         search: Has fitted the model.
         base: Of the model; the bare one unless given.
+        names: Of the effects; all unless given.
     """
 
-    def __init__(self, search: Search, base: ModelKey = ModelKey()) -> None:  # noqa: B008
+    def __init__(
+        self,
+        search: Search,
+        base: ModelKey = ModelKey(),  # noqa: B008  (frozen)
+        names: Sequence[str] | None = None,
+    ) -> None:
         self.search, self.base = search, base
-        self.names = [n for n in search.names if n not in base.effects]
+        every = [n for n in search.names if n not in base.effects]
+        self.names = every if names is None else [*names]
         self.fitted = search.found[base].model
         self._singles: dict[str, LinearModel] = {}
         self._blocks: dict[str, NDArray[np.bool_]] = {}

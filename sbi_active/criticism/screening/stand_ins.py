@@ -13,8 +13,8 @@ from sbi_active.criticism.steps.influence import unless_refuted, withdrawn
 #: Tail probability of the chi-square below which a model is not adopted, on fitted
 #: trials and on others.
 LEVEL, HELD_OUT = 0.01, 0.01
-#: Log Bayes factor of a residual process beside a model that explains all.
-PROCESS = 0.0
+#: Log Bayes factor of a residual process above which a model does not explain all.
+PROCESS = 1.1
 
 
 def judged(
