@@ -39,8 +39,9 @@ MEASURES: dict[str, list[tuple[str, Callable[[Row], bool]]]] = {
     ],
     "outside": [
         ("held-out error falls", _falls),
-        ("called a stand-in, or withdrawn", lambda r: is_flagged(r)),
-        ("adopted, and the error rises", lambda r: _rises(r)),
+        ("called a stand-in, or nothing named", lambda r: is_flagged(r)),
+        ("error rises, and no stand-in", lambda r: _rises(r) and not is_flagged(r)),
+        ("error rises with a stand-in", lambda r: _rises(r) and is_flagged(r)),
     ],
     "clean": [("something named", lambda r: r["verdict"] != "none")],
     "magnet": [
@@ -52,7 +53,8 @@ MEASURES: dict[str, list[tuple[str, Callable[[Row], bool]]]] = {
 
 def is_flagged(row: Row) -> bool:
     """Return whether the verdict says that nothing declared explains the trials."""
-    return bool(row["stand_in"]) or row["verdict"] in ("unexplained", "none")
+    withdrawn = row["refuted"] == "1"
+    return bool(row["stand_in"]) or withdrawn or row["verdict"] == "unexplained"
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
