@@ -50,7 +50,7 @@ class FewSimulations(Search):
     """
 
     _library: Library | None = None
-    _done: frozenset[str] = frozenset()
+    _has_larger = False
 
     @property
     def library(self) -> Library:
@@ -59,16 +59,40 @@ class FewSimulations(Search):
             self._library = Library(self)
         return self._library
 
-    def restrict(self, names: Sequence[str]) -> None:
-        """Fit models of these effects alone from now on."""
-        self.names = [n for n in self.names if n in names]
+    def restrict(
+        self, names: Sequence[str], every: Sequence[str] | None = None
+    ) -> None:
+        """Fit models of some effects alone from now on.
+
+        Args:
+            names: Theirs.
+            every: Of those that they are among; None is of those so far.
+        """
+        self.names = [n for n in every or self.names if n in names]
+
+    def kin(self, every: Sequence[str]) -> list[str]:
+        """Return forms of the family that leaves least, where none explains.
+
+        Args:
+            every: Names of all effects.
+        """
+        effects = self.rivals.effects
+        keys = [k for k in self.found if k.effects]
+        if self._explains() or not keys:
+            return []
+        best = min(keys, key=lambda k: self.found[k].model.rms)
+        own = effects[best.effects[0]]
+        if not is_force(own):
+            return []
+        same = [n for n in every if effects[n].family == own.family]
+        return [n for n in same if ModelKey((n,)) not in self.found]
 
     def fit_singles(self) -> None:
         """Fit each effect alone, and the bare model from where they end, once."""
-        if "singles" in self._done:
+        new = [n for n in self.names if ModelKey((n,)) not in self.found]
+        if not new:
             return
-        self._done |= {"singles"}
-        for name in self.names:
+        for name in new:
             self.fit_set(ModelKey((name,)))
         bare, starts = self.found[ModelKey()].model, []
         for key in self._best(1):
@@ -83,9 +107,9 @@ class FewSimulations(Search):
 
     def fit_larger(self) -> None:
         """Fit the sets of several effects that linear evidence puts in front, once."""
-        if "larger" in self._done:
+        if self._has_larger:
             return
-        self._done |= {"larger"}
+        self._has_larger = True
         for size in range(2, min(MAX_EFFECTS, len(self.names)) + 1):
             bases = self._best(size - 1)
             if size > 2 and self._explains():

@@ -76,11 +76,12 @@ def worth_fitting(
     if any(map(is_force, rivals.library)) and sensor is not None:
         unit, cells = sensor
         few = FewSimulations(rivals, unit, log_priors(rivals.library, ()), cells)
-        found = (
-            _best_of(few.library, FEW_PAIRED) if len(rivals.effects) > MANY else None
-        )
+        found = None
+        if len(rivals.effects) > MANY:
+            few.library.look_at_each()
+            found = _best_of(few.library, FEW_PAIRED)
         if found is not None:
-            few.restrict(found.kept)
+            found = _with_kin(found, few)
             rivals.effects = {n: rivals.effects[n] for n in found.kept}
         return rivals, found, few
     found = screen(rivals)
@@ -97,6 +98,23 @@ def worth_fitting(
     )
     own.library = rivals.library
     return own, found, None
+
+
+def _with_kin(found: Screening, few: FewSimulations) -> Screening:
+    """Return what is fitted, with all forms of a family where none explains.
+
+    Far from a fit a Jacobian tells the family sooner than the form.
+    """
+    every = few.names
+    few.restrict(found.kept)
+    few.fit_singles()
+    kin = few.kin(every)
+    if not kin:
+        return found
+    kept = tuple(n for n in few.rivals.effects if n in {*found.kept, *kin})
+    few.restrict(kept, every)
+    few.fit_singles()
+    return Screening(kept, {n: v for n, v in found.behind.items() if n not in kin})
 
 
 def _best_of(linear: Library, num_paired: int = PAIRED) -> Screening | None:
