@@ -40,6 +40,7 @@ from sbi_active.criticism import (
     Trials,
     generic_effects,
 )
+from sbi_active.criticism.data.arrays import Role
 from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import Tracing
 
@@ -136,7 +137,7 @@ def _library(own: Machine, action: Tensor, number: int) -> list[Effect]:
 
 
 def _trials(own: Machine, action: Tensor, x: Tensor) -> Trials:
-    role = ["fit" if k in FITTED else "held out" for k in range(NUM_TRIALS)]
+    role: list[Role] = ["fit" if k in FITTED else "held out" for k in range(NUM_TRIALS)]
     return Trials(action, x, role=role, sample_times=own.model.sample_times)
 
 

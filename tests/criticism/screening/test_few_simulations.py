@@ -97,7 +97,8 @@ def test_one_that_does_not_lower_the_error_is_withdrawn(loop):
     table = evaluation.table.copy()
     table.loc[table["metric"] == "rmse", "ratio"] = 1.01
     judged = loop.judged(replace(evaluation, table=table))
-    assert judged.chosen == () and judged.verdict == UNEXPLAINED
+    assert judged.chosen == ()
+    assert judged.verdict == UNEXPLAINED
     assert judged.instead_of == loop.trace().verdict
     assert loop.judged(evaluation).chosen == loop.trace().chosen
 
@@ -137,4 +138,6 @@ def test_clean_trials_have_none(few):
 def test_other_libraries_are_sampled_as_ever():
     rivals = RivalSet(OSCILLATOR, RATES, oscillations(), EFFECTS, seed=0)
     same, screening, few = worth_fitting(rivals)
-    assert same is rivals and screening is None and few is None
+    assert same is rivals
+    assert screening is None
+    assert few is None
