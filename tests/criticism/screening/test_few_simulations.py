@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sbi_active import BoxActions
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces import force_effects
@@ -141,3 +142,15 @@ def test_other_libraries_are_sampled_as_ever():
     assert same is rivals
     assert screening is None
     assert few is None
+
+
+@pytest.mark.slow
+def test_the_next_action_is_told_within_the_range_tried_and_beyond_it(hidden):
+    effects = force_effects(MODEL, PRIOR, hidden, joints=["hinge"])
+    actions = BoxActions([-2.4, 0.0], [2.4, 3.0])
+    loop = Criticism(MODEL, PRIOR, hidden, effects=effects, actions=actions, seed=0)
+    found = loop.next_action()
+    assert len(found.separates) > 1  # several forms of a force in q
+    tried = hidden.action[:, 0].abs().max()
+    assert abs(found.within[0]) <= tried < abs(found.beyond[0])
+    assert found.beyond_gain > found.within_gain  # forms part far from rest
