@@ -83,7 +83,7 @@ def worth_fitting(
         if found is not None:
             found = _with_kin(found, few)
             rivals.effects = {n: rivals.effects[n] for n in found.kept}
-        return rivals, found, few
+        return rivals, found if found and found.behind else None, few
     found = screen(rivals)
     if found is None:
         return rivals, None, None
