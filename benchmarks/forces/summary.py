@@ -39,6 +39,7 @@ MEASURES: dict[str, list[tuple[str, Callable[[Row], bool]]]] = {
     ],
     "outside": [
         ("held-out error falls", _falls),
+        ("called a stand-in", lambda r: bool(r["stand_in"])),
         ("called a stand-in, or nothing named", lambda r: is_flagged(r)),
         ("error rises, and no stand-in", lambda r: _rises(r) and not is_flagged(r)),
         ("error rises with a stand-in", lambda r: _rises(r) and is_flagged(r)),
