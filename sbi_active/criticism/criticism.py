@@ -191,12 +191,10 @@ class Criticism:
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:
-            with self._fitting("models fitted"):
-                self._misfit = find_misfit(
-                    self.rivals, self.equivalent(), search=self._few
-                )
-            if self._few is not None and self._misfit is None:
-                self._by_sensor = BySensor(self._few, self.rivals)
+            groups, few = self.equivalent(), self._few
+            self._misfit = find_misfit(self.rivals, groups, search=few)
+            if few is not None and self._misfit is None:
+                self._by_sensor = BySensor(few, self.rivals)
             self._is_searched = True
         return self._misfit
 
