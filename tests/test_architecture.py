@@ -54,6 +54,7 @@ FLOORS = (
     "criticism.evidence",
     "criticism.steps",
     "criticism.misfit",
+    "criticism.screening",
     "criticism.next_trial",
     "criticism.report",
     "criticism",

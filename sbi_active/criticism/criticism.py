@@ -24,14 +24,11 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.given import made_given
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.record import detected, traced
-from sbi_active.criticism.misfit.screening import worth_fitting
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
-    NONE,
     SCATTER,
     UNEXPLAINED,
     Detection,
@@ -41,11 +38,13 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
+from sbi_active.criticism.screening.by_sensor import BySensor
+from sbi_active.criticism.screening.screening import worth_fitting
+from sbi_active.criticism.screening.stand_ins import judged
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.steps.formulas import guess
-from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.tracing import trace
 from sbi_active.criticism.thinning import thinned_to_need
@@ -57,6 +56,8 @@ if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
 
 FEWEST_TRIALS = 4  # to leave one out
+#: Posterior draws that predict held-out trials, of models by linear evidence.
+FEW_DRAWS = 60
 NUM_OTHERS = 3  # models besides those with an effect: none and two catch-alls
 
 
@@ -166,9 +167,12 @@ class Criticism:
         own, measured, some = self._parts
         with stage("a look at the simulator", show_progress=show_progress):
             #: Effects that linear evidence set aside; None where all are fitted.
-            self.rivals, self.screening = worth_fitting(
+            self.rivals, self.screening, self._few = worth_fitting(
                 RivalSet(own, prior, measured.fit, some, actions=actions, seed=seed)
             )
+        self._fewer = {} if self._few is None else {"num_draws": FEW_DRAWS}
+        # Each model's held-out errors would take as much as the verdict.
+        self._scored = measured.held_out if self._few is None else None
         self.rivals.warm_up = require_warm_up(warm_up, measured, some)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
@@ -177,6 +181,7 @@ class Criticism:
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
         self._misfit: Misfit | None = None
+        self._by_sensor: BySensor | None = None
         self._is_searched = False
 
     def misfit(self) -> Misfit | None:
@@ -186,7 +191,10 @@ class Criticism:
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:
-            self._misfit = find_misfit(self.rivals, self.equivalent())
+            groups, few = self.equivalent(), self._few
+            self._misfit = find_misfit(self.rivals, groups, search=few)
+            if few is not None and self._misfit is None:
+                self._by_sensor = BySensor(few, self.rivals)
             self._is_searched = True
         return self._misfit
 
@@ -204,6 +212,8 @@ class Criticism:
         It depends on the simulator and the actions, not on what was measured; without
         permitted actions, on those of the trials.
         """
+        if self._few is not None:  # the next action looks for what separates them
+            return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
                 self._equivalent = equivalent_effects(self.rivals, self.actions)
@@ -213,7 +223,9 @@ class Criticism:
         """Return whether the bare model misses the data."""
         if self._detection is None:
             groups, misfit = self.equivalent(), self.misfit()
-            if misfit is None:
+            if self._by_sensor is not None:
+                self._detection = self._by_sensor.detected()
+            elif misfit is None:
                 num = len(self.rivals.effects) + NUM_OTHERS
                 with self._fitting("models fitted", num):
                     self._detection = detect(self.rivals, groups)
@@ -225,18 +237,25 @@ class Criticism:
         """Return which effect the data point to."""
         misfit = self.misfit()
         if self._tracing is None and misfit is not None:
-            self._tracing = traced(misfit, self._parts[1].held_out)
+            self._tracing = traced(misfit, self._scored)
         if self._tracing is None:
             detection, groups = self.detect(), self.equivalent()
-            with self._fitting("verdict, sets of effects fitted"):
-                tracing = trace(self.rivals, detection, groups, actions=self.actions)
+            if self._by_sensor is not None:
+                tracing = self._by_sensor.traced()
+            else:
+                with self._fitting("verdict, sets of effects fitted"):
+                    tracing = trace(
+                        self.rivals, detection, groups, actions=self.actions
+                    )
             if tracing.verdict in (UNEXPLAINED, SCATTER):
                 # It is no error of a sensor: a process that follows the action is.
-                self._misfit = find_misfit(self.rivals, groups, is_known=True)
+                self._misfit = find_misfit(
+                    self.rivals, groups, is_known=True, search=self._few
+                )
             if self._misfit is not None:
                 self._residuals = None
                 self.rivals.fits.clear()
-                tracing = traced(self._misfit, self._parts[1].held_out)
+                tracing = traced(self._misfit, self._scored)
             elif tracing.verdict == UNEXPLAINED and not tracing.chosen:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
@@ -299,14 +318,26 @@ class Criticism:
         tracing, trials = self.trace(), self._parts[1]
         held_out = trials.held_out
         if held_out is not None:
-            return evaluate_held_out(self.rivals, tracing, held_out)
+            return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        if tracing.misfit is not None and self._misfit is not None:
-            return evaluate_linear(self._misfit, trials.fit)
+        linear = self._by_sensor if tracing.misfit is None else self._misfit
+        if linear is not None:
+            return evaluate_linear(linear, trials.fit)
         return evaluate_left_out(
             trials.fit, self._fold, show_progress=self.show_progress
         )
+
+    def judged(self, evaluation: Evaluation | None) -> Tracing:
+        """Return what was traced, unless trials that had no part in it speak against.
+
+        Effects with which these are predicted worse are withdrawn, and forces of the
+        dictionary that leave more than the sensor's error are called stand-ins.
+
+        Args:
+            evaluation: The error before and after; None where nobody asked.
+        """
+        return judged(self.rivals, self.trace(), evaluation)
 
     def _fitting(
         self, what: str, total: int | None = None
@@ -351,49 +382,13 @@ class Criticism:
             exploratory: Library or priors were changed after the data were seen, of
                 which it warns too.
         """
-        from sbi_active.criticism.next_trial.severe_tests import severe_tests
-        from sbi_active.criticism.report.report import build_report
-        from sbi_active.criticism.steps.leave_one_out import leave_one_out
+        from sbi_active.criticism.reporting import report_of
 
-        tracing = self.trace()
-        evaluation = self.evaluate() if evaluate else None
-        tracing = unless_refuted(tracing, evaluation)
         held_out = self._parts[1].held_out
-        if tracing.refuted and held_out is not None:
-            evaluation = evaluate_held_out(self.rivals, tracing, held_out)
-        simulator, prior = self.add(tracing.chosen)
-        space = self.actions if plan else None
-        next_action = None if space is None else self.next_action()
-        with stage("residuals and tests", show_progress=self.show_progress):
-            residuals, after = self.residuals(), None
-            if tracing.verdict != NONE:
-                after = find_residuals(self.rivals, tracing.key)
-            left_out = () if tracing.misfit else leave_one_out(self.rivals, tracing)
-            tests = () if space is None else severe_tests(self.rivals, tracing, space)
-        given = made_given(
-            self.trials,
-            num_summaries=self.num_summaries,
-            sampling=self.sampling,
-            left_out=self.left_out,
-            screening=self.screening,
-            nuisances=[e.name for e in self.rivals.nuisances],
-            warm_up=self.rivals.warm_up,
-        )
-        return build_report(
-            trials=self.trials,
-            residuals=residuals,
-            residuals_after=after,
-            detection=self.detect(),
-            tracing=tracing,
-            simulator=simulator,
-            prior=prior,
-            evaluation=evaluation,
-            next_action=next_action,
-            actions=self.actions,
-            digest=self.digest,
+        evaluation = self.evaluate() if evaluate else None
+        return report_of(
+            *(self, evaluation, held_out),
+            plan=plan,
             designed=designed,
             exploratory=exploratory,
-            leave_one_out=left_out,
-            severe_tests=tests,
-            warnings=(*given,),
         )

@@ -267,6 +267,11 @@ class Tracing:
             that help are then ``chosen``, those that are probably the cause are the
             verdict, and the rest stand in ``beside``.
         trial_names: What each trial is called, by its index; others by their index.
+        stand_in: Why forces of the dictionary that are chosen only stand in for
+            something that nobody declared, a clause each; empty where they may be it.
+        p_value: Tail probability of the chi-square of the verdict's model, its
+            parameters all taken as determined; NaN where nobody asked.
+        log_process: Log Bayes factor of a residual process beside that model, nats.
     """
 
     verdict: str
@@ -288,6 +293,9 @@ class Tracing:
     refuted: tuple[float, float] | None = None
     misfit: Misfit | None = None
     trial_names: dict[float, str] = field(default_factory=dict)
+    stand_in: tuple[str, ...] = ()
+    p_value: float = float("nan")
+    log_process: float = -float("inf")
 
     @property
     def key(self) -> ModelKey:
@@ -323,6 +331,8 @@ class Evaluation:
             trials; NaN below 8 trials.
         selected: Verdict of each fold, shape (s,).
         names: What each scored trial is called; empty for its position.
+        p_value: Tail probability of the chi-square of all scored trials under what the
+            model with the effects predicts; NaN where the noise is not declared.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -332,6 +342,7 @@ class Evaluation:
     table: pd.DataFrame
     selected: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
+    p_value: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,6 +360,11 @@ class NextAction:
         outside_separates: The group that it separates; empty without.
         outside_gain: Lower bound on the information about which of the group is right,
             all taken as equally likely, nats; 0 without.
+        within: Where several forms of a force are left, the action within the range of
+            the trials that tells most about which, shape (action_dim,).
+        within_gain: Lower bound on that information, nats.
+        beyond: The same beyond that range, permitted or not.
+        beyond_gain: Likewise.
     """
 
     action: Array | None
@@ -359,6 +375,10 @@ class NextAction:
     outside: Array | None = None
     outside_separates: tuple[str, ...] = ()
     outside_gain: float = 0.0
+    within: Array | None = None
+    within_gain: float = 0.0
+    beyond: Array | None = None
+    beyond_gain: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active.criticism import AugmentedSimulator, Trials
+from sbi_active import BoxActions
+from sbi_active.criticism import AugmentedSimulator, Criticism, Trials
 from sbi_active.criticism.forces.trajectories import trajectories
 from sbi_active.mujoco import force_effects, from_mjcf
 
@@ -37,7 +38,7 @@ def test_forms_are_on_the_joints_of_the_model_in_their_units(cart):
     assert found["sign v of rail"].units.endswith(" N")
     assert found["sin 2q of hinge"].units.endswith(" N m")
     assert found["q of hinge on rail"].family == "coupling with rail"
-    force = found["sin 2q of hinge"].apply.force
+    force = found["sin 2q of hinge"].apply.key
     q, v = np.array([[0.0, np.pi / 4]]), np.zeros((1, 2))
     applied = force(q, v, 0.0, np.array([[1.0, 0.0]]))
     assert applied[0] == pytest.approx([0.0, force.size])
@@ -69,3 +70,33 @@ def test_a_force_moves_the_robot_and_none_does_not(cart):
     bare = robot.simulator.mean(theta, action)
     assert torch.allclose(x[0], bare[0], atol=1e-9)
     assert (x[1] - bare[1]).abs().max() > 1e-3
+
+
+@pytest.mark.slow
+def test_a_hidden_force_is_found_with_few_simulations():
+    robot = from_mjcf(
+        CART.replace('timestep=".002"', 'timestep=".01"'),
+        {"rail.damping": (0.1, 1.0), "pole.mass": (0.2, 0.8)},
+        sensors=["rail", "hinge"],
+        actions=BoxActions([-1.2], [1.2], names=["hinge"]),
+        times=np.linspace(0.1, 2.0, 20),
+        noise=1e-3,
+    )
+    action = torch.tensor([0.9, -0.4, 0.6, -1.1, 0.2, 1.2])[:, None]
+    theta = torch.tensor([[0.5, 0.4]]).expand(6, -1)
+    times = robot.simulator.sample_times
+    blank = Trials(action, torch.zeros(6, 20, 2), sample_times=times)
+    effects = force_effects(robot, trials=blank, seed=1)
+    hidden = next(e for e in effects if e.name == "v|v| of hinge")
+    model = AugmentedSimulator(robot.simulator, [hidden])
+    x = model.evaluate(theta, {hidden.name: torch.full((6, 1), -0.3)}, action)
+    generator = torch.Generator().manual_seed(1)
+    x = x + 1e-3 * torch.randn(x.shape, generator=generator)
+    trials = Trials(action, x, sample_times=times)
+    loop = Criticism(robot.simulator, robot.prior, trials, effects=effects)
+    tracing = loop.trace()
+    families = {e.name: e.family for e in effects}
+    assert len(effects) > 60
+    assert families[tracing.verdict] == "force in v of hinge"
+    assert hidden.name in tracing.credible_set
+    assert loop.rivals.simulator.num_simulations < 15_000

@@ -269,3 +269,30 @@ def _require_finite_draws(effect: Effect) -> None:
             f"or inf in {int(lost.any(-1).sum())} of {NUM_DRAWS}; pass a prior whose "
             "draws are numbers"
         )
+
+
+@dataclass(frozen=True)
+class UnderKey:
+    """Adds phi to a dictionary that the simulator takes as a keyword, under a key.
+
+    Attributes:
+        keyword: Of the simulator's function.
+        key: What phi belongs to, such as a force.
+        order: Center and half span of the trials' order; with it the place of the
+            trial, from -1 to 1, is the last column of phi.
+    """
+
+    keyword: str
+    key: Any
+    order: tuple[float, float] | None = None
+
+    def __call__(
+        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
+    ) -> dict[str, Any]:
+        """Return the keywords with phi added."""
+        if self.order is not None:
+            center, half = self.order
+            place = (context.index.to(phi) - center) / half
+            phi = torch.cat([phi, place[:, None]], 1)
+        others = value.get(self.keyword) or {}
+        return {**value, self.keyword: {**others, self.key: phi}}

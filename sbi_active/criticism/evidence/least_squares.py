@@ -258,6 +258,7 @@ def descend(
     *,
     center: Array | None = None,
     secant: bool = False,
+    known: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
     """Return improved starts and their cost, shapes (n, dim) and (n,).
 
@@ -270,6 +271,8 @@ def descend(
         center: Of the penalty, shape (n, dim); None has that of the prior.
         secant: Derivatives are updated from the steps made, by Broyden's rule, and not
             computed again.
+        known: Whitened residuals at the starts and their derivatives, shapes (n, N) and
+            (n, N, dim), where they need no simulation.
     """
     c, dim = rival.coordinates, rival.dim
     weight = c.precision if center is None else _floor(rival)
@@ -281,7 +284,9 @@ def descend(
     def penalized(r: Array, at: Array, rows: Array) -> Array:
         return (r**2).sum(1) + ((at - center[rows]) ** 2 * weight).sum(1)
 
-    r, jac = rival.jacobian(u, whiten, step)
+    if known is None:
+        known = rival.jacobian(u, whiten, step)
+    r, jac = (part.copy() for part in known)
     cost = penalized(r, u, np.arange(len(u)))
     rows = np.arange(len(u))
     for i in range(iterations):

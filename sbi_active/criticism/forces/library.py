@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.effect import Effect, UnderKey
 from sbi_active.criticism.effects.patterns import picked, unmatched
 from sbi_active.criticism.forces.dictionary import (
     FORMS,
@@ -26,6 +26,8 @@ from sbi_active.simulation import SimulatorModel
 
 #: How families of forces begin: their forms are alternatives of one cause.
 FAMILY = "force in "
+#: The same, of forces that depend on another joint.
+COUPLING = "coupling with "
 #: Prior deviation of a force, in root mean squares of what the motion takes.
 SHARE = 0.2
 #: On a slide the unit of q is what 90 % of the time lies within, by this.
@@ -110,14 +112,14 @@ def force_effects(
         )
     nominal = trajectories(simulator, prior, trials, seed=seed)
     known = _joints(simulator, nominal, joints, slides)
-    center, span = _range_of(trials.index)
+    order = _range_of(trials.index)
     found: list[Effect] = []
     for joint in known:
         scale = SHARE * nominal.force[joint.dof]
         for name, family, force in _forces(joint, known, nominal, free=free):
             sized = _sized(force, nominal, scale)
             if sized is not None:
-                found.append(_effect(name, family, sized, center, span))
+                found.append(_effect(name, family, sized, order))
     wanted, without = (
         [patterns] if isinstance(patterns, str) else [*patterns]
         for patterns in (include, exclude)
@@ -128,6 +130,11 @@ def force_effects(
             "which matches none; correct it"
         )
     return picked(found, wanted, without)
+
+
+def is_force(effect: Effect) -> bool:
+    """Return whether an effect is a force of the dictionary."""
+    return str(effect.family).startswith((FAMILY, COUPLING))
 
 
 def _forces(
@@ -144,7 +151,7 @@ def _forces(
         for form in ("q", "v"):
             name = f"{form} of {other.name} on {joint.name}"
             force = FormForce(joint, form, 1.0, horizon, other)
-            yield name, f"coupling with {joint.name}", force
+            yield name, f"{COUPLING}{joint.name}", force
     if free:
         for what in FREE:
             depends = "q and v" if what == "q times v" else what
@@ -166,7 +173,7 @@ def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce |
 
 
 def _effect(
-    name: str, family: str, force: FormForce, center: float, span: float
+    name: str, family: str, force: FormForce, order: tuple[float, float]
 ) -> Effect:
     dim = NUM_SHAPES if force.form.startswith("free") else 1
     return Effect(
@@ -174,29 +181,12 @@ def _effect(
         hook="dynamics",
         prior=Independent(Normal(torch.zeros(dim), torch.ones(dim)), 1),
         null=0.0,
-        apply=_Adds(force, center, span),
+        apply=UnderKey("force", force, order),
         units=f"times {force.size:.3g} {force.joint.unit}",
         family=family,
         describe=f"a generalized force, {name}",
         needs_order=force.form.startswith("trial"),
     )
-
-
-@dataclass(frozen=True)
-class _Adds:
-    """Adds a force to those of the simulator, with the place of the trial."""
-
-    force: FormForce
-    center: float
-    span: float
-
-    def __call__(
-        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
-    ) -> dict[str, Any]:
-        place = (context.index.to(phi) - self.center) / self.span
-        others = value.get("force") or {}
-        given = torch.cat([phi, place[:, None]], 1)
-        return {**value, "force": {**others, self.force: given}}
 
 
 def _range_of(index: Tensor) -> tuple[float, float]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.processes import Posterior
-from sbi_active.criticism.misfit.verdict import Misfit
+from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.steps.evaluation import joined, scores, summary
@@ -19,7 +20,29 @@ from sbi_active.seeding import derive_seed
 Array = NDArray[Any]
 
 
-def evaluate_linear(misfit: Misfit, trials: Trials) -> Evaluation | None:
+class Fitted(Protocol):
+    """Linear models, of which one is chosen."""
+
+    @property
+    def search(self) -> Search:
+        """Its models."""
+        ...
+
+    @property
+    def rivals(self) -> RivalSet:
+        """What they are models of."""
+        ...
+
+    def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
+        """Return the posterior of a model by some parts of the trials."""
+        ...
+
+    def selected_without(self, fold: int) -> ModelKey:
+        """Return the model that is chosen without one part of the trials."""
+        ...
+
+
+def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
     """Return the error on each trial of models chosen and fitted without it.
 
     The linearizations are those of all trials; evidence, left-out errors, the choice
@@ -46,12 +69,11 @@ def evaluate_linear(misfit: Misfit, trials: Trials) -> Evaluation | None:
     )
 
 
-def _prediction(misfit: Misfit, key: ModelKey, fold: int, place: int) -> Prediction:
+def _prediction(misfit: Fitted, key: ModelKey, fold: int, place: int) -> Prediction:
     """Return what a model that was fitted without a trial predicts of it."""
     search, m = misfit.search, misfit.rivals.measurements
     candidate, errors = search.found[key], search.errors
-    use = np.arange(errors.num_folds) != fold
-    posterior = errors.posterior(candidate.model, candidate.grams, use)
+    posterior = misfit.posterior(key, np.arange(errors.num_folds) != fold)
     seed = derive_seed(misfit.rivals.seed, "left out", str(key), fold)
     rng = np.random.default_rng(seed)
     whole = np.flatnonzero(errors.fold == fold)

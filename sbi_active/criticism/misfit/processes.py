@@ -112,6 +112,8 @@ class Errors:
             six the parts of trials, which are then left out in their place.
         num_folds: f.
         is_by_trial: Whether the parts are trials.
+        cells: The sensor's error in its units, with what is unknown of its correlation.
+        log_cells: Log prior probability of each, shape (c,).
         is_scored: Numbers that are predicted where their part is left out, bool, (N,).
     """
 
@@ -139,9 +141,9 @@ class Errors:
         low, high = SAMPLE * m.step, max(TRIAL * span, 2 * SAMPLE * m.step)
         num = 2 + round(np.log(high / low) / np.log(APART))
         self.times = np.geomspace(low, high, num)
-        self._cells = [_in_units(cell, unit) for cell in cells]
-        total = log_sum_exp(np.array([c.log_weight for c in self._cells]))
-        self._log_cells = np.array([c.log_weight for c in self._cells]) - total
+        self.cells = [_in_units(cell, unit) for cell in cells]
+        total = log_sum_exp(np.array([c.log_weight for c in self.cells]))
+        self.log_cells = np.array([c.log_weight for c in self.cells]) - total
         self.patterns = self._by_pattern()
 
     @property
@@ -152,9 +154,9 @@ class Errors:
     def grams(self, rows: Array) -> Grams:
         """Return the Gram matrices of rows (N, k), the sensor's errors first."""
         k, f = rows.shape[1], self.num_folds
-        num = len(self._cells) + self.num_processes
+        num = len(self.cells) + self.num_processes
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
-        for i, cell in enumerate(self._cells):
+        for i, cell in enumerate(self.cells):
             white = cell.whiten(rows.T).T
             scale = np.log(cell.sd) + 0.5 * np.log1p(-(cell.rho**2))
             log_det[i] = 2 * np.bincount(self.fold, scale, f)
@@ -163,7 +165,7 @@ class Errors:
                 gram[i, j] = own.T @ own
         for places, folds, bases in self.patterns:
             blocks = rows[places]  # (b, n, k)
-            at = len(self._cells)
+            at = len(self.cells)
             for values, vectors in bases:
                 y = np.einsum("nm,bnk->bmk", vectors, blocks)
                 product = (y[..., :, None] * y[..., None, :]).reshape(*y.shape[:2], -1)
@@ -184,6 +186,7 @@ class Errors:
         folds: Array | None = None,
         *,
         factor: float = 1.0,
+        process: bool = True,
     ) -> Posterior:
         """Return the evidence and the posterior of a model.
 
@@ -192,6 +195,7 @@ class Errors:
             grams: Of its rows.
             folds: Parts that count, bool, shape (f,); None takes all.
             factor: On the scales of the effects' priors.
+            process: Whether u is given the process; else the sensor's error alone.
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds
         gram, log_det = grams.gram[:, use].sum(1), grams.log_det[:, use].sum(1)
@@ -202,23 +206,29 @@ class Errors:
         log_z = np.stack([f[0] for f in found], 1)  # (h, widths)
         const = grams.count[use].sum() * LOG_2PI
         log_z = log_z - 0.5 * (log_det[:, None] + const) - np.log(len(WIDTHS))
-        n = len(self._cells)
-        sensor = log_sum_exp((log_z[:n] + self._log_cells[:, None]).ravel())
-        log_p = (log_z[n:] - np.log(self.num_processes)).ravel()
-        process = log_sum_exp(log_p)
-        p = np.exp(log_p - process)
-        means = np.stack([f[1] for f in found], 1)[n:].reshape(len(p), -1)
-        covs = np.stack([f[2] for f in found], 1)[n:]
+        n = len(self.cells)
+        by_sensor = (log_z[:n] + self.log_cells[:, None]).ravel()
+        by_process = (log_z[n:] - np.log(self.num_processes)).ravel()
+        log_sensor = float(log_sum_exp(by_sensor))
+        log_process = float(log_sum_exp(by_process))
+        log_p = by_process if process else by_sensor
+        p = np.exp(log_p - (log_process if process else log_sensor))
+        which = slice(n, None) if process else slice(n)
+        means = np.stack([f[1] for f in found], 1)[which].reshape(len(p), -1)
+        covs = np.stack([f[2] for f in found], 1)[which]
         covs = covs.reshape(len(p), *covs.shape[2:])
         mean = p @ means
         off = means - mean
         cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
-        by_process = p.reshape(len(KERNELS), len(self.times), len(self.sizes), -1)
-        sizes, times = by_process.sum((0, 1, 3)), by_process.sum((0, 2, 3))
+        if not process:
+            center = mean + model.center
+            return Posterior(log_sensor, log_process, center, cov, 0.0, 1.0)
+        each = p.reshape(len(KERNELS), len(self.times), len(self.sizes), -1)
+        sizes, times = each.sum((0, 1, 3)), each.sum((0, 2, 3))
         middle = int(np.searchsorted(np.cumsum(times), 0.5))
         return Posterior(
-            float(sensor),
-            float(process),
+            log_sensor,
+            log_process,
             mean + model.center,
             cov,
             float(sizes @ self.sizes),

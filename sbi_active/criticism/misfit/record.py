@@ -11,8 +11,10 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import ImportanceSample
-from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
+from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.misfit.guesses import guess_residual
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
@@ -106,22 +108,37 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
         guesses=() if choice.key.effects else guess_residual(search),
         beside=tuple(n for n in choice.key.effects if n not in named),
         misfit=found,
+        p_value=misfit.model(choice.key).chi_square[2],
     )
 
 
 def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
-    rivals = misfit.rivals
+    model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
+    return keep_draws(misfit.rivals, model, model.u, misfit.covariance(key), log_z)
+
+
+def keep_draws(
+    rivals: RivalSet, model: LinearModel, center: Array, cov: Array, log_z: float
+) -> Evidence:
+    """Return a linear model's record, and keep its draws as its posterior sample.
+
+    Args:
+        rivals: That keep them.
+        model: Fitted.
+        center: Of its posterior, shape (d,).
+        cov: Of its posterior, shape (d, d).
+        log_z: Its evidence, nats.
+    """
+    key = model.key
     if key in rivals.fits:
         return rivals.fits[key].evidence
     before = rivals.simulator.num_simulations if key.effects else 0
-    model, cov = misfit.model(key), misfit.covariance(key)
     rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(key)))
     values, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = model.u + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
+    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
     u = np.clip(u, model.low, model.high)
-    log_z = misfit.search.found[key].posterior.log_process
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
     sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS))
     rival = rivals.rival(key)
@@ -221,15 +238,25 @@ def _estimates(misfit: Misfit, evidences: dict[str, Evidence]) -> tuple[Estimate
 def _aliases(misfit: Misfit) -> tuple[frozenset[str], ...]:
     """Return pairs of effects that fit the trials nearly alike and about as well."""
     found = misfit.search.found
-    log_z = {
-        n: found[ModelKey((n,))].posterior.log_process for n in misfit.search.names
-    }
+    return alike(
+        misfit.search,
+        {n: found[ModelKey((n,))].posterior.log_process for n in misfit.search.names},
+    )
+
+
+def alike(search: Search, log_z: dict[str, float]) -> tuple[frozenset[str], ...]:
+    """Return pairs of effects that fit the trials nearly alike and about as well.
+
+    Args:
+        search: Has fitted them alone.
+        log_z: Their evidence alone.
+    """
     best = max(log_z.values(), default=-np.inf)
     likely = [n for n, value in log_z.items() if value > best - THRESHOLD]
     pairs = []
     for i, a in enumerate(likely):
         for b in likely[i + 1 :]:
-            one, two = (misfit.model(ModelKey((n,))).residual for n in (a, b))
+            one, two = (search.found[ModelKey((n,))].model.residual for n in (a, b))
             if np.mean((one - two) ** 2) < CLOSE**2:
                 pairs.append(frozenset({a, b}))
     return (*pairs,)

@@ -60,6 +60,11 @@ class Misfit:
         """Return whether a model's chi-square passes against the sensor."""
         return passes(self.model(key))
 
+    def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
+        """Return the posterior of a model by some parts of the trials."""
+        found = self.search.found[key]
+        return self.search.errors.posterior(found.model, found.grams, use)
+
     def covariance(self, key: ModelKey) -> Array:
         """Return the covariance of a model's coordinates about its best fit."""
         found = self.search.found[key]
@@ -120,6 +125,7 @@ def find_misfit(
     equivalent: Sequence[frozenset[str]] = (),
     *,
     is_known: bool = False,
+    search: Search | None = None,
 ) -> Misfit | None:
     """Return the models and what helps; None where one fits to the sensor's error.
 
@@ -130,13 +136,14 @@ def find_misfit(
         rivals: The models, whose noise is the sensor's.
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
+        search: Fits the models; None makes one.
     """
-    sensor = sensor_error(rivals)
-    if sensor is None:
-        return None
-    unit, cells = sensor
-    prior = log_priors(rivals.library, ())
-    search = Search(rivals, unit, prior, cells)
+    if search is None:
+        sensor = sensor_error(rivals)
+        if sensor is None:
+            return None
+        unit, cells = sensor
+        search = Search(rivals, unit, log_priors(rivals.library, ()), cells)
     search.fit_singles()
     square = search.found[ModelKey()].model.chi_square[0]
     rivals.look = FirstLook(search.likeliest(), square)

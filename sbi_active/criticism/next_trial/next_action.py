@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.next_trial.candidates import (
     following,
     permitted_candidates,
@@ -34,6 +35,8 @@ MAX_RIVALS = 8
 NOTHING = 0.02
 #: Information of another action that is worth a second choice, nats.
 SOMETHING = 0.1
+#: Probability that a model in question has at least.
+FEWEST = 1e-3
 #: Candidates beyond the permitted range, where the best is not asked for.
 MAX_OUTSIDE = 24
 #: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
@@ -148,6 +151,8 @@ def choose_action(
     )
     if len(named) < 2:
         return found
+    if any(is_force(e) for e in rivals.library if e.name in tracing.chosen):
+        found = _by_range(rivals, tracing, found, actions)
     groups = [g & {*named} for g in tracing.equivalent]
     if action is None:
         groups.append(frozenset(named))
@@ -178,6 +183,38 @@ def _most_telling(
         gain[others] = design.expected_information_gain.clamp_min(0.0).numpy()
         told = gain[others[design.index]]
     return (design.action.double().numpy() if told >= NOTHING else None), gain
+
+
+def _by_range(
+    rivals: RivalSet, tracing: Tracing, found: NextAction, actions: ActionSpace
+) -> NextAction:
+    """Return the choice with the best action within the range tried, and beyond it.
+
+    Within it forms of a force look alike, or the trials had told them apart; a
+    prediction beyond it rests on the form.
+    """
+    tried, gain = rivals.trials.action, found.information_gain
+    candidates = torch.from_numpy(found.candidates)
+    low, high = tried.min(0).values.double(), tried.max(0).values.double()
+    inside = ((candidates >= low) & (candidates <= high)).all(-1).numpy()
+    if inside.any():
+        best = int(np.argmax(np.where(inside, gain, -np.inf)))
+        told = float(gain[best])
+        found = replace(found, within=found.candidates[best], within_gain=told)
+    if not inside.all():
+        best = int(np.argmax(np.where(inside, -np.inf, gain)))
+        beyond, told = found.candidates[best], float(gain[best])
+    else:
+        others = outside_candidates(actions, candidates.float(), limit=MAX_OUTSIDE)
+        others = simulated(rivals, others)
+        if not len(others):
+            return found
+        names = found.separates
+        p = np.array([max(tracing.probabilities.get(n, 0.0), FEWEST) for n in names])
+        design = _select(rivals, tracing, names, p / p.sum(), others)
+        told = float(design.expected_information_gain[design.index])
+        beyond = design.action.double().numpy()
+    return replace(found, beyond=beyond, beyond_gain=max(told, 0.0))
 
 
 def _look_outside(

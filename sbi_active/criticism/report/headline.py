@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from sbi_active.criticism.forces.library import FAMILY
+from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.numbers import number, stated
 from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
 from sbi_active.criticism.report.under_misfit import misfit_line, misfit_sentences
 from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.under_misfit import UNDECLARED
 
 #: Probability from which a form of a force is named, and one from which it is listed.
 CERTAIN, SHOWN = 0.9, 0.01
@@ -25,6 +26,8 @@ def verdict_line(report: Contents) -> str:
     line += verdict_clause(tracing)
     if tracing.beside and tracing.misfit is None:
         line += f", beside {ModelKey(tracing.beside)}"
+    if tracing.stand_in:
+        line += f", a stand-in for {UNDECLARED}: {'; '.join(tracing.stand_in)}"
     if report.guess is not None:
         line += f", a guess, not declared: {report.guess}"
     if not tracing.robust:
@@ -38,25 +41,24 @@ def verdict_line(report: Contents) -> str:
 
 
 def open_form(report: Contents) -> str | None:
-    """Return the family of forces that is certain where none of its forms is."""
+    """Return the families of the forces that are chosen where no form is certain."""
     tracing = report.tracing
     families = {e.name: e.family for e in tracing.estimates}
-    if len(tracing.chosen) != 1 or tracing.inclusion[tracing.verdict] >= CERTAIN:
+    chosen = {families.get(name, "") for name in tracing.chosen}
+    p = tracing.probabilities
+    if not chosen or p.get(tracing.verdict, 0.0) >= CERTAIN:
         return None
-    family = families[tracing.verdict]
-    if not family.startswith(FAMILY):
+    if not all(family.startswith((FAMILY, COUPLING)) for family in chosen):
         return None
     shares = {
-        key: p
-        for key, p in tracing.probabilities.items()
-        if any(families.get(name) == family for name in key.split(" + "))
+        key: share
+        for key, share in p.items()
+        if chosen <= {families.get(name) for name in key.split(" + ")}
     }
-    total = sum(shares.values())
-    if total < CERTAIN:
-        return None
-    alone = {n: p for n, p in shares.items() if n in families and p >= SHOWN}
-    forms = [f"{n} ({stated(p)})" for n, p in sorted(alone.items(), key=_by_share)]
-    return f"{family} ({stated(total)}), form open: {', '.join(forms)}"
+    listed = sorted(shares.items(), key=_by_share)
+    forms = [f"{n} ({stated(share)})" for n, share in listed if share >= SHOWN]
+    cause = " and ".join(sorted(chosen))
+    return f"{cause} ({stated(sum(shares.values()))}), form open: {', '.join(forms)}"
 
 
 def _by_share(item: tuple[str, float]) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
@@ -122,7 +124,19 @@ def next_action(report: Contents) -> Section:
         text.append(_by_error(report.tracing.misfit))
     if report.severe_tests:
         text.append(SEVERE)
-    return Section(title, tuple(text), items=tuple(_inseparable(report, chosen)))
+    items = (*_by_range(report, chosen), *_inseparable(report, chosen))
+    return Section(title, tuple(text), items=items)
+
+
+def _by_range(report: Contents, chosen: NextAction) -> Iterator[str]:
+    """Yield what separates forms of a force, within the range tried and beyond it."""
+    for where, action, gain in (
+        ("within the range tried", chosen.within, chosen.within_gain),
+        ("beyond the range tried", chosen.beyond, chosen.beyond_gain),
+    ):
+        if action is not None:
+            told = f"at least {gain:.2f} nats between {joined(chosen.separates)}"
+            yield f"{where}, {setting(report.action_labels, action)}: {told}"
 
 
 def _nothing_to_tell(report: Contents, chosen: NextAction, best: float) -> str:

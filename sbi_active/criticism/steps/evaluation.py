@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
-from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.progress import stage
+from sbi_active.simulation import GaussianNoise
 
 Array = NDArray[Any]
 #: The models fitted to some trials, and what was traced in them.
@@ -28,7 +31,11 @@ DIFFERENCES = ("log predictive density", "coverage")
 
 
 def evaluate_held_out(
-    rivals: RivalSet, tracing: Tracing, held_out: Trials
+    rivals: RivalSet,
+    tracing: Tracing,
+    held_out: Trials,
+    *,
+    num_draws: int = NUM_DRAWS,
 ) -> Evaluation:
     """Return the error on held-out trials.
 
@@ -36,10 +43,11 @@ def evaluate_held_out(
         rivals: The models, fitted to other trials.
         tracing: What was traced in those.
         held_out: Trials to score.
+        num_draws: From each posterior.
     """
-    before, after = _predictions(rivals, tracing, held_out)
+    before, after = _predictions(rivals, tracing, held_out, num_draws)
     num = len(held_out)
-    return summary(
+    found = summary(
         "held out",
         np.arange(num),
         scores(before, held_out),
@@ -47,6 +55,31 @@ def evaluate_held_out(
         (tracing.verdict,) * num,
         held_out.names,
     )
+    return replace(found, p_value=tail(after, held_out)) if _is_known(rivals) else found
+
+
+def _is_known(rivals: RivalSet) -> bool:
+    """Return whether errors are Gaussian of a declared size."""
+    return (
+        isinstance(rivals.model.noise, GaussianNoise) and len(rivals.noise.scales) < 2
+    )
+
+
+def tail(prediction: Prediction, trials: Trials) -> float:
+    r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
+
+    With S the covariance of the predictions over the posterior, and R the noise, whose
+    errors are taken as independent.
+
+    Args:
+        prediction: Of some trials.
+        trials: What was measured in them.
+    """
+    x = trials.x.double().numpy().reshape(-1)[prediction.position]
+    off = prediction.mean - prediction.mean.mean(0)
+    cov = off.T @ off / (len(off) - 1) + np.diag((prediction.sd**2).mean(0))
+    error = x - prediction.mean.mean(0)
+    return float(chi2.sf(error @ np.linalg.solve(cov, error), len(error)))
 
 
 def evaluate_left_out(
@@ -82,12 +115,12 @@ def evaluate_left_out(
 
 
 def _predictions(
-    rivals: RivalSet, tracing: Tracing, trials: Trials
+    rivals: RivalSet, tracing: Tracing, trials: Trials, num_draws: int = NUM_DRAWS
 ) -> tuple[Prediction, Prediction]:
-    before = predict(rivals, trials)
+    before = predict(rivals, trials, num_draws=num_draws)
     if tracing.verdict == NONE:
         return before, before
-    return before, predict(rivals, trials, key=tracing.key)
+    return before, predict(rivals, trials, key=tracing.key, num_draws=num_draws)
 
 
 def scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import HalfNormal, Independent, Normal, Uniform
 
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.effect import Effect, UnderKey
 
 __all__ = ["force_effect", "half_normal", "model_effect", "normal", "uniform"]
 
@@ -25,7 +24,7 @@ def model_effect(name: str, change: Any, *, prior: Any, **options: Any) -> Effec
     """
     options = {"null": 0.0, **options}
     return Effect(
-        name, hook="dynamics", prior=prior, apply=_Keyword("model", change), **options
+        name, hook="dynamics", prior=prior, apply=UnderKey("model", change), **options
     )
 
 
@@ -40,22 +39,8 @@ def force_effect(name: str, force: Any, *, prior: Any, **options: Any) -> Effect
     """
     options = {"null": 0.0, **options}
     return Effect(
-        name, hook="dynamics", prior=prior, apply=_Keyword("force", force), **options
+        name, hook="dynamics", prior=prior, apply=UnderKey("force", force), **options
     )
-
-
-@dataclass(frozen=True)
-class _Keyword:
-    """Adds phi to a keyword argument of the simulator's function, under a key."""
-
-    keyword: str
-    key: Any
-
-    def __call__(
-        self, value: dict[str, Any], phi: Tensor, action: Tensor, context: Context
-    ) -> dict[str, Any]:
-        others = value.get(self.keyword) or {}
-        return {**value, self.keyword: {**others, self.key: phi}}
 
 
 def normal(sd: float) -> Independent:

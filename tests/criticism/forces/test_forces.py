@@ -88,7 +88,7 @@ def test_phi_of_one_is_a_fifth_of_the_force_of_nominal_motion(library):
     for effect in library:
         if not effect.name.startswith(("q^3", "v|v|", "sin 6 pi t")):
             continue
-        force, squares = effect.apply.force, []
+        force, squares = effect.apply.key, []
         for k, t in enumerate(found.time):
             q, v = found.q[:, k], found.v[:, k]
             phi = np.tile([1.0, 0.5], (len(q), 1))

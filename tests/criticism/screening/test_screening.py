@@ -6,7 +6,7 @@ from torch.distributions import Normal
 
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.screening import MANY, screen
+from sbi_active.criticism.screening.screening import MANY, screen
 from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, TIMES, trials
 

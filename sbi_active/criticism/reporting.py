@@ -1,0 +1,116 @@
+"""A report of all steps of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.data.sampling import Sampling
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.given import made_given
+from sbi_active.criticism.next_trial.severe_tests import severe_tests
+from sbi_active.criticism.report.report import Report, build_report
+from sbi_active.criticism.results import (
+    NONE,
+    Detection,
+    Evaluation,
+    NextAction,
+    Residuals,
+    Tracing,
+)
+from sbi_active.criticism.screening.screening import Screening
+from sbi_active.criticism.steps.evaluation import evaluate_held_out
+from sbi_active.criticism.steps.leave_one_out import leave_one_out
+from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.progress import stage
+from sbi_active.simulation import SimulatorModel
+
+
+class Steps(Protocol):
+    """The steps that a report is of, as :class:`.Criticism` has them."""
+
+    rivals: RivalSet
+    trials: Trials
+    actions: ActionSpace | None
+    show_progress: bool
+    num_summaries: int
+    sampling: Sampling | None
+    left_out: list[str]
+    screening: Screening | None
+    digest: str
+
+    def judged(self, evaluation: Evaluation | None) -> Tracing: ...  # noqa: D102
+
+    def detect(self) -> Detection: ...  # noqa: D102
+
+    def residuals(self) -> Residuals: ...  # noqa: D102
+
+    def next_action(self) -> NextAction: ...  # noqa: D102
+
+    def add(  # noqa: D102
+        self, effects: Sequence[str] | None = None
+    ) -> tuple[SimulatorModel, Distribution]: ...
+
+
+def report_of(
+    loop: Steps,
+    evaluation: Evaluation | None,
+    held_out: Trials | None,
+    *,
+    plan: bool,
+    designed: bool,
+    exploratory: bool,
+) -> Report:
+    """Return the report of all steps.
+
+    Args:
+        loop: The steps.
+        evaluation: Error before and after; None leaves it out.
+        held_out: Trials that had no part in them.
+        plan: As in :meth:`.Criticism.report`.
+        designed: The same.
+        exploratory: The same.
+    """
+    tracing = loop.judged(evaluation)
+    if tracing.refuted and held_out is not None:
+        evaluation = evaluate_held_out(loop.rivals, tracing, held_out)
+    simulator, prior = loop.add(tracing.chosen)
+    space = loop.actions if plan else None
+    next_action = None if space is None else loop.next_action()
+    with stage("residuals and tests", show_progress=loop.show_progress):
+        residuals, after = loop.residuals(), None
+        if tracing.verdict != NONE:
+            after = find_residuals(loop.rivals, tracing.key)
+        left_out = () if tracing.misfit else leave_one_out(loop.rivals, tracing)
+        tests = () if space is None else severe_tests(loop.rivals, tracing, space)
+    given = made_given(
+        loop.trials,
+        num_summaries=loop.num_summaries,
+        sampling=loop.sampling,
+        left_out=loop.left_out,
+        screening=loop.screening,
+        nuisances=[e.name for e in loop.rivals.nuisances],
+        warm_up=loop.rivals.warm_up,
+    )
+    return build_report(
+        trials=loop.trials,
+        residuals=residuals,
+        residuals_after=after,
+        detection=loop.detect(),
+        tracing=tracing,
+        simulator=simulator,
+        prior=prior,
+        evaluation=evaluation,
+        next_action=next_action,
+        actions=loop.actions,
+        digest=loop.digest,
+        designed=designed,
+        exploratory=exploratory,
+        leave_one_out=left_out,
+        severe_tests=tests,
+        warnings=(*given,),
+    )

@@ -1,0 +1,129 @@
+"""A fitted model with a column of every effect that it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.misfit.processes import Grams, Posterior
+from sbi_active.criticism.misfit.search import Search
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.combinations import log_prior
+
+Array = NDArray[Any]
+
+#: Effects whose Gram matrices are computed together.
+TOGETHER = 12
+
+
+class Library:
+    """A model at its best fit, with a column of every effect that it lacks.
+
+    Coordinates of these effects count from where their columns were taken.
+
+    Args:
+        search: Has fitted the model.
+        base: Of the model; the bare one unless given.
+        names: Of the effects; all unless given.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        base: ModelKey = ModelKey(),  # noqa: B008  (frozen)
+        names: Sequence[str] | None = None,
+    ) -> None:
+        self.search, self.base = search, base
+        every = [n for n in search.names if n not in base.effects]
+        self.names = every if names is None else [*names]
+        self.fitted = search.found[base].model
+        self._singles: dict[str, LinearModel] = {}
+        self._blocks: dict[str, NDArray[np.bool_]] = {}
+        for name in self.names:
+            self._singles[name], self._blocks[name] = search.beside(base, name)
+        self._grams: Grams | None = None
+        self._places: dict[str, NDArray[np.intp]] = {}
+        self._found: dict[tuple[str, ...], Posterior] = {}
+
+    def prepare(self, names: Sequence[str]) -> None:
+        """Compute once what all pairs of some effects take."""
+        dim = 1 + len(self.fitted.u)
+        for name in names:
+            width = int(self._blocks[name].sum())
+            self._places[name] = np.arange(dim, dim + width)
+            dim += width
+        self._grams = self.search.errors.grams(self._model(names).rows)
+
+    def column(self, name: str) -> tuple[Array, Array]:
+        """Return phi where an effect's column was taken, and that, (k,) and (N, k)."""
+        model, own = self._singles[name], self._blocks[name]
+        return model.u[own], model.jacobian[:, own]
+
+    def look_at_each(self) -> None:
+        """Compute the posterior of each effect alone, several at a time."""
+        for start in range(0, len(self.names), TOGETHER):
+            some = self.names[start : start + TOGETHER]
+            self.prepare(some)
+            for name in some:
+                self._posterior((name,))
+        self._grams, self._places = None, {}
+
+    def score(self, names: tuple[str, ...]) -> float:
+        """Return the log posterior probability of a set, unnormalized."""
+        every = (*self.base.effects, *names)
+        return self._posterior(names).log_evidence + log_prior(every, self.search.prior)
+
+    def remains(self, name: str) -> float:
+        """Return the rms of the simulator's residual at an effect's linear optimum."""
+        model, own = self._singles[name], self._blocks[name]
+        mean = self._posterior((name,)).mean
+        u = np.empty(len(model.u))
+        u[~own], u[own] = mean[: (~own).sum()], mean[(~own).sum() :] + model.u[own]
+        return self.search.rms(model.key, np.clip(u, model.low, model.high))
+
+    def _posterior(self, names: tuple[str, ...]) -> Posterior:
+        if names not in self._found:
+            model, errors = self._model(names), self.search.errors
+            self._found[names] = errors.posterior(model, self._grams_of(names, model))
+        return self._found[names]
+
+    def _grams_of(self, names: tuple[str, ...], model: LinearModel) -> Grams:
+        if self._grams is None or any(n not in self._places for n in names):
+            return self.search.errors.grams(model.rows)
+        at = np.arange(1 + len(self.fitted.u))
+        at = np.concatenate([at, *[self._places[n] for n in names]])
+        gram = self._grams.gram[..., at[:, None], at]
+        return Grams(gram, self._grams.log_det, self._grams.count)
+
+    def _model(self, names: Sequence[str]) -> LinearModel:
+        """Return the model with the columns of some effects after its own."""
+        fitted = self.fitted
+        parts = [(self._singles[n], self._blocks[n]) for n in names]
+
+        def joined(field: str) -> Array:
+            own = [getattr(model, field)[block] for model, block in parts]
+            return np.concatenate([getattr(fitted, field), *own])
+
+        def shifted(field: str) -> Array:
+            own = [(getattr(m, field) - m.u)[block] for m, block in parts]
+            return np.concatenate([getattr(fitted, field), *own])
+
+        columns = [model.jacobian[:, block] for model, block in parts]
+        null = [np.zeros(block.sum()) for _, block in parts]
+        return LinearModel(
+            key=ModelKey(tuple(names)),
+            u=np.concatenate([fitted.u, *null]),
+            residual=fitted.residual,
+            jacobian=np.concatenate([fitted.jacobian, *columns], 1),
+            center=shifted("center"),
+            sd=joined("sd"),
+            scaled=joined("scaled"),
+            low=shifted("low"),
+            high=shifted("high"),
+            own=fitted.own,
+            trial_of=joined("trial_of"),
+        )

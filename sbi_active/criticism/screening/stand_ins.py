@@ -1,0 +1,58 @@
+"""Whether a force of the dictionary explains the trials, or stands in for what does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.results import Evaluation, Tracing
+from sbi_active.criticism.steps.influence import unless_refuted, withdrawn
+
+#: Tail probability of the chi-square below which a model is not adopted, on fitted
+#: trials and on others.
+LEVEL, HELD_OUT = 0.01, 0.01
+#: Log Bayes factor of a residual process above which a model does not explain all.
+PROCESS = 1.1
+
+
+def judged(
+    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+) -> Tracing:
+    """Return what was traced, and whether its forces are stand-ins.
+
+    A force is adopted as an explanation only where the chi-square of its model has a
+    tail probability of at least .01, and the error on trials that had no part in it
+    falls. One with which that error rises is withdrawn.
+
+    Args:
+        rivals: The models.
+        tracing: Which effects the data point to.
+        evaluation: Error before and after on trials that had no part in it.
+    """
+    tracing = unless_refuted(tracing, evaluation)
+    effects = {e.name: e for e in rivals.library}
+    if not any(is_force(effects[name]) for name in tracing.chosen):
+        return tracing
+    if evaluation is not None:
+        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
+        if rmse["ratio"] >= 1:
+            return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+    return replace(tracing, stand_in=(*_reasons(rivals, tracing, evaluation),))
+
+
+def _reasons(
+    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+) -> Iterator[str]:
+    if tracing.p_value < LEVEL:
+        yield f"its chi-square has p = {tracing.p_value:.2g}"
+    if evaluation is not None and evaluation.p_value < HELD_OUT:
+        yield f"that of held-out trials has p = {evaluation.p_value:.2g}"
+    if any(name.startswith("free") for name in tracing.chosen):
+        yield "its form is free"
+    families = [e.family for e in rivals.library if e.name in tracing.chosen]
+    if len({*families}) < len(families):
+        yield "it takes several forms of one family"
+    if tracing.log_process > PROCESS:
+        yield f"a residual process beside it gains {tracing.log_process:.1f} nats"
