@@ -191,7 +191,7 @@ class MujocoFunction:
         num = num_steps(times, begin, step)
         width = base.nu + base.nsensordata + base.nq + base.nv + 1
         size = max(1, NUMBERS // (num * width))
-        if rows.forces:
+        if rows.is_stepped:
             size = min(size, TOGETHER)
         numbers = np.arange(len(rows), dtype=float)[:, None]
         places = [c.place for c in self.channels]

@@ -1,7 +1,8 @@
 """Rows of a machine, stepped: what its sensors read at every step.
 
-Without forces of a caller MuJoCo's own rollout runs each row to its end. With them all
-rows go step by step together, so that a force is computed once a step for all.
+Without forces of a caller, or changes that follow the state, MuJoCo's own rollout runs
+each row to its end. With them all rows go step by step together, so that a force is
+computed once a step for all.
 
 A sensor's reading belongs to the state before a step: reading k is at time k h.
 """
@@ -13,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.mujoco.models.changes import StateChange
+from sbi_active.mujoco.models.fields import field_of
 from sbi_active.mujoco.models.machine import Model, Rows
-from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.spec import mujoco_of
 
 __all__ = ["readings", "start_states"]
@@ -36,7 +39,7 @@ def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -
     """
     start = start_states(model, rows)
     _settle(model, models, rows, start)
-    run = _stepped if rows.forces else _rolled_out
+    run = _stepped if rows.is_stepped else _rolled_out
     x, finished = run(model, models, start, rows, threads)
     x[~finished] = np.nan
     return x
@@ -106,6 +109,7 @@ def _stepped(
     controls = [d.ctrl for d in datas]
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
+    following = _Following(model, models, datas, rows)
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
             now = np.stack(q)[:, model.positions]
@@ -113,12 +117,64 @@ def _stepped(
             total = np.zeros((len(rows), model.base.nv))
             for force, phi in rows.forces.items():
                 total[:, model.velocities] += force(now, speed, k * step, phi)
+            changed = following.changed(q, v)
             for i in np.flatnonzero(going).tolist():
                 controls[i][:] = rows.controls[i, k]
                 applied[i][:] = total[i]
+                for field, places, numbers in changed[i]:
+                    for place, number in zip(places, numbers, strict=True):
+                        field[place] = number
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
                 bad = [d.warning.number.any() for d in datas]
                 going &= ~np.array(bad)
+    following.restore()
     return x, going & np.isfinite(x).all((1, 2))
+
+
+class _Following:
+    """Entries of each row's model that follow the state of its joints."""
+
+    def __init__(
+        self, model: Model, models: list[Any], datas: list[Any], rows: Rows
+    ) -> None:
+        self.loads = [d.qfrc_actuator for d in datas]
+        base, changes = model.base, [*rows.changes.items()]
+        self.parts = []
+        for change, phi in changes:
+            if not isinstance(change, StateChange):
+                continue
+            joints = [element_id(base, "joint", name) for name in change.joints()]
+            at, dofs = base.jnt_qposadr[joints], base.jnt_dofadr[joints]
+            self.parts.append((change, phi, at, dofs))
+        # Changes of one field add up. Rows of the same numbers share a model: what it
+        # has is looked up before any of them runs.
+        self.fields = {}
+        for name in dict.fromkeys(part[0].fields()[0] for part in self.parts):
+            own = [p[3] for p in self.parts if p[0].fields()[0] == name]
+            dofs = np.unique(np.concatenate(own))
+            fields = [field_of(each, name) for each in models]
+            self.fields[name] = fields, dofs, np.array([f[dofs] for f in fields])
+
+    def changed(self, q: list[Array], v: list[Array]) -> list[list[Any]]:
+        """Return fields, places and numbers that are to be written, by row."""
+        found: list[list[Any]] = [[] for _ in self.loads]
+        if not self.parts:
+            return found
+        at, speed, load = np.stack(q), np.stack(v), np.stack(self.loads)
+        for name, (fields, dofs, before) in self.fields.items():
+            total = before.copy()
+            for change, phi, places, own in self.parts:
+                if change.fields()[0] == name:
+                    state = at[:, places], speed[:, own], load[:, own]
+                    total[:, np.searchsorted(dofs, own)] += change.values(*state, phi)
+            for i, numbers in enumerate(total.tolist()):
+                found[i].append((fields[i], dofs.tolist(), numbers))
+        return found
+
+    def restore(self) -> None:
+        """Write back what the models had."""
+        for fields, dofs, before in self.fields.values():
+            for field, values in zip(fields, before, strict=True):
+                field[dofs] = values
