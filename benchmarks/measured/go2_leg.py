@@ -30,7 +30,8 @@ FIRST = (0, 601, 1163, 1684, 2165, 2606, 3008, 3370, 3692, 3973, 4215, 4415, 457
 FITTED = 8
 KP, KD = 20.0, 1.5  # N m/rad and N m s/rad, of the drive
 PERIOD = 0.005  # s
-STEPS = 3  # of the simulation in a period
+STEPS = 2  # of the simulation in a period
+EVERY = 5  # readings that are fitted by the loop: what it gets wrong is smooth
 #: Samples to each side from which the speed at a triangle's start is read.
 AROUND = 4
 #: Encoder, rad: a jitter of .25 ms of its time at the speeds of the fitted triangles.
@@ -38,7 +39,7 @@ ENCODER_SD = 5e-4
 #: What the simulator gets wrong, rad, and the time over which it does, s.
 SD, CORRELATION_TIME = (1e-3, 0.2), (0.01, 3.0)
 #: Lets dry friction hold: with MuJoCo's default a joint that is held creeps.
-SOLREF, SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001, 0.5, 2.0)
+SOLREF, SOLIMP = (0.005, 1.0), (0.99, 0.999, 0.001, 0.5, 2.0)
 
 
 #: Bounds: of a rotor, kg m^2; of damping, N m s/rad; of dry friction, N m; of the
@@ -99,7 +100,7 @@ class Leg:
         spec.option.timestep = PERIOD / STEPS
         return spec
 
-    def log(self, begin: int, end: int) -> dict[str, Array]:
+    def log(self, begin: int, end: int, every: int = 1) -> dict[str, Array]:
         """Return some samples as a recording, from the state at the first.
 
         The speed is the slope of a line through the readings around it.
@@ -107,6 +108,7 @@ class Leg:
         Args:
             begin: First sample.
             end: The one behind the last.
+            every: Readings that are kept; the goals all are.
         """
         rows = slice(begin, end)
         log: dict[str, Array] = {"time": self.time[rows] - self.time[begin]}
@@ -115,7 +117,8 @@ class Leg:
         names = zip(self.joints, self.motors, strict=True)
         for k, (joint, motor) in enumerate(names):
             log[motor] = self.goal[rows, k]
-            log[joint] = self.position[rows, k]
+            read = np.arange(end - begin) % every == 0
+            log[joint] = np.where(read, self.position[rows, k], np.nan)
             log[f"start {joint}"] = self.position[rows, k]
             log[f"start {joint} velocity"] = np.full(end - begin, slopes[k])
         return log
@@ -141,7 +144,8 @@ class Leg:
     def triangles(self) -> list[dict[str, Array]]:
         """Return the logs of the triangles that are fitted."""
         ends = FIRST[1 : FITTED + 1]
-        return [self.log(a, b) for a, b in zip(FIRST[:FITTED], ends, strict=True)]
+        pairs = zip(FIRST[:FITTED], ends, strict=True)
+        return [self.log(begin, end, EVERY) for begin, end in pairs]
 
     def free_run(
         self, parameters: Mapping[str, Any], effects: Sequence[Effect], values: Tensor
@@ -204,9 +208,7 @@ def usual_parameters(leg: Leg, *, rigid: bool = False) -> dict[str, Any]:
         return found
     found |= {f"{j}.damping": DAMPING for j in leg.joints}
     found |= {f"{j}.frictionloss": FRICTION for j in leg.joints}
-    return found | {
-        f"{m} torque scale": (*SCALE, _TorqueScale(m)) for m in leg.motors
-    }
+    return found | {f"{m} torque scale": (*SCALE, _TorqueScale(m)) for m in leg.motors}
 
 
 def read_leg(folder: str | Path, name: str) -> Leg:

@@ -269,9 +269,7 @@ def _neighbors(z: Array) -> tuple[float, int]:
     return float(np.corrcoef(first, second)[0, 1]), len(first)
 
 
-def _at_edge(
-    tracing: Tracing, effects: Sequence[Effect]
-) -> list[tuple[Effect, Array]]:
+def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, Array]]:
     """Return effects of the verdict whose phi is at its edge given all, and phi."""
     evidence = tracing.evidences.get(tracing.model)
     found = []

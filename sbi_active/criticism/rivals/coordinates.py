@@ -174,6 +174,9 @@ class SearchCoordinates:
         for effect in self.joint.effects:
             own = slice(at, at + effect.phi_dim)
             least, most = dissipative_bounds(effect)
-            low[own], high[own] = np.maximum(low[own], least), np.minimum(high[own], most)
+            low[own], high[own] = (
+                np.maximum(low[own], least),
+                np.minimum(high[own], most),
+            )
             at += effect.phi_dim
         return low, high

@@ -30,17 +30,20 @@ Array = NDArray[Any]
 BY_LOAD = 0.2
 #: Speed at which static friction has fallen to 1 / e, in root mean squares of the speed.
 TURNING = 0.1
-#: Places in the range at which friction by position is told.
-KNOTS = 3
 
 
 @dataclass(frozen=True)
 class FrictionChange(StateChange):
     r"""Adds dry friction to joints.
 
-    By position, :math:`\phi_1, \phi_2, \phi_3` at the lower end, the middle and the
-    upper end of the range in which a joint moves, linear between and constant beyond;
-    by load, of the actuators' force on the joint, :math:`F = \phi |\tau|`; or static
+    By position, more towards either end of the range in which a joint moves,
+
+    .. math::
+        F = \phi_1 (1 - w)^2 + \phi_2 w^2, \qquad
+        w = \mathrm{clip}\Bigl(\frac{q - q_{low}}{q_{high} - q_{low}}, 0, 1\Bigr),
+
+    of which no part is constant, so that it is told from a plain friction loss; by
+    load, of the actuators' force on the joint, :math:`F = \phi |\tau|`; or static
     (Stribeck), :math:`F = \phi e^{-|v| / v_s}`. No phi is negative, so that all of
     them dissipate. Writes ``dof_frictionloss`` before every step.
 
@@ -73,9 +76,8 @@ class FrictionChange(StateChange):
         if self.what == "speed":
             return phi * np.exp(-np.abs(v) / self.speed)
         low, high = np.array(self.low), np.array(self.high)
-        place = np.clip((q - low) / (high - low), 0.0, 1.0) * (KNOTS - 1)
-        apart = np.abs(place[..., None] - np.arange(KNOTS))  # (n, joints, knots)
-        return (np.clip(1 - apart, 0.0, None) * phi[:, None]).sum(-1)
+        share = np.clip((q - low) / (high - low), 0.0, 1.0)
+        return phi[:, :1] * (1 - share) ** 2 + phi[:, 1:] * share**2
 
 
 def of_friction(
@@ -99,12 +101,12 @@ def of_friction(
         yield model_effect(
             f"{group.label} friction loss by position",
             FrictionChange(group.names, "position", low, high),
-            prior=half_normal(force, KNOTS),
+            prior=half_normal(force, 2),
             units=unit,
             family="friction",
             describe=(
-                f"dry friction in {group.label} that depends on its position, from "
-                f"{_listed(low)} to {_listed(high)}"
+                f"dry friction in {group.label} that depends on its position, larger "
+                f"by phi_1 at {_listed(low)} and by phi_2 at {_listed(high)}"
             ),
         )
     yield model_effect(

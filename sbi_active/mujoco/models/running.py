@@ -110,20 +110,23 @@ def _stepped(
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
     following = _Following(model, models, datas, rows)
+    given = [*rows.controls]
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
-            now = np.stack(q)[:, model.positions]
-            speed = np.stack(v)[:, model.velocities]
-            total = np.zeros((len(rows), model.base.nv))
-            for force, phi in rows.forces.items():
-                total[:, model.velocities] += force(now, speed, k * step, phi)
-            changed = following.changed(q, v)
+            if rows.forces:
+                now = np.stack(q)[:, model.positions]
+                speed = np.stack(v)[:, model.velocities]
+                total = np.zeros((len(rows), model.base.nv))
+                for force, phi in rows.forces.items():
+                    total[:, model.velocities] += force(now, speed, k * step, phi)
+                for one, value in zip(applied, total, strict=True):
+                    one[:] = value
+            tables = following.tables(q, v)
             for i in np.flatnonzero(going).tolist():
-                controls[i][:] = rows.controls[i, k]
-                applied[i][:] = total[i]
-                for field, places, numbers in changed[i]:
-                    for place, number in zip(places, numbers, strict=True):
-                        field[place] = number
+                controls[i][:] = given[i][k]
+                for fields, dofs, table in tables:
+                    for dof, number in zip(dofs, table[i], strict=True):
+                        fields[i][dof] = number
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
@@ -140,41 +143,44 @@ class _Following:
         self, model: Model, models: list[Any], datas: list[Any], rows: Rows
     ) -> None:
         self.loads = [d.qfrc_actuator for d in datas]
-        base, changes = model.base, [*rows.changes.items()]
-        self.parts = []
-        for change, phi in changes:
-            if not isinstance(change, StateChange):
-                continue
-            joints = [element_id(base, "joint", name) for name in change.joints()]
-            at, dofs = base.jnt_qposadr[joints], base.jnt_dofadr[joints]
-            self.parts.append((change, phi, at, dofs))
+        own, base = [], model.base
+        for change, phi in rows.changes.items():
+            if isinstance(change, StateChange):
+                joints = [element_id(base, "joint", name) for name in change.joints()]
+                places = base.jnt_qposadr[joints], base.jnt_dofadr[joints]
+                own.append((change, phi, *places))
         # Changes of one field add up. Rows of the same numbers share a model: what it
         # has is looked up before any of them runs.
-        self.fields = {}
-        for name in dict.fromkeys(part[0].fields()[0] for part in self.parts):
-            own = [p[3] for p in self.parts if p[0].fields()[0] == name]
-            dofs = np.unique(np.concatenate(own))
+        self.parts = []
+        for name in dict.fromkeys(one[0].fields()[0] for one in own):
+            some = [one for one in own if one[0].fields()[0] == name]
+            dofs = np.unique(np.concatenate([one[3] for one in some]))
+            some = [(*one, np.searchsorted(dofs, one[3])) for one in some]
             fields = [field_of(each, name) for each in models]
-            self.fields[name] = fields, dofs, np.array([f[dofs] for f in fields])
+            before = np.array([field[dofs] for field in fields])
+            self.parts.append((fields, dofs.tolist(), before, some))
 
-    def changed(self, q: list[Array], v: list[Array]) -> list[list[Any]]:
-        """Return fields, places and numbers that are to be written, by row."""
-        found: list[list[Any]] = [[] for _ in self.loads]
+    def tables(self, q: list[Array], v: list[Array]) -> list[tuple[Any, Any, Any]]:
+        """Return fields by row, entries, and the numbers that each row has there.
+
+        Args:
+            q: Positions of each row.
+            v: Velocities.
+        """
         if not self.parts:
-            return found
+            return []
         at, speed, load = np.stack(q), np.stack(v), np.stack(self.loads)
-        for name, (fields, dofs, before) in self.fields.items():
+        found = []
+        for fields, dofs, before, changes in self.parts:
             total = before.copy()
-            for change, phi, places, own in self.parts:
-                if change.fields()[0] == name:
-                    state = at[:, places], speed[:, own], load[:, own]
-                    total[:, np.searchsorted(dofs, own)] += change.values(*state, phi)
-            for i, numbers in enumerate(total.tolist()):
-                found[i].append((fields[i], dofs.tolist(), numbers))
+            for change, phi, places, own, among in changes:
+                state = at[:, places], speed[:, own], load[:, own]
+                total[:, among] += change.values(*state, phi)
+            found.append((fields, dofs, total.tolist()))
         return found
 
     def restore(self) -> None:
         """Write back what the models had."""
-        for fields, dofs, before in self.fields.values():
+        for fields, dofs, before, _ in self.parts:
             for field, values in zip(fields, before, strict=True):
                 field[dofs] = values

@@ -1,0 +1,199 @@
+"""The Go2's legs: what rigid legs with friction lack, from one record in the air.
+
+    python -m benchmarks.measured.go2 --data DIR
+    python -m benchmarks.measured.go2 --data DIR --legs FL --figures docs/measured_go2
+
+``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints, from
+3.0 to .6 s. Each leg is fitted to the first eight and judged on the five faster ones,
+in one free run of the whole record from its first reading on. Stages of each leg, which
+are added to ``results/go2.json`` unless they are there:
+
+- ``FL``: the engineer's model, with armature, viscous damping, dry friction and a
+  torque scale of each joint, against all of ``mjcf_effects``.
+- ``FL, NAME removed``: the same without the effects that the first stage named.
+- ``FL, rigid legs``: armature and the PD law alone, in rounds: what a round says that
+  helps is in the simulator of the next, until nothing does.
+- ``FL, forces``: the library of generalized forces on the knee, with free shapes.
+
+Beside the verdicts plain least squares, given the same effects.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.criticism.scores import counted
+from benchmarks.measured.go2_least_squares import fit_leg
+from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
+from benchmarks.measured.go2_tables import tables
+from benchmarks.measured.record_verdicts import read_report
+from sbi_active.criticism import Effect, close_loop
+from sbi_active.mujoco import Robot, force_effects, mjcf_effects
+
+__all__ = ["judge", "main"]
+
+RESULT = Path(__file__).parent / "results" / "go2.json"
+ROUNDS = 5
+
+
+def judge(
+    leg: Leg,
+    library: Callable[[Robot], Sequence[Effect]],
+    *,
+    rigid: bool = False,
+    rounds: int = 1,
+    seed: int = 0,
+    folder: Path | None = None,
+) -> dict[str, Any]:
+    """Return the row of one verdict, or of some in turn.
+
+    Args:
+        leg: That is fitted.
+        library: Effects of a robot.
+        rigid: Start from armature and the PD law alone.
+        rounds: Verdicts at most, each with what helped before in the simulator.
+        seed: Of all draws.
+        folder: Where whole reports go.
+    """
+    parameters = usual_parameters(leg, rigid=rigid)
+    robot = leg.robot(parameters, leg.triangles())
+    begin = time.process_time()
+    effects = [*library(robot)]
+    model, count = counted(robot.simulator)
+    prior, found, before, adopted = robot.prior, [], None, []
+    assert robot.trials is not None
+    for k in range(rounds):
+        left = [e for e in effects if e not in adopted]
+        report = close_loop(
+            *(model, prior, robot.trials),
+            effects=left,
+            thin=False,  # readings are chosen by hand
+            evaluate=False,
+            seed=seed,
+        )
+        if folder is not None:
+            report.save(folder / f"round_{k + 1}" if rounds > 1 else folder)
+        read = read_report(report, prior.event_shape[0])
+        adopted += [e for n in read.helps for e in effects if e.name == n]
+        values = read.after
+        run = leg.free_run(parameters, adopted, values)[0]
+        row = {**read.row, "helps": [*read.helps], "text": read.text}
+        row |= {"values": values[0].tolist(), "after": leg.errors(run)}
+        if before is None:
+            before = leg.free_run(parameters, [], read.before)[0]
+            row["before"] = leg.errors(before)
+            row["bare values"] = read.before[0].tolist()
+        found.append(row)
+        if not read.helps:
+            break
+        model, prior = report.simulator, report.prior
+    last = {"values": found[-1]["values"], "after": found[-1]["after"]}
+    row = {**found[0], **last, "helps": [e.name for e in adopted]}
+    if rounds > 1:
+        row["rounds"] = found
+    return row | {
+        "cpu_seconds": time.process_time() - begin,
+        "trial_simulations": count(),
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the stages that are missing from the results, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--legs", nargs="+", choices=LEGS, default=LEGS)
+    parser.add_argument("--stages", nargs="+", help="as in 'removed', 'rigid legs'")
+    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--reports", type=Path, help="folder for whole reports")
+    parser.add_argument("--figures", type=Path, help="folder for the figure")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args(argv)
+    try:
+        legs = [read_leg(arguments.data, name) for name in arguments.legs]
+    except FileNotFoundError as error:
+        print(f"{error}, as in --data DIR", file=sys.stderr)
+        return 2
+    rows: dict[str, Any] = {}
+    if arguments.out.is_file():
+        rows = json.loads(arguments.out.read_text())
+    for leg in legs:
+        for name, row in _stages(leg, rows, arguments):
+            rows[name] = row
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
+            if "line" in row:
+                print(f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s")
+            sys.stdout.flush()
+    print(tables(rows))
+    if arguments.figures is not None:
+        from benchmarks.measured.go2_figures import draw
+
+        for leg in legs:
+            draw(rows[leg.name], leg, arguments.figures)
+    return 0
+
+
+def _library(leg: Leg, removed: Sequence[str] = ()) -> Callable[..., list[Effect]]:
+    """Return what lists the effects of the engineer's model, which has the gains."""
+    gone = [f"{motor} gain" for motor in leg.motors]
+    return lambda robot: mjcf_effects(robot, exclude=[*gone, *removed])
+
+
+def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
+    """Yield the name and the row of each stage that is missing."""
+    seed, own = arguments.seed, leg.name
+
+    def folder(name: str) -> Path | None:
+        return arguments.reports and arguments.reports / name.replace(", ", "_")
+
+    def wanted(stage: str) -> bool:
+        name = f"{own}, {stage}" if stage else own
+        chosen = arguments.stages is None or stage in arguments.stages
+        return name not in rows and (chosen or not stage)
+
+    def judged(name: str, library: Any, **options: Any) -> Any:
+        row = judge(leg, library, seed=seed, folder=folder(name), **options)
+        return name, row
+
+    if wanted(""):
+        yield judged(own, _library(leg))
+    helps = rows[own]["helps"]
+    if wanted("removed"):
+        yield judged(f"{own}, removed", _library(leg, helps))
+    if wanted("least squares"):
+        given = dict.fromkeys([(), (*helps,), *[(name,) for name in helps]])
+        yield f"{own}, least squares", _least_squares(leg, [*given])
+    if own == LEGS[0] and wanted("rigid legs"):
+        every = lambda robot: mjcf_effects(robot)  # noqa: E731
+        yield judged(f"{own}, rigid legs", every, rigid=True, rounds=ROUNDS)
+    if own == LEGS[0] and wanted("forces"):
+        knee = f"*of {leg.joints[-1]}"
+        yield judged(f"{own}, forces", lambda robot: force_effects(robot, include=knee))
+
+
+def _least_squares(leg: Leg, sets: Sequence[tuple[str, ...]]) -> dict[str, Any]:
+    """Return fits of the engineer's model, given some sets of effects."""
+    parameters = usual_parameters(leg)
+    robot = leg.robot(parameters, leg.triangles())
+    names = sorted({name for each in sets for name in each})
+    effects = {e.name: e for e in mjcf_effects(robot, include=names)} if names else {}
+    found = {}
+    for each in sets:
+        found[" + ".join(each) or "none"] = fit_leg(
+            leg, parameters, [effects[name] for name in each]
+        )
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
