@@ -3,9 +3,9 @@
     python -m benchmarks.measured.go2 --data DIR
     python -m benchmarks.measured.go2 --data DIR --legs FL --figures docs/measured_go2
 
-``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints, from
-3.0 to .6 s. Each leg is fitted to the first eight and judged on the five faster ones,
-in one free run of the whole record from its first reading on. Stages of each leg, which
+``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints,
+from 3.0 to 0.6 s. Each leg is fitted to the first eight and judged on the five faster
+ones, in one free run of the whole record from its first reading on. Stages of each leg, which
 are added to ``results/go2.json`` unless they are there:
 
 - ``FL``: the engineer's model, with armature, viscous damping, dry friction and a
@@ -27,8 +27,6 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from benchmarks.criticism.scores import counted
 from benchmarks.measured.go2_least_squares import fit_leg

@@ -20,7 +20,7 @@ from sbi_active.simulation import AutocorrelatedNoise
 
 __all__ = ["DATA", "FITTED", "JOINTS", "LEGS", "Leg", "read_leg", "usual_parameters"]
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 DATA = Path("../shared/data/go2_in_air")
 LEGS = ("FL", "FR", "RL", "RR")

@@ -153,6 +153,7 @@ def test_the_loop_names_friction_that_depends_on_the_position():
             *("hinge quadratic damping", "hinge zero offset", "gravity tilt y"),
         ],
     )
+    assert robot.trials is not None
     report = close_loop(*robot[:2], robot.trials, effects=effects, evaluate=False)
     assert report.verdict == "hinge friction loss by position"
     assert "depends on its position" in str(report)

@@ -28,7 +28,7 @@ Array = NDArray[Any]
 #: One prior deviation of friction by load, as a share of the load: a gear's
 #: inefficiency.
 BY_LOAD = 0.2
-#: Speed at which static friction has fallen to 1 / e, in root mean squares of the speed.
+#: Speed at which static friction has fallen to 1 / e, in root mean squares of it.
 TURNING = 0.1
 
 
