@@ -5,8 +5,8 @@
 
 ``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints,
 from 3.0 to 0.6 s. Each leg is fitted to the first eight and judged on the five faster
-ones, in one free run of the whole record from its first reading on. Stages of each leg, which
-are added to ``results/go2.json`` unless they are there:
+ones, in one free run of the whole record from its first reading on. Stages of each
+leg, which are added to ``results/go2.json`` unless they are there:
 
 - ``FL``: the engineer's model, with armature, viscous damping, dry friction and a
   torque scale of each joint, against all of ``mjcf_effects``.
