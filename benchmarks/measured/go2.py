@@ -9,7 +9,8 @@ ones, in one free run of the whole record from its first reading on. Stages of e
 leg, which are added to ``results/go2.json`` unless they are there:
 
 - ``FL``: the engineer's model, with armature, viscous damping, dry friction and a
-  torque scale of each joint, against all of ``mjcf_effects``.
+  torque scale of each joint, against what ``mjcf_effects`` lists of the knee, its motor
+  and its encoder, and the tilt of the base.
 - ``FL, NAME removed``: the same without the effects that the first stage named.
 - ``FL, rigid legs``: armature and the PD law alone, in rounds: what a round says that
   helps is in the simulator of the next, until nothing does.
@@ -40,6 +41,9 @@ __all__ = ["judge", "main"]
 
 RESULT = Path(__file__).parent / "results" / "go2.json"
 ROUNDS = 5
+#: Of a joint.
+KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffness")
+KINDS += ("zero offset", "sensor bias", "sensor delay")
 
 
 def judge(
@@ -142,9 +146,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _library(leg: Leg, removed: Sequence[str] = ()) -> Callable[..., list[Effect]]:
-    """Return what lists the effects of the engineer's model, which has the gains."""
-    gone = [f"{motor} gain" for motor in leg.motors]
-    return lambda robot: mjcf_effects(robot, exclude=[*gone, *removed])
+    """Return what lists the effects on the knee of the engineer's model.
+
+    That has the torque scale of the motor already, "gain" by another name. What moves
+    the body behind the joint by a second one is left out for what it costs.
+    """
+    joint, motor = leg.joints[-1], leg.motors[-1]
+    wanted = [*(f"{joint} {kind}" for kind in KINDS), "gravity tilt *"]
+    wanted += [f"{motor} {kind}" for kind in ("bias", "delay")]
+    return lambda robot: mjcf_effects(robot, include=wanted, exclude=removed)
 
 
 def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
