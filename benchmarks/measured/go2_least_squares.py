@@ -78,7 +78,7 @@ def fit_leg(
     found = least_squares(
         lambda x: residual(x[None])[0],
         x0,
-        jac=jacobian,
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
         bounds=(low, high),
         x_scale=scale,
         max_nfev=EVALUATIONS,
