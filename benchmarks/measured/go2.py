@@ -10,8 +10,8 @@ leg, which are added to ``results/go2.json`` unless they are there:
 
 - ``FL``: the engineer's model, with armature, viscous damping, dry friction and a
   torque scale of each joint, against what ``mjcf_effects`` lists of the knee, its motor
-  and its encoder, and the tilt of the base.
-- ``FL, NAME removed``: the same without the effects that the first stage named.
+  and its encoder, and the tilt of the base; of the other legs against five of these.
+- ``FL, removed``: against these five without the effects that the first stage adopted.
 - ``FL, rigid legs``: armature and the PD law alone, in rounds: what a round says that
   helps is in the simulator of the next, until nothing does.
 - ``FL, forces``: the library of generalized forces on the knee, with free shapes.
@@ -44,6 +44,8 @@ ROUNDS = 5
 #: Of a joint.
 KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffness")
 KINDS += ("zero offset", "sensor bias", "sensor delay")
+#: The same for the other legs, and with an effect removed: what was near on the first.
+FEW_KINDS = ("friction loss by *", "static friction", "quadratic damping")
 
 
 def judge(
@@ -145,15 +147,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _library(leg: Leg, removed: Sequence[str] = ()) -> Callable[..., list[Effect]]:
+def _library(
+    leg: Leg, removed: Sequence[str] = (), *, few: bool = False
+) -> Callable[..., list[Effect]]:
     """Return what lists the effects on the knee of the engineer's model.
 
     That has the torque scale of the motor already, "gain" by another name. What moves
     the body behind the joint by a second one is left out for what it costs.
     """
     joint, motor = leg.joints[-1], leg.motors[-1]
-    wanted = [*(f"{joint} {kind}" for kind in KINDS), "gravity tilt *"]
-    wanted += [f"{motor} {kind}" for kind in ("bias", "delay")]
+    kinds = FEW_KINDS if few else KINDS
+    wanted = [*(f"{joint} {kind}" for kind in kinds), f"{motor} delay"]
+    wanted += [] if few else [f"{motor} bias", "gravity tilt *"]
     return lambda robot: mjcf_effects(robot, include=wanted, exclude=removed)
 
 
@@ -174,10 +179,10 @@ def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
         return name, row
 
     if wanted(""):
-        yield judged(own, _library(leg))
+        yield judged(own, _library(leg, few=own != LEGS[0]))
     helps = rows[own]["helps"]
     if wanted("removed"):
-        yield judged(f"{own}, removed", _library(leg, helps))
+        yield judged(f"{own}, removed", _library(leg, helps, few=True))
     if wanted("least squares"):
         given = dict.fromkeys([(), (*helps,), *[(name,) for name in helps]])
         yield f"{own}, least squares", _least_squares(leg, [*given])
