@@ -29,12 +29,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from benchmarks.criticism.scores import counted
 from benchmarks.measured.go2_least_squares import fit_leg
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
 from benchmarks.measured.go2_tables import tables
-from benchmarks.measured.record_verdicts import read_report
-from sbi_active.criticism import Effect, close_loop
+from sbi_active.criticism import Criticism, Effect
+from sbi_active.criticism.results import ModelKey, Tracing
 from sbi_active.mujoco import Robot, force_effects, mjcf_effects
 
 __all__ = ["judge", "main"]
@@ -55,7 +57,6 @@ def judge(
     rigid: bool = False,
     rounds: int = 1,
     seed: int = 0,
-    folder: Path | None = None,
 ) -> dict[str, Any]:
     """Return the row of one verdict, or of some in turn.
 
@@ -65,7 +66,6 @@ def judge(
         rigid: Start from armature and the PD law alone.
         rounds: Verdicts at most, each with what helped before in the simulator.
         seed: Of all draws.
-        folder: Where whole reports go.
     """
     parameters = usual_parameters(leg, rigid=rigid)
     robot = leg.robot(parameters, leg.triangles())
@@ -74,31 +74,32 @@ def judge(
     model, count = counted(robot.simulator)
     prior, found, before, adopted = robot.prior, [], None, []
     assert robot.trials is not None
-    for k in range(rounds):
+    for _ in range(rounds):
         left = [e for e in effects if e not in adopted]
-        report = close_loop(
+        # The report's residuals, each trial predicted from those before, would take as
+        # long as the verdict.
+        loop = Criticism(
             *(model, prior, robot.trials),
             effects=left,
             thin=False,  # readings are chosen by hand
-            evaluate=False,
             seed=seed,
         )
-        if folder is not None:
-            report.save(folder / f"round_{k + 1}" if rounds > 1 else folder)
-        read = read_report(report, prior.event_shape[0])
-        adopted += [e for n in read.helps for e in effects if e.name == n]
-        values = read.after
+        tracing = loop.trace()
+        adopted += [e for n in tracing.chosen for e in effects if e.name == n]
+        values = _mean(tracing, ModelKey(tracing.chosen))
         run = leg.free_run(parameters, adopted, values)[0]
-        row = {**read.row, "helps": [*read.helps], "text": read.text}
-        row |= {"values": values[0].tolist(), "after": leg.errors(run)}
+        row = _row(tracing) | {
+            "values": values[0].tolist(),
+            "after": leg.errors(run),
+        }
         if before is None:
-            before = leg.free_run(parameters, [], read.before)[0]
-            row["before"] = leg.errors(before)
-            row["bare values"] = read.before[0].tolist()
+            bare = _mean(tracing, ModelKey())
+            before = leg.errors(leg.free_run(parameters, [], bare)[0])
+            row |= {"before": before, "bare values": bare[0].tolist()}
         found.append(row)
-        if not read.helps:
+        if not tracing.chosen:
             break
-        model, prior = report.simulator, report.prior
+        model, prior = loop.add()
     last = {"values": found[-1]["values"], "after": found[-1]["after"]}
     row = {**found[0], **last, "helps": [e.name for e in adopted]}
     if rounds > 1:
@@ -106,6 +107,34 @@ def judge(
     return row | {
         "cpu_seconds": time.process_time() - begin,
         "trial_simulations": count(),
+    }
+
+
+def _mean(tracing: Tracing, key: ModelKey) -> torch.Tensor:
+    """Return the posterior mean of a model's parameters and strengths, (1, d)."""
+    draws = tracing.evidences[str(key)].draws
+    return torch.from_numpy(draws.mean(0, keepdims=True))
+
+
+def _row(tracing: Tracing) -> dict[str, Any]:
+    """Return a verdict as plain figures."""
+    misfit, helps = tracing.misfit, tracing.chosen
+    evidence = tracing.evidences[str(ModelKey(helps))]
+    cause = tracing.inclusion if misfit is None else misfit.cause
+    describe = {e.name: e.describe for e in tracing.estimates}
+    return {
+        "verdict": tracing.verdict,
+        "line": f"Verdict: {tracing.verdict}",
+        "named": [*(helps if misfit is None else misfit.named)],
+        "helps": [*helps],
+        "describe": [describe[name] for name in helps],
+        "cause": {name: float(cause.get(name, 0.0)) for name in tracing.inclusion},
+        "better": {} if misfit is None else dict(misfit.better),
+        "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
+        "parameters": {
+            name: [float(z.mean()), float(z.std())]
+            for name, z in zip(evidence.names, evidence.draws.T, strict=True)
+        },
     }
 
 
@@ -118,7 +147,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--legs", nargs="+", choices=LEGS, default=LEGS)
     parser.add_argument("--stages", nargs="+", help="as in 'removed', 'rigid legs'")
     parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--reports", type=Path, help="folder for whole reports")
     parser.add_argument("--figures", type=Path, help="folder for the figure")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args(argv)
@@ -166,16 +194,13 @@ def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
     """Yield the name and the row of each stage that is missing."""
     seed, own = arguments.seed, leg.name
 
-    def folder(name: str) -> Path | None:
-        return arguments.reports and arguments.reports / name.replace(", ", "_")
-
     def wanted(stage: str) -> bool:
         name = f"{own}, {stage}" if stage else own
         chosen = arguments.stages is None or stage in arguments.stages
         return name not in rows and (chosen or not stage)
 
     def judged(name: str, library: Any, **options: Any) -> Any:
-        row = judge(leg, library, seed=seed, folder=folder(name), **options)
+        row = judge(leg, library, seed=seed, **options)
         return name, row
 
     if wanted(""):
