@@ -10,8 +10,8 @@ leg, which are added to ``results/go2.json`` unless they are there:
 
 - ``FL``: the engineer's model, with armature, viscous damping, dry friction and a
   torque scale of each joint, against what ``mjcf_effects`` lists of the knee, its motor
-  and its encoder, and the tilt of the base; of the other legs against five of these.
-- ``FL, removed``: against these five without the effects that the first stage adopted.
+  and its encoder, and the tilt of the base; of the other legs against four of these.
+- ``FL, removed``: against these four without the effects that the first stage adopted.
 - ``FL, rigid legs``: armature and the PD law alone, in rounds: what a round says that
   helps is in the simulator of the next, until nothing does.
 - ``FL, forces``: the library of generalized forces on the knee, with free shapes.
@@ -47,7 +47,7 @@ ROUNDS = 5
 KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffness")
 KINDS += ("zero offset", "sensor bias", "sensor delay")
 #: The same for the other legs, and with an effect removed: what was near on the first.
-FEW_KINDS = ("friction loss by *", "static friction", "quadratic damping")
+FEW_KINDS = ("friction loss by *", "static friction")
 
 
 def judge(
