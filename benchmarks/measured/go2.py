@@ -206,11 +206,11 @@ def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
     if wanted(""):
         yield judged(own, _library(leg, few=own != LEGS[0]))
     helps = rows[own]["helps"]
+    if wanted("least squares"):
+        given = dict.fromkeys([(), (*helps,)])
+        yield f"{own}, least squares", _least_squares(leg, [*given])
     if wanted("removed"):
         yield judged(f"{own}, removed", _library(leg, helps, few=True))
-    if wanted("least squares"):
-        given = dict.fromkeys([(), (*helps,), *[(name,) for name in helps]])
-        yield f"{own}, least squares", _least_squares(leg, [*given])
     if own == LEGS[0] and wanted("rigid legs"):
         every = lambda robot: mjcf_effects(robot)  # noqa: E731
         yield judged(f"{own}, rigid legs", every, rigid=True, rounds=ROUNDS)
