@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.mujoco.models.changes import require_changes
+from sbi_active.mujoco.models.changes import StateChange, require_changes
 from sbi_active.mujoco.models.machine import Machine, Model, Rows
 from sbi_active.mujoco.models.names import names_of, require_name, start_places
 from sbi_active.mujoco.models.running import readings
@@ -28,6 +28,9 @@ Watch = Callable[[Model, list[Any], Rows], Any]
 NUMBERS = 4_000_000
 #: Rows that are stepped together, each with data of its own.
 TOGETHER = 64
+#: Rows of one length from which they run apart from longer ones, on average: of
+#: MuJoCo's rollout, and of those that are stepped together, where few cost as many.
+FEWEST = (1, 16)
 #: Entry of an action that says which of several models runs.
 MODEL = "model"
 #: Entry of an action that is the number of a recording.
@@ -152,10 +155,10 @@ class MujocoFunction:
         found = np.empty((num, wanted.shape[1], len(self.channels)))
         changes = require_changes("model", model)
         forces = require_changes("force", force)
-        for k, machine in enumerate(self.machines):
-            own = np.flatnonzero(which == k)
-            if not len(own):
-                continue
+        begin = 0.0 if grid is None else float(grid[0])
+        is_stepped = bool(forces) or any(isinstance(c, StateChange) for c in changes)
+        for k, own in _alike(which, wanted - begin, FEWEST[is_stepped]):
+            machine = self.machines[k]
             rows = Rows(
                 _array(theta)[own],
                 {c: phi[own] for c, phi in changes.items()},
@@ -191,7 +194,7 @@ class MujocoFunction:
         num = num_steps(times, begin, step)
         width = base.nu + base.nsensordata + base.nq + base.nv + 1
         size = max(1, NUMBERS // (num * width))
-        if rows.forces:
+        if rows.is_stepped:
             size = min(size, TOGETHER)
         numbers = np.arange(len(rows), dtype=float)[:, None]
         places = [c.place for c in self.channels]
@@ -263,6 +266,28 @@ class MujocoFunction:
             require_name(name, known, "joint, or one with ' velocity',")
             found[name] = _array(value)
         return found
+
+
+def _alike(
+    which: Array, times: Array, fewest: int
+) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Yield a model's number and rows that it runs for as long as each other.
+
+    Args:
+        which: Model of each row, (n,).
+        times: Of its readings since the start, (n, k).
+        fewest: Rows of one length, on average, from which lengths run apart.
+    """
+    last = np.nanmax(times, 1, initial=0.0)
+    for k in np.unique(which):
+        mine = np.flatnonzero(which == k)
+        lasting = np.unique(last[mine])
+        # Recordings differ in length; where every row does, parts would be too small.
+        if len(lasting) * fewest > len(mine):
+            yield int(k), mine
+            continue
+        for length in lasting:
+            yield int(k), mine[last[mine] == length]
 
 
 def _array(value: Tensor) -> Array:

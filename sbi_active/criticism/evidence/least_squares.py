@@ -16,6 +16,8 @@ from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
+#: Times that coordinates are held at their bounds, or let go, in a step.
+HELD = 20
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
@@ -297,7 +299,7 @@ def descend(
         diagonal = np.einsum("njj->nj", normal)
         lift = damping[rows, None] * diagonal + 1e-8
         system = normal + lift[:, :, None] * np.eye(dim)
-        move = np.linalg.solve(system, gradient[..., None])[..., 0]
+        move = within(system, gradient, u[rows], c.low, c.high)
         new = np.clip(u[rows] - np.where(free, move, 0.0), c.low, c.high)
         linear = np.einsum("nij,nj->ni", part, new - u[rows])
         expected = cost[rows] - penalized(r[rows] + linear, new, rows)
@@ -319,3 +321,40 @@ def descend(
             _, jac[won] = rival.jacobian(u[won], whiten, step)
         damping[rows] = damping[rows] * np.where(better, 0.15, 10.0)
     return u, cost
+
+
+def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) -> Array:
+    """Return the steps of normal equations, (n, dim), along the bounds they stand at.
+
+    A coordinate that a step would take beyond its bound is held, and the others are
+    found again: clipped alone, it would leave them where they are right only with it.
+
+    Args:
+        system: Shape (n, dim, dim).
+        gradient: Shape (n, dim).
+        u: Shape (n, dim).
+        low: Lower bounds, shape (dim,).
+        high: Upper bounds.
+
+    References:
+        Bertsekas, SIAM Journal on Control and Optimization 20 (1982).
+    """
+    move = np.linalg.solve(system, gradient[..., None])[..., 0]
+    # Of a coordinate at its upper bound, signs turn around.
+    side = (u <= low).astype(float) - (u >= high)
+    for i in np.flatnonzero((side * move > 0).any(1)):
+        held = np.zeros(u.shape[1], dtype=bool)
+        for _ in range(HELD):
+            out = ~held & (side[i] * move[i] > 0)
+            # What is held, and would now be better off inside.
+            pull = side[i] * (gradient[i] - system[i] @ move[i])
+            back = held & (pull < 0) & (not out.any())
+            if not out.any() and not back.any():
+                break
+            if back.any():
+                back &= pull == pull[back].min()
+            held = (held | out) & ~back
+            move[i] = 0.0
+            open_ = np.ix_(~held, ~held)
+            move[i, ~held] = np.linalg.solve(system[i][open_], gradient[i, ~held])
+    return move

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.evidence.least_squares import within
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Errors
 
@@ -19,6 +20,8 @@ Array = NDArray[Any]
 
 #: Factor on the scale of effects' priors in refits, which are to follow the trials.
 WIDTH = 3.0
+#: Of a search within bounds, each of which ends at one or at the best x.
+STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -76,10 +79,9 @@ def leave_out(
     total = gram.sum(0)
     prior = np.diag(1 / model.widened(WIDTH) ** 2)
     without = total - gram
-    refits = np.linalg.solve(without[:, 1:, 1:] + prior, without[:, 1:, :1])[..., 0]
-    fit = np.linalg.solve(total[1:, 1:] + prior, total[1:, 0])
     low, high = model.low - model.center, model.high - model.center
-    refits, fit = np.clip(refits, low, high), np.clip(fit, low, high)
+    refits = bounded(without[:, 1:, 1:] + prior, without[:, 1:, 0], low, high)
+    fit = bounded((total[1:, 1:] + prior)[None], total[None, 1:, 0], low, high)[0]
     if not errors.is_scored.all():
         refits = _with_nuisances(refits, scaled, prior, model, errors)
     error = rows[:, 0] - (rows[:, 1:] * refits[errors.fold]).sum(1)
@@ -93,6 +95,31 @@ def leave_out(
         refits + model.center,
         fit + model.center,
     )
+
+
+def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
+    r"""Return the x within bounds that minimize :math:`x^T A x / 2 - b^T x`, (n, d).
+
+    Clipped alone, the best x without bounds would leave other coordinates where they
+    are right only with what was clipped.
+
+    Args:
+        system: A, shape (n, d, d), positive definite.
+        right: b, shape (n, d).
+        low: Shape (d,).
+        high: Shape (d,).
+    """
+    free = np.linalg.solve(system, right[..., None])[..., 0]
+    x = np.clip(free, low, high)
+    some = np.flatnonzero((x != free).any(1))
+    for _ in range(STEPS if len(some) else 0):
+        gradient = np.einsum("nij,nj->ni", system[some], x[some]) - right[some]
+        new = x[some] - within(system[some], gradient, x[some], low, high)
+        new = np.clip(new, low, high)
+        if np.allclose(new, x[some], rtol=1e-9, atol=1e-12):
+            break
+        x[some] = new
+    return x
 
 
 def _with_nuisances(

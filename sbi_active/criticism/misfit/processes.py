@@ -268,10 +268,15 @@ def integrated(
     sd = model.widened(width)
     g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
     precision = sd[:, None] * g * sd + np.eye(len(sd))
-    cov = np.linalg.inv(precision)
+    # Columns of very different size, as of what jumps, keep their digits in units of
+    # their own.
+    size = np.sqrt(np.einsum("hii->hi", precision))
+    own = size[:, :, None] * size[:, None]
+    cov = np.linalg.inv(precision / own) / own
     mean = np.einsum("hij,hj->hi", cov, sd * b)
     log_z = -0.5 * (rr - (sd * b * mean).sum(1))
-    log_z = log_z - 0.5 * np.linalg.slogdet(precision)[1]
+    log_det = np.linalg.slogdet(precision / own)[1] + 2 * np.log(size).sum(1)
+    log_z = log_z - 0.5 * log_det
     mean, cov = sd * mean, sd[:, None] * cov * sd
     low, high = model.low - model.center, model.high - model.center
     some = np.isfinite(low) | np.isfinite(high)

@@ -12,6 +12,7 @@ from scipy.stats import rankdata
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
+from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.report.section import called
 from sbi_active.criticism.report.suspects import of_noise, of_trials
 from sbi_active.criticism.results import (
@@ -33,6 +34,8 @@ Array = NDArray[Any]
 ALIASED = 0.9  # |rank correlation| of an action with the order of the trials
 #: Quantile of an effect's prior beyond which an estimate lies at its edge.
 EDGE = 0.99
+#: Families of effects that blame an instrument, beside those on what is observed.
+INSTRUMENTS = ("sensor", "geometry")
 #: Effective samples below which, and standard error in nats above which, an evidence
 #: is called uncertain; models below the probability are left out.
 FEW_SAMPLES, UNCERTAIN, NEGLIGIBLE = 50, 0.5, 0.01
@@ -211,9 +214,16 @@ def _of_verdict(
     edge = _at_edge(tracing, effects)
     if edge:
         yield (
-            f"phi at its prior's edge ({', '.join(edge)}): the effect is stronger than "
-            "declared, or stands in for another"
+            f"phi at its prior's edge ({', '.join(e.name for e, _ in edge)}): the "
+            "effect is stronger than declared, or stands in for another"
         )
+    for effect, phi in edge:
+        if effect.hook == "observation" or effect.family in INSTRUMENTS:
+            size = f"{number(float(phi[np.argmax(np.abs(phi))]))} {effect.units}"
+            yield (
+                f"{effect.name} of {size.strip()} is more than an instrument gets "
+                "wrong: it stands in for something else, however well it predicts"
+            )
     if not tracing.robust:
         yield (
             "not robust to its prior: effect priors a third or three times as wide "
@@ -259,20 +269,19 @@ def _neighbors(z: Array) -> tuple[float, int]:
     return float(np.corrcoef(first, second)[0, 1]), len(first)
 
 
-def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[str]:
-    """Return effects of the verdict whose phi, given all of them, is at its edge."""
+def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, Array]]:
+    """Return effects of the verdict whose phi is at its edge given all, and phi."""
     evidence = tracing.evidences.get(tracing.model)
-    if evidence is None:
-        return []
-    return [
-        effect.name
-        for effect in effects
-        if effect.name in tracing.chosen
-        and _is_extreme(
-            effect,
-            evidence.draws[:, [evidence.names.index(n) for n in effect.phi_names]],
-        )
-    ]
+    found = []
+    for effect in effects if evidence is not None else ():
+        if effect.name not in tracing.chosen:
+            continue
+        assert evidence is not None
+        columns = [evidence.names.index(name) for name in effect.phi_names]
+        phi = evidence.draws[:, columns]
+        if _is_extreme(effect, phi):
+            found.append((effect, phi.mean(0)))
+    return found
 
 
 def _is_extreme(effect: Effect, phi: Array) -> bool:

@@ -52,6 +52,7 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
             f"{n[0].upper()}{n[1:]}: probably the cause ({_share(misfit, n)})."
             for n in named
         ]
+    found += _described(report, misfit.helps)
     verb = "Adding" if not named else "With"
     found.append(
         f"{verb} {ModelKey(misfit.helps)} the error on left-out {misfit.left_out} goes "
@@ -68,6 +69,16 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
         change = _change(report, bare.held_out, model.held_out)
         found.append(f"On held-out trials: {change}.")
     return " ".join(found)
+
+
+def _described(report: Contents, names: Sequence[str]) -> list[str]:
+    """Return on what each effect depends, a sentence each."""
+    return [
+        f"{e.name}: {e.describe.rstrip('.')}."
+        for name in names
+        for e in report.tracing.estimates
+        if e.name == name and e.describe
+    ]
 
 
 def _guessed(report: Contents) -> str:

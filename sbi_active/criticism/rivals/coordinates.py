@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import JointPrior
+from sbi_active.criticism.rivals.energy import dissipative_bounds
 from sbi_active.inference.sampling.coordinates import support_bounds
 from sbi_active.seeding import forked_generators
 
@@ -30,7 +31,8 @@ class SearchCoordinates:
     .. math::
         u_j = (t_j(z_j) - a_j) / b_j, \qquad t_j = \log \text{ or identity},
 
-    with a and b the mean and deviation of the prior's draws. Bounds stay bounds.
+    with a and b the mean and deviation of the prior's draws. Bounds stay bounds, and a
+    force has one where beyond it it would feed energy without end (:mod:`.energy`).
 
     Args:
         prior: Of theta.
@@ -167,5 +169,14 @@ class SearchCoordinates:
             pairs.append(
                 (np.tile(low, self.num_trials), np.tile(high, self.num_trials))
             )
-        low, high = zip(*pairs, strict=True)
-        return np.concatenate(low), np.concatenate(high)
+        low, high = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+        at = self.joint.sizes[0]
+        for effect in self.joint.effects:
+            own = slice(at, at + effect.phi_dim)
+            least, most = dissipative_bounds(effect)
+            low[own], high[own] = (
+                np.maximum(low[own], least),
+                np.minimum(high[own], most),
+            )
+            at += effect.phi_dim
+        return low, high

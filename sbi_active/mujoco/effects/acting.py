@@ -48,9 +48,9 @@ def normal(sd: float) -> Independent:
     return Independent(Normal(_one(0.0), _one(sd)), 1)
 
 
-def half_normal(sd: float) -> Independent:
-    """Return a half-normal prior of one number."""
-    return Independent(HalfNormal(_one(sd)), 1)
+def half_normal(sd: float, num: int = 1) -> Independent:
+    """Return a half-normal prior of some numbers, independent of each other."""
+    return Independent(HalfNormal(_one(sd).repeat(num)), 1)
 
 
 def uniform(low: float, high: float) -> Independent:

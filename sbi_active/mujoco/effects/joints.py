@@ -12,6 +12,7 @@ from sbi_active.mujoco.effects.acting import (
     model_effect,
     normal,
 )
+from sbi_active.mujoco.effects.frictions import of_friction
 from sbi_active.mujoco.effects.insertions import Transmission, least_compliance
 from sbi_active.mujoco.effects.nominal import Nominal
 from sbi_active.mujoco.effects.powers import PowerForce
@@ -65,6 +66,7 @@ def of_joints(group: Group, sizes: Nominal) -> Iterator[Effect]:
         family="friction",
         describe=f"dry friction in {group.label}",
     )
+    yield from of_friction(group, sizes, force, unit)
     yield make(
         "viscous damping",
         change("damping"),

@@ -61,9 +61,9 @@ def mjcf_effects(
     ============= ==================================================================
     of            effects
     ============= ==================================================================
-    joints        friction loss, viscous, quadratic and cubic damping, stiffness,
-                  quadratic and cubic stiffness, armature, zero offset, backlash,
-                  series elasticity
+    joints        friction loss, the same by position and by load, static friction,
+                  viscous, quadratic and cubic damping, stiffness, quadratic and cubic
+                  stiffness, armature, zero offset, backlash, series elasticity
     actuators     gain, bias, back-EMF, saturation; delay and lag of signals
     sensors       bias, gain, delay, lag, quantum
     bodies        payload, center of mass x, y, z

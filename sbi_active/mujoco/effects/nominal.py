@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.mujoco.models.machine import Rows
-from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.running import start_states
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.simulator import MujocoFunction
@@ -35,6 +35,8 @@ class Nominal:
     Attributes:
         model: At these parameters.
         position: Half the range that 90 % of the time is spent in, (nv,), rad or m.
+        lowest: Lower end of all of it, (nv,), as a hinge or slide is read.
+        highest: Upper end.
         velocity: Root mean square, (nv,).
         force: Root of the mean square of gravity and inertia, of actuators and of
             passive forces, (nv,), N m or N.
@@ -48,6 +50,8 @@ class Nominal:
 
     model: Any
     position: Array
+    lowest: Array
+    highest: Array
     velocity: Array
     force: Array
     inertia: Array
@@ -88,6 +92,8 @@ def nominal(
         Nominal(
             model,
             position=_positive(0.5 * (high - low), SPREAD),
+            lowest=together["q"].min(0) + _zeros(model),
+            highest=together["q"].max(0) + _zeros(model),
             velocity=_positive(_rms(together["v"]), 1.0),
             force=_positive(np.sqrt(sum(parts)), 1.0),
             inertia=together["inertia"].mean(0),
@@ -191,6 +197,16 @@ def _scalars(model: Any, data: Any) -> Array:
     away = np.zeros(model.nv)
     mujoco_of().mj_differentiatePos(model, away, 1.0, model.qpos0, data.qpos)
     return away
+
+
+def _zeros(model: Any) -> Array:
+    """Return what joints read where :func:`_scalars` counts from, (nv,)."""
+    zeros = np.zeros(model.nv)
+    for name, place in start_places(model).items():
+        if place < model.nq and "[" not in name:
+            joint = element_id(model, "joint", name)
+            zeros[model.jnt_dofadr[joint]] = model.qpos0[place]
+    return zeros
 
 
 def _rms(value: Array) -> Array:

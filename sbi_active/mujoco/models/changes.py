@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from sbi_active.criticism.forces.force import Force
 
-__all__ = ["Force", "Insertion", "ModelChange", "require_changes"]
+__all__ = ["Force", "Insertion", "ModelChange", "StateChange", "require_changes"]
 
 Array = NDArray[Any]
 
@@ -65,6 +66,34 @@ class Insertion(ModelChange):
             data: At the start, its forces computed.
             phi: Shape (k,).
         """
+
+
+class StateChange(ModelChange):
+    """A change that follows the state of joints: added to theirs before every step.
+
+    What a force cannot do, such as hold a joint still by dry friction that depends on
+    where it is, MuJoCo's own solver then does. Rows with such a change are stepped
+    together, as those with a :class:`Force`.
+    """
+
+    @abstractmethod
+    def joints(self) -> tuple[str, ...]:
+        """Return the hinges and slides whose entries of its one field it changes."""
+
+    @abstractmethod
+    def values(self, q: Array, v: Array, load: Array, phi: Array) -> Array:
+        """Return what is added for each joint, shape (n, joints).
+
+        Args:
+            q: Their positions, shape (n, joints).
+            v: Their velocities.
+            load: Forces of the actuators on them in the step before.
+            phi: Shape (n, k).
+        """
+
+    @override
+    def write(self, model: Any, phi: Array) -> None:
+        """Write nothing before the state is known."""
 
 
 def require_changes(name: str, value: Any) -> dict[Any, Array]:

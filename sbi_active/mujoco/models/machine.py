@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.mujoco.models.changes import Insertion, ModelChange
+from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.fields import copied, restore
 from sbi_active.mujoco.models.names import start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
@@ -45,6 +45,13 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.theta)
+
+    @property
+    def is_stepped(self) -> bool:
+        """Whether something must be computed between the steps."""
+        return bool(self.forces) or any(
+            isinstance(change, StateChange) for change in self.changes
+        )
 
     def at(self, rows: Any) -> Rows:
         """Return some rows."""

@@ -1,7 +1,8 @@
 """Rows of a machine, stepped: what its sensors read at every step.
 
-Without forces of a caller MuJoCo's own rollout runs each row to its end. With them all
-rows go step by step together, so that a force is computed once a step for all.
+Without forces of a caller, or changes that follow the state, MuJoCo's own rollout runs
+each row to its end. With them all rows go step by step together, so that a force is
+computed once a step for all.
 
 A sensor's reading belongs to the state before a step: reading k is at time k h.
 """
@@ -13,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.mujoco.models.changes import StateChange
+from sbi_active.mujoco.models.fields import field_of
 from sbi_active.mujoco.models.machine import Model, Rows
-from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.spec import mujoco_of
 
 __all__ = ["readings", "start_states"]
@@ -36,7 +39,7 @@ def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -
     """
     start = start_states(model, rows)
     _settle(model, models, rows, start)
-    run = _stepped if rows.forces else _rolled_out
+    run = _stepped if rows.is_stepped else _rolled_out
     x, finished = run(model, models, start, rows, threads)
     x[~finished] = np.nan
     return x
@@ -106,19 +109,78 @@ def _stepped(
     controls = [d.ctrl for d in datas]
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
+    following = _Following(model, models, datas, rows)
+    given = [*rows.controls]
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
-            now = np.stack(q)[:, model.positions]
-            speed = np.stack(v)[:, model.velocities]
-            total = np.zeros((len(rows), model.base.nv))
-            for force, phi in rows.forces.items():
-                total[:, model.velocities] += force(now, speed, k * step, phi)
+            if rows.forces:
+                now = np.stack(q)[:, model.positions]
+                speed = np.stack(v)[:, model.velocities]
+                total = np.zeros((len(rows), model.base.nv))
+                for force, phi in rows.forces.items():
+                    total[:, model.velocities] += force(now, speed, k * step, phi)
+                for one, value in zip(applied, total, strict=True):
+                    one[:] = value
+            tables = following.tables(q, v)
             for i in np.flatnonzero(going).tolist():
-                controls[i][:] = rows.controls[i, k]
-                applied[i][:] = total[i]
+                controls[i][:] = given[i][k]
+                for fields, dofs, table in tables:
+                    for dof, number in zip(dofs, table[i], strict=True):
+                        fields[i][dof] = number
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
                 bad = [d.warning.number.any() for d in datas]
                 going &= ~np.array(bad)
+    following.restore()
     return x, going & np.isfinite(x).all((1, 2))
+
+
+class _Following:
+    """Entries of each row's model that follow the state of its joints."""
+
+    def __init__(
+        self, model: Model, models: list[Any], datas: list[Any], rows: Rows
+    ) -> None:
+        self.loads = [d.qfrc_actuator for d in datas]
+        own, base = [], model.base
+        for change, phi in rows.changes.items():
+            if isinstance(change, StateChange):
+                joints = [element_id(base, "joint", name) for name in change.joints()]
+                places = base.jnt_qposadr[joints], base.jnt_dofadr[joints]
+                own.append((change, phi, *places))
+        # Changes of one field add up. Rows of the same numbers share a model: what it
+        # has is looked up before any of them runs.
+        self.parts = []
+        for name in dict.fromkeys(one[0].fields()[0] for one in own):
+            some = [one for one in own if one[0].fields()[0] == name]
+            dofs = np.unique(np.concatenate([one[3] for one in some]))
+            some = [(*one, np.searchsorted(dofs, one[3])) for one in some]
+            fields = [field_of(each, name) for each in models]
+            before = np.array([field[dofs] for field in fields])
+            self.parts.append((fields, dofs.tolist(), before, some))
+
+    def tables(self, q: list[Array], v: list[Array]) -> list[tuple[Any, Any, Any]]:
+        """Return fields by row, entries, and the numbers that each row has there.
+
+        Args:
+            q: Positions of each row.
+            v: Velocities.
+        """
+        if not self.parts:
+            return []
+        at, speed, load = np.stack(q), np.stack(v), np.stack(self.loads)
+        found = []
+        for fields, dofs, before, changes in self.parts:
+            total = before.copy()
+            for change, phi, places, own, among in changes:
+                state = at[:, places], speed[:, own], load[:, own]
+                total[:, among] += change.values(*state, phi)
+            found.append((fields, dofs, total.tolist()))
+        return found
+
+    def restore(self) -> None:
+        """Write back what the models had."""
+        for fields, dofs, before, _ in self.parts:
+            for field, values in zip(fields, before, strict=True):
+                field[dofs] = values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from sbi_active.criticism.evidence.importance import INFLATION
 from sbi_active.criticism.evidence.least_squares import (
@@ -12,6 +13,7 @@ from sbi_active.criticism.evidence.least_squares import (
     along_ridges,
     find_modes,
     local_proposal,
+    within,
 )
 from tests.criticism.evidence.linear import exact, linear_rival
 
@@ -70,3 +72,18 @@ def test_along_a_ridge_points_stay_where_the_data_put_them():
         np.linalg.det(proposal.factors)
         <= np.linalg.det(modes.proposal.factors[0]) * (1 + 1e-6)
     ).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_steps_along_bounds_end_where_the_bounded_least_squares_is(seed):
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(20, 5)) + rng.normal(size=(20, 1))
+    target = rng.normal(size=20)
+    low, high = np.zeros(5), np.full(5, np.inf)
+    system, right = (matrix.T @ matrix)[None], matrix.T @ target
+    u = np.zeros((1, 5))
+    for _ in range(20):
+        gradient = (system[0] @ u[0] - right)[None]
+        u = np.clip(u - within(system, gradient, u, low, high), low, high)
+    assert u[0] == pytest.approx(nnls(matrix, target)[0], abs=1e-9)
+    assert (u[0] == 0).any()  # or the bounds would not matter

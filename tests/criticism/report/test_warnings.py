@@ -192,6 +192,15 @@ CASES: dict[str, tuple[Callable[[], Report], Callable[[], Report]]] = {
         replace(usual, order="unknown", effects=(bias(), DRIFT)).report,
         replace(usual, effects=(bias(), DRIFT)).report,
     ),
+    "is more than an instrument gets wrong": (
+        replace(
+            usual,
+            num=12,
+            effects=(bias(0.25), CUBIC),
+            missing=lambda a: 0.8 - 0.4 * a**3,
+        ).report,
+        usual.report,
+    ),
     "phi at its prior's edge (bias)": (
         replace(
             usual,

@@ -1,0 +1,79 @@
+"""The Go2's legs: what is read, what is run, and the tables."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.measured.go2 import main
+from benchmarks.measured.go2_leg import FITTED, read_leg, usual_parameters
+from benchmarks.measured.go2_tables import tables
+from sbi_active.mujoco import mjcf_effects
+
+DATA = Path(__file__).parents[2] / "../shared/data/go2_in_air"
+
+needs_data = pytest.mark.skipif(
+    not (DATA / "trajectory.csv").is_file(),
+    reason=f"needs the files of go2_in_air in {DATA}",
+)
+
+
+@pytest.fixture(scope="module")
+def leg():
+    return read_leg(DATA, "FL")
+
+
+@needs_data
+def test_a_leg_is_alone_and_its_trials_are_the_slow_triangles(leg):
+    model = leg.spec().compile()
+    assert (model.nq, model.nu) == (3, 3)
+    robot = leg.robot(usual_parameters(leg), leg.triangles())
+    assert len(robot.trials) == FITTED
+    x = robot.trials.x.numpy()
+    read = np.isfinite(x).all(2)
+    assert read.sum() == pytest.approx(leg.split / 5, abs=FITTED)
+    knee = x[read][:, 2]
+    assert (knee > -2.5).all()
+    assert (knee < -1.2).all()
+
+
+@needs_data
+def test_friction_by_position_follows_the_knee_where_a_constant_one_does_not(leg):
+    parameters = usual_parameters(leg)
+    robot = leg.robot(parameters, leg.triangles())
+    (effect,) = mjcf_effects(robot, include=["FL_calf_joint friction loss by position"])
+    # Armature, damping, friction and torque scale of a fit by SciPy.
+    theta = [0, 0.014, 0.03, 0.165, 0.181, 0.22, 0.256, 0.169, 0.6, 0.872, 0.795, 0.9]
+    bare = [0, 0.014, 0.029, 0.159, 0.18, 0.158, 0.256, 0.166, 0.86, 0.872, 0.794, 0.92]
+    with_it = torch.tensor([[*theta, 0.5, 0.0]])
+    after = leg.errors(leg.free_run(parameters, [effect], with_it)[0])
+    before = leg.errors(leg.free_run(parameters, [], torch.tensor([bare]))[0])
+    assert before["fitted"][2] > 7e-3
+    assert after["fitted"][2] < 3e-3
+    assert after["held out"][2] < 5e-3
+
+
+def test_tables_say_what_was_found_and_what_it_cost():
+    errors = {"fitted": [0.002, 0.001, 0.0023], "held out": [0.0035, 0.002, 0.004]}
+    row = {
+        "line": "Verdict: knee friction",
+        "verdict": "knee friction",
+        "helps": ["knee friction"],
+        "named": ["knee friction"],
+        "cause": {"knee friction": 0.81},
+        "before": errors,
+        "after": errors,
+        "parameters": {"hip.armature": [0.012, 0.001]},
+        "trial_simulations": 12_345,
+        "cpu_seconds": 321.4,
+    }
+    text = tables({"FL": row, "FL, least squares": {"none": errors}})
+    assert "| FL | knee friction | knee friction 0.81 | 12,345 | 321 |" in text
+    assert "| FL, least squares: none | 2.0 / 1.0 / 2.3 | 3.5 / 2.0 / 4.0 |" in text
+    assert "| hip.armature | 0.012 +- 0.001 |" in text
+
+
+def test_a_folder_without_files_is_said(tmp_path, capsys):
+    assert main(["--data", str(tmp_path)]) == 2
+    assert "--data DIR" in capsys.readouterr().err

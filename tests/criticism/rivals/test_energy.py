@@ -1,0 +1,110 @@
+"""Forces whose sign would feed energy without bound are never fitted."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.forces import force_effects, total_force
+from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from sbi_active.criticism.rivals.energy import dissipative_bounds
+
+STEP, NUM = 0.02, 100
+
+
+def swing(theta, action, *, force=None):
+    """Return a damped pendulum's angle, (n, k)."""
+    q, v, found = action[:, :1].clone(), torch.zeros(len(action), 1), []
+    v = v.to(q)
+    for k in range(NUM):
+        tau = total_force(force, q, v, STEP * k)
+        v = v + STEP * (tau - 9.81 * torch.sin(q) - theta * v)
+        q = q + STEP * v
+        found.append(q[:, 0])
+    return torch.stack(found, 1)
+
+
+TIMES = STEP * torch.arange(1, NUM + 1, dtype=torch.float64)
+PRIOR = BoxUniform(torch.zeros(1), 2 * torch.ones(1))
+
+
+def model(sd):
+    return SimulatorModel(swing, noise=GaussianNoise(sd), sample_times=TIMES)
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """Return trials of a pendulum that something drives faster than it is damped."""
+    action = torch.tensor([[0.3], [0.6], [0.9], [1.2], [-0.5], [-1.0], [1.5]])
+
+    class Push:
+        def __call__(self, q, v, t, phi):
+            return 0.15 * v * np.abs(v)
+
+    force = {Push(): torch.zeros(len(action), 1)}
+    x = swing(torch.full((len(action), 1), 0.6), action.double(), force=force)
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+    return Trials(action, x + 0.003 * noise, sample_times=TIMES)
+
+
+@pytest.fixture(scope="module")
+def forces(pushed):
+    effects = force_effects(model(0.003), PRIOR, pushed, joints=["hinge"])
+    return {effect.name: effect for effect in effects}
+
+
+def test_only_what_outgrows_damping_and_drives_is_bounded(forces):
+    bounds = {name: dissipative_bounds(effect) for name, effect in forces.items()}
+    for name in ("v|v| of hinge", "v^3 of hinge"):
+        low, high = bounds[name]
+        assert low.tolist() == [-np.inf], name
+        assert high.tolist() == [0.0], name
+    rest = {n for n, (low, high) in bounds.items() if np.isfinite([*low, *high]).any()}
+    assert rest == {"v|v| of hinge", "v^3 of hinge"}
+
+
+def test_bounds_are_those_of_the_search(forces):
+    one = forces["v|v| of hinge"]
+    coordinates = SearchCoordinates(PRIOR, [one], [], 3)
+    inside = coordinates.to_z(coordinates.high[None])
+    assert inside[0, 1] == pytest.approx(0.0, abs=1e-9)
+    beyond = coordinates.from_z(np.array([[0.5, 0.1]]))
+    assert coordinates.log_prob(beyond) == -np.inf
+
+
+def test_quadratic_damping_that_feeds_energy_is_never_adopted(pushed, forces):
+    kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
+    loop = Criticism(
+        model(0.003), PRIOR, pushed, effects=[forces[name] for name in kinds]
+    )
+    tracing = loop.trace()
+    assert "v|v| of hinge" not in tracing.chosen
+    for evidence in tracing.evidences.values():
+        if "v|v| of hinge" in evidence.names:
+            at = evidence.names.index("v|v| of hinge")
+            assert (evidence.draws[:, at] <= 1e-9).all()
+
+
+def test_without_the_bound_it_would_be(pushed, forces, monkeypatch):
+    free = lambda e: (np.full(e.phi_dim, -np.inf), np.full(e.phi_dim, np.inf))  # noqa: E731
+    monkeypatch.setattr(
+        "sbi_active.criticism.rivals.coordinates.dissipative_bounds", free
+    )
+    kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
+    loop = Criticism(
+        model(0.003), PRIOR, pushed, effects=[forces[name] for name in kinds]
+    )
+    assert "v|v| of hinge" in loop.trace().chosen
+
+
+def test_what_is_no_force_has_no_bounds():
+    prior = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
+    effect = Effect(
+        "keywords", hook="dynamics", prior=prior, null=0.0, apply=lambda v, *rest: v
+    )
+    low, high = dissipative_bounds(effect)
+    assert low.tolist() == [-np.inf] * 2
+    assert high.tolist() == [np.inf] * 2

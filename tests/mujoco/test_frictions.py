@@ -1,0 +1,159 @@
+"""Dry friction that follows the state of its joint."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.robots.models import PENDULUM
+from sbi_active.criticism import AugmentedSimulator, close_loop
+from sbi_active.mujoco import from_mjcf, mjcf_effects
+from sbi_active.mujoco.effects.acting import half_normal, model_effect
+from sbi_active.mujoco.effects.frictions import FrictionChange
+from tests.mujoco.test_robot import pendulum
+
+THETA = {"hinge.damping": (0.0, 0.1)}
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return pendulum(parameters=THETA)
+
+
+@pytest.fixture(scope="module")
+def effects(robot):
+    wanted = ["hinge friction loss*", "hinge static friction"]
+    return {e.name: e for e in mjcf_effects(robot, include=wanted)}
+
+
+def run(robot, phi, angles, effects, damping=0.0):
+    model = AugmentedSimulator(robot.simulator, effects)
+    action = torch.tensor(angles, dtype=torch.float64)[:, None]
+    theta = torch.full((len(action), 1), damping, dtype=torch.float64)
+    given = {
+        e.name: torch.tensor(p, dtype=torch.float64).expand(len(action), -1)
+        for e, p in zip(effects, phi, strict=True)
+    }
+    return model.evaluate(theta, given, action).numpy()
+
+
+def test_they_are_offered_with_their_units_and_say_on_what_they_depend(effects):
+    assert {*effects} == {
+        "hinge friction loss",
+        "hinge friction loss by position",
+        "hinge friction loss by load",
+        "hinge static friction",
+    } - {"hinge friction loss by load"}  # nothing drives this pendulum
+    for name, what in (("friction loss by position", "position"), ("static", "speed")):
+        (effect,) = (e for n, e in effects.items() if name in n and "hinge" in n)
+        assert f"depends on its {what}" in effect.describe
+        assert (effect.units, effect.family) == ("N m", "friction")
+        assert (effect.declared_draws() >= 0).all()
+
+
+def test_a_friction_that_follows_nothing_is_that_of_the_field(robot, effects):
+    loss = effects["hinge friction loss"]
+    same = FrictionChange(("hinge",), "speed", speed=1e12)  # of any speed
+    follows = model_effect("follows", same, prior=half_normal(0.2))
+    field = run(robot, [[0.2]], [1.0, -0.6], [loss])
+    assert run(robot, [[0.2]], [1.0, -0.6], [follows]) == pytest.approx(field, abs=1e-9)
+    # Two frictions of one joint add up.
+    both = run(robot, [[0.15], [0.05]], [1.0, -0.6], [follows, loss])
+    assert both == pytest.approx(field, abs=1e-9)
+
+
+def test_friction_by_position_is_largest_at_the_ends():
+    change = FrictionChange(("hinge",), "position", (-1.0,), (3.0,))
+    q = np.array([[-2.0], [-1.0], [1.0], [3.0], [9.0]])
+    phi = np.tile([0.4, 0.8], (5, 1))
+    found = change.values(q, 0 * q, 0 * q, phi)[:, 0]
+    assert found == pytest.approx([0.4, 0.4, 0.3, 0.8, 0.8])
+
+
+def test_a_joint_is_held_where_friction_is_large_and_slides_where_it_is_not(
+    robot, effects
+):
+    # Gravity's torque at .5 rad is about 1.2 N m to either side.
+    x = run(robot, [[0.0, 9.0]], [0.8, -0.8], [by_position(effects)])
+    assert np.abs(x[0] - 0.8).max() < 0.1
+    assert np.abs(x[1] + 0.8).max() > 0.5
+
+
+def test_rows_do_not_depend_on_each_other(robot, effects):
+    one = by_position(effects)
+    angles, phi = [0.9, -0.4, 0.9], [0.05, 0.3]
+    together = run(robot, [phi], angles, [one])
+    apart = [run(robot, [phi], [angle], [one])[0] for angle in angles]
+    assert (together == np.stack(apart)).all()
+    plain = run(robot, [], angles, [])
+    assert (run(robot, [[0.0] * 2], angles, [one]) == plain).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_draw_of_any_friction_feeds_energy(robot, effects, seed):
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-1.4, 1.4)
+    for effect in effects.values():
+        phi = effect.declared_draws()[seed].tolist()
+        x = run(robot, [phi], [angle], [effect])[0]
+        assert np.abs(x).max() <= abs(angle) + 1e-3, effect.name
+
+
+def test_friction_by_load_grows_with_the_force_of_the_motor():
+    cart = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
+      <body><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+      </body></worldbody><actuator><motor name="push" joint="rail"/></actuator>
+      </mujoco>"""
+    from sbi_active import BoxActions
+
+    robot = from_mjcf(
+        cart,
+        {"rail.damping": (0.0, 0.1)},
+        sensors=["rail"],
+        actions=BoxActions([0.0], [4.0], names=["push"]),
+        times=[0.5, 1.0],
+        noise=0.01,
+    )
+    (effect,) = mjcf_effects(robot, include=["rail friction loss by load"])
+    free = run(robot, [], [2.0, 4.0], [])
+    held = run(robot, [[0.25]], [2.0, 4.0], [effect])
+    # A quarter of the push is lost, however large it is.
+    assert held / free == pytest.approx(0.75, abs=0.01)
+
+
+def by_position(effects):
+    return effects["hinge friction loss by position"]
+
+
+def test_the_loop_names_friction_that_depends_on_the_position():
+    rng = np.random.default_rng(3)
+
+    def log(start):
+        model = mujoco.MjModel.from_xml_string(PENDULUM)
+        model.dof_damping[0] = 0.03
+        data, angles = mujoco.MjData(model), []
+        data.qpos[0] = start
+        for _ in range(150):
+            angles.append(data.qpos[0] + 0.002 * rng.standard_normal())
+            model.dof_frictionloss[0] = 0.15 * max(1 + data.qpos[0], 0.0)
+            mujoco.mj_step(model, data)
+        time = 0.01 * np.arange(150)
+        return {
+            "time": time[10::10],
+            "hinge": angles[10::10],
+            "start hinge": np.full(14, start),
+        }
+
+    logs = [log(start) for start in (0.3, -1.4, 1.0, -0.7, 1.4, -0.4, 0.7)]
+    robot = from_mjcf(PENDULUM, THETA, sensors=["hinge"], recordings=logs, noise=0.002)
+    effects = mjcf_effects(
+        robot,
+        include=[
+            *("hinge friction loss*", "hinge static friction", "hinge stiffness"),
+            *("hinge quadratic damping", "hinge zero offset", "gravity tilt y"),
+        ],
+    )
+    assert robot.trials is not None
+    report = close_loop(*robot[:2], robot.trials, effects=effects, evaluate=False)
+    assert report.verdict == "hinge friction loss by position"
+    assert "depends on its position" in str(report)
