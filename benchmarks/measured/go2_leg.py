@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from torch import Tensor
 from sbi_active.criticism import AugmentedSimulator, Effect
 from sbi_active.criticism.rivals.trial_simulator import conditions_of_trials
 from sbi_active.mujoco import Robot, from_mjcf
+from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.simulation import AutocorrelatedNoise
 
 __all__ = ["DATA", "FITTED", "JOINTS", "LEGS", "Leg", "read_leg", "usual_parameters"]
@@ -82,7 +82,7 @@ class Leg:
 
     def spec(self) -> Any:
         """Return its MJCF: the leg alone, rigid, its motors driven by the PD law."""
-        spec = mujoco.MjSpec.from_file(str(self.folder / "go2_in_air.xml"))
+        spec = mujoco_of().MjSpec.from_file(str(self.folder / "go2_in_air.xml"))
         for key in [*spec.keys]:
             spec.delete(key)
         for motor in [*spec.actuators]:

@@ -152,7 +152,7 @@ def run(
         print(machine, "seed", seed, flush=True)
 
 
-def table(rows: pd.DataFrame) -> pd.DataFrame:
+def table(rows: Any) -> pd.DataFrame:
     """Return coverage with its 95 % interval, widths and cost, by way.
 
     Args:
@@ -183,7 +183,7 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
-def summary(rows: pd.DataFrame) -> pd.DataFrame:
+def summary(rows: Any) -> pd.DataFrame:
     """Return coverage over all parameters and the cost, one row a condition.
 
     Args:
@@ -234,7 +234,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     if options.what == "show":
-        rows = pd.read_csv(options.out)
+        rows: Any = pd.read_csv(options.out)
         told = table if options.by_parameter else summary
         print(
             told(rows[rows.seed >= FIRST]).to_markdown(

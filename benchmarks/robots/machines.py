@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.robots.models import ARM, CART_POLE, SPRING_MASS
+from sbi_active.mujoco.models.spec import mujoco_of
 
 Array = NDArray[Any]
 Edit = Callable[[Any, float], None]
@@ -98,8 +99,7 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
         seed: Of truths, controls, starts and errors; white and correlated sets of one
             seed share the first three.
     """
-    import mujoco
-    import mujoco.rollout
+    mujoco = mujoco_of()
     from mujoco import sysid  # pyright: ignore
 
     correlation, friction = CONDITIONS[condition]
@@ -172,9 +172,7 @@ def _errors(
 
 def _from(text: str) -> Callable[[], Any]:
     def made() -> Any:
-        import mujoco
-
-        return mujoco.MjSpec.from_string(text)
+        return mujoco_of().MjSpec.from_string(text)
 
     return made
 
@@ -214,7 +212,7 @@ READ_ARM = """<sensor><jointpos name="shoulder" joint="shoulder"/>
 
 def swimmer() -> Any:
     """Return gymnasium's swimmer, three links that float in a viscous medium."""
-    import mujoco
+    mujoco = mujoco_of()
 
     found = find_spec("gymnasium")
     if found is None or found.origin is None:
@@ -229,8 +227,7 @@ def swimmer() -> Any:
 
 def go2_leg() -> Any:
     """Return the front left leg of a Go2 with its drives, Kp 20 and Kd 1.5."""
-    import mujoco
-
+    mujoco = mujoco_of()
     spec = mujoco.MjSpec.from_file(str(os.environ.get("GO2_IN_AIR", GO2)))
     for motor in [*spec.actuators]:
         if not motor.name.startswith("FL"):
@@ -247,7 +244,7 @@ def go2_leg() -> Any:
 
 
 def _read_joints(spec: Any) -> None:
-    import mujoco
+    mujoco = mujoco_of()
 
     for joint in spec.joints:
         spec.add_sensor(
