@@ -90,9 +90,10 @@ def score(
     loop = _criticism(trials_of(pair, until={1: UNTIL}), seed)
     tracing, whole = loop.trace(), trials_of(pair)
     verdicts = {"before": NONE, "after": tracing.verdict}
+    averaged = {"before": {NONE: 1.0}, "after": tracing.probabilities}
     found = {
-        when: forecast(loop.rivals, whole, verdict=verdict, trial=1, seed=seed)
-        for when, verdict in verdicts.items()
+        when: forecast(loop.rivals, whole, probabilities=p, trial=1, seed=seed)
+        for when, p in averaged.items()
     }
     row: dict[str, Any] = {
         "ball": tested.ball,

@@ -71,7 +71,7 @@ def draw_forecasts(
         ax.plot(drop.times, drop.heights, "k.", ms=3.5, label="measured", zorder=3)
         for when, color, label in (
             ("before", BEFORE, "gravity alone"),
-            ("after", AFTER, "with the verdict's effect"),
+            ("after", AFTER, "average of the models"),
         ):
             one = found[when]
             ax.plot(one.times, one.mean, color=color, lw=1.5, label=label)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,26 +57,61 @@ class Forecast:
 
 
 def forecast(
-    rivals: RivalSet, whole: Trials, *, verdict: str, trial: int, seed: int = 0
+    rivals: RivalSet,
+    whole: Trials,
+    *,
+    probabilities: Mapping[str, float],
+    trial: int,
+    seed: int = 0,
 ) -> Forecast:
     """Return the rest of a trial given its beginning and the other trials.
 
     Unlike a new trial, it keeps the nuisances that its beginning shows, and its errors
-    go on from the last one.
+    go on from the last one. It is the average of the models, since what a verdict
+    leaves open is a part of what is not known.
 
     Args:
         rivals: The models, fitted to trials of which this one was cut short.
         whole: The same trials, this one in full.
-        verdict: Names of the effects joined by " + ", or a catch-all.
+        probabilities: By names of the effects joined by " + ", or a catch-all.
         trial: Position of the one that was cut.
         seed: Of the draws.
     """
-    key = _key(rivals, verdict)
-    fit, rng = rivals.fit(key), np.random.default_rng(seed)
-    rival, u = fit.rival, fit.sample.draws(NUM_DRAWS, rng)
+    rng = np.random.default_rng(seed)
+    names, p = [*probabilities], np.array([*probabilities.values()])
+    counts = np.round(NUM_DRAWS * p / p.sum()).astype(int)
+    parts = [
+        _drawn(rivals, whole, _key(rivals, name), trial, num, rng)
+        for name, num in zip(names, counts, strict=True)
+        if num
+    ]
+    mean, x = (np.concatenate(part) for part in zip(*parts, strict=True))
+    m = TrialSimulator(rivals.simulator.model, whole).measurements
+    rest = _rest(rivals, m, trial)[1:]
+    low, high = np.quantile(x, [0.05, 0.95], axis=0)
+    return Forecast(m.time[rest], m.x[rest], mean.mean(0), low, high)
+
+
+def _rest(rivals: RivalSet, m: Any, trial: int) -> NDArray[np.int64]:
+    """Return places of the last sample of the beginning, and of all that follow it."""
+    first = int((rivals.measurements.trial == trial).sum())
+    return np.flatnonzero(m.trial == trial)[first - 1 :]
+
+
+def _drawn(
+    rivals: RivalSet,
+    whole: Trials,
+    key: ModelKey,
+    trial: int,
+    num: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return noise-free predictions of one model, and outcomes, both (num, m)."""
+    fit = rivals.fit(key)
+    rival, u = fit.rival, fit.sample.draws(num, rng)
     simulator = TrialSimulator(rivals.simulator.model, whole)
     mean = simulator.predict(*rival.coordinates.split(u))[0]
-    m, cut = simulator.measurements, rivals.measurements
+    m = simulator.measurements
     own = rival.residual(u, penalized=False)[0]
     extra = np.zeros(len(m))
     if isinstance(rival.error, ResidualProcess):
@@ -85,21 +121,16 @@ def forecast(
         mean = mean + shift
     cells, scales = rival.error.noise_posterior(own, rng)
     noise = declared_noise(rivals.model.noise, m)
-    # The last sample of the beginning, and all that follow it.
-    first = int((cut.trial == trial).sum())
-    at = np.flatnonzero(m.trial == trial)
-    last, rest = at[first - 1], at[first:]
+    last, *rest = _rest(rivals, m, trial)
     rho = np.stack([noise.cells[c].rho for c in cells])
     sd = np.stack([noise.cells[c].sd for c in cells]) * scales[:, None]
     r = m.x[last] - mean[:, last]
-    x = np.empty((NUM_DRAWS, len(rest)))
+    x = np.empty((num, len(rest)))
     for j, k in enumerate(rest):
         fresh = sd[:, k] * np.sqrt(1 - rho[:, k] ** 2)
-        r = rho[:, k] * r + fresh * rng.normal(size=NUM_DRAWS)
+        r = rho[:, k] * r + fresh * rng.normal(size=num)
         x[:, j] = mean[:, k] + r
-    x = x + extra[rest] * rng.normal(size=x.shape)
-    low, high = np.quantile(x, [0.05, 0.95], axis=0)
-    return Forecast(m.time[rest], m.x[rest], mean[:, rest].mean(0), low, high)
+    return mean[:, rest], x + extra[rest] * rng.normal(size=x.shape)
 
 
 def aligned_error(

@@ -17,7 +17,7 @@ from sbi_active.criticism import Effect
 from sbi_active.tasks.ball_drops.model import RELEASE_HEIGHT
 from sbi_active.tasks.product import Product
 
-__all__ = ["DRAG", "make_effects", "release"]
+__all__ = ["DRAG", "make_effects", "release", "wind"]
 
 #: Family of everything that slows the ball with its speed.
 DRAG = "drag"
@@ -25,21 +25,23 @@ DRAG_SD = 3.0  # m/s^2 at 10 m/s, a third of the weight
 EXPONENT = (0.5, 2.5)
 #: Most of the weight that air carries: 1.7 % of a basketball, the largest.
 BUOYANCY = 0.02
+WIND = 1.0  # m/s, up or down, of a light breeze around a bridge
 RATE = 0.02  # largest relative error of the frame rate
 
 
 def make_effects() -> list[Effect]:
-    """Return the nuisance of each drop and the effects.
+    """Return the nuisances of each drop and the effects.
 
     Example:
         >>> [effect.name for effect in make_effects()][:3]
-        ['release', 'linear drag', 'quadratic drag']
+        ['release', 'wind', 'linear drag']
     """
     half = HalfNormal(torch.tensor([DRAG_SD]))
     low, high = (torch.tensor([end]) for end in EXPONENT)
     exponent = Uniform(low, high)
     return [
         release(),
+        wind(),
         Effect(
             "linear drag",
             hook="dynamics",
@@ -99,6 +101,17 @@ def release() -> Effect:
         units="m, s",
         scope="trial",
         describe="height and time at which the ball is let go",
+    )
+
+
+def wind() -> Effect:
+    """Return how fast the air rises below the bridge, anew in each drop."""
+    return Effect.keyword(
+        "wind",
+        prior=Independent(Normal(torch.zeros(1), torch.tensor([WIND])), 1),
+        units="m/s",
+        scope="trial",
+        describe="the air rises or sinks while the ball falls",
     )
 
 

@@ -13,10 +13,11 @@ camera that is not level,
     + b \Bigl(\frac{h - 29\,\mathrm{m}}{18\,\mathrm{m}}\Bigr)^2 .
 
 With the keyword argument ``drag`` = :math:`a` the air takes the deceleration
-:math:`a (v / v_0)^p` at the downward speed v, :math:`v_0` = 10 m/s,
+:math:`a ((v + w) / v_0)^p` at the downward speed v where it rises with a ``wind`` of w,
+:math:`v_0` = 10 m/s,
 
 .. math::
-    \dot v = g - a (v / v_0)^p, \qquad \dot h = -v,
+    \dot v = g - a ((v + w) / v_0)^p, \qquad \dot h = -v,
 
 by the classical Runge-Kutta method on a grid that is dense after the release, where
 :math:`v^p` is not smooth, and cubic Hermite interpolation.
@@ -69,6 +70,7 @@ def fall(
     exponent: Tensor | float = 1.0,
     lightness: Tensor | float = 0.0,
     clock: Tensor | float = 0.0,
+    wind: Tensor | float = 0.0,
 ) -> Tensor:
     r"""Return the height of a falling ball.
 
@@ -83,6 +85,7 @@ def fall(
         exponent: p, a number or shape (n,).
         lightness: Share of the weight that something carries, alike.
         clock: Relative error of the frame rate: stamps are early by it, alike.
+        wind: w in m/s, upward, alike; without drag it does nothing.
 
     Returns:
         Shape (n, k), m.
@@ -99,7 +102,8 @@ def fall(
     if drag is None:
         way = 0.5 * g * s**2
     else:
-        way = _way(s, g, _column(drag, theta), _column(exponent, theta))
+        drags = (_column(value, theta) for value in (drag, exponent, wind))
+        way = _way(s, g, *drags)
     scale, bend = theta[..., None].unbind(1)
     h = _column(height, theta) - way
     return h + scale * (h - RELEASE_HEIGHT) + bend * ((h - MIDDLE) / HALF) ** 2
@@ -109,12 +113,13 @@ def _column(value: Tensor | float, like: Tensor) -> Tensor:
     return torch.as_tensor(value).to(like).reshape(-1, 1)
 
 
-def _way(s: Tensor, g: Tensor, drag: Tensor, exponent: Tensor) -> Tensor:
+def _way(s: Tensor, g: Tensor, drag: Tensor, exponent: Tensor, wind: Tensor) -> Tensor:
     """Return the way fallen at times s (n, k) after the release, shape (n, k)."""
     last = s.amax(1, keepdim=True).clamp(min=1e-6)
 
     def acceleration(v: Tensor) -> Tensor:
-        return g - drag * (v.clamp(min=0) / REFERENCE_SPEED) ** exponent
+        through = (v + wind).clamp(min=0)
+        return g - drag * (through / REFERENCE_SPEED) ** exponent
 
     v, y = torch.zeros_like(last), torch.zeros_like(last)
     knots = [(y, v, acceleration(v))]

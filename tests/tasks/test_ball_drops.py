@@ -80,9 +80,23 @@ def test_every_effect_vanishes_at_its_null_and_moves_x_elsewhere():
     model = AugmentedSimulator(task.simulator, task.effects(), check=(theta, action))
     bare = model.evaluate(theta, {}, action)
     for effect in task.effects():
+        if effect.name == "wind":  # which the drag alone sees
+            continue
         phi = effect.sample(16).to(theta.dtype)
         change = (model.evaluate(theta, {effect.name: phi}, action) - bare).abs()
         assert float(change.max()) > 0.01, effect.name
+
+
+def test_the_drag_sees_the_air_that_moves():
+    drag, wind = torch.tensor([2.0, 2.0, 2.0]).double(), torch.tensor([0.0, 1.0, -1.0])
+    theta = LEVEL.repeat(3, 1)
+    still, up, down = fall(
+        theta, theta, times=TIMES[None], drag=drag, wind=wind.double()
+    )
+    assert (up[5:] > still[5:]).all()  # rising air holds the ball longer
+    assert (down[5:] < still[5:]).all()
+    bare = fall(theta, theta, times=TIMES[None], wind=wind.double())
+    assert torch.equal(bare[0], bare[1])
 
 
 def test_the_task_is_a_real_system():
