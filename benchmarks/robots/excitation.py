@@ -1,0 +1,385 @@
+"""Chosen excitation against chirps: how long a robot must move for the same intervals.
+
+    python -m benchmarks.robots.excitation --machine arm --first 2000 --cases 5
+    python -m benchmarks.robots.excitation --machine leg --first 2000 --cases 5
+    python -m benchmarks.robots.excitation --summary
+
+A two-link arm and one leg of the Go2 (whose files are looked for beside the project, or
+at GO2_IN_AIR) with their drives; damping, armature and dry friction of each joint, and
+the mass of the last link, are unknown. Truth is simulated: parameters from the middle
+half of the prior, encoders with white noise of 1 mrad at 50 Hz.
+
+*Chirps* are those of common practice: every joint sweeps from 0.1 to 10 Hz in 20 s, all
+at once, three times over (60 s), with the largest amplitude that keeps the limits of
+position, speed and torque at parameters of the prior. *Chosen*: three signals of 8.25 s,
+one after the other. Each is the best of 150 random ones (chirps and multisines of each
+joint about centers of its own, as large as the same limits permit) by the Gauss-Newton
+information under the belief of that time, the first under the prior. *Random* takes the
+first of pools made in the same way. Every belief is that of ``identify`` from the
+simulated recordings.
+
+Recorded: standard deviations of all parameters after each, and whether 90 % intervals
+cover. Seeds below 1000 tune, those from 2000 on judge. Resumable.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.criticism.run import append, read
+from benchmarks.robots.models import ARM
+from sbi_active import DiscreteActions, InformationGainDesigner
+from sbi_active.actions import SignalActions
+from sbi_active.criticism import Trials, identify
+from sbi_active.mujoco import MotionLimits, Robot, from_mjcf
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+
+__all__ = ["MACHINES", "main", "score", "summary"]
+
+RESULT = Path(__file__).parent / "results" / "excitation.csv"
+COLUMNS = ["machine", "case", "arm", "seconds", "sds", "covered", "cpu_seconds"]
+NOISE, RATE, GRID = 0.001, 50.0, 200.0  # rad; Hz of encoders and of goals
+SWEEP, SWEEPS, LENGTH, NUM_CHOSEN = 20.0, 3, 8.25, 3  # s
+BAND = 0.1, 10.0  # Hz
+POOL, NUM_SAMPLES = 150, 64
+SCALES = 1.0, 0.7, 0.5, 0.35, 0.25, 0.17, 0.12  # of all shares of a random signal
+LEVEL = 0.9
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A robot with drives, and what it may do.
+
+    Attributes:
+        spec: Its MJCF, or a function that makes an ``MjSpec``.
+        joints: Names, in the order of the drives.
+        drives: Actuators, whose inputs are goals, rad.
+        last: Body whose mass is unknown.
+        center: Of each joint's range of goals, rad.
+        reach: Half of it.
+        speed: Largest, rad/s.
+        torque: Largest, N m.
+        bounds: Of damping, armature, dry friction and mass.
+    """
+
+    spec: Any
+    joints: tuple[str, ...]
+    drives: tuple[str, ...]
+    last: str
+    center: tuple[float, ...]
+    reach: tuple[float, ...]
+    speed: float
+    torque: float
+    bounds: Mapping[str, tuple[float, float]]
+
+    def parameters(self) -> dict[str, tuple[float, float, str]]:
+        """Return the unknown ones, with their bounds and places."""
+        found = {}
+        for joint in self.joints:
+            short = joint.removeprefix("FL_").removesuffix("_joint")
+            for what, field in (
+                ("damping", "damping"),
+                ("armature", "armature"),
+                ("friction", "frictionloss"),
+            ):
+                found[f"{short} {what}"] = (*self.bounds[what], f"{joint}.{field}")
+        found["mass"] = (*self.bounds["mass"], f"{self.last}.mass")
+        return found
+
+
+def _leg() -> Any:
+    from benchmarks.robots.machines import go2_leg
+
+    return go2_leg()
+
+
+MACHINES = {
+    "arm": Machine(
+        ARM,
+        ("shoulder", "elbow"),
+        ("shoulder servo", "elbow servo"),
+        "lower",
+        (0.0, 0.0),
+        (0.8, 1.2),
+        8.0,
+        20.0,
+        {
+            "damping": (0.0, 1.0),
+            "armature": (0.0, 0.1),
+            "friction": (0.0, 1.0),
+            "mass": (0.2, 1.0),
+        },
+    ),
+    "leg": Machine(
+        _leg,
+        ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"),
+        ("FL_hip", "FL_thigh", "FL_calf"),
+        "FL_calf",
+        (0.0, 0.9, -1.8),
+        (0.4, 0.5, 0.6),
+        8.0,
+        20.0,
+        {
+            "damping": (0.0, 2.0),
+            "armature": (0.0, 0.1),
+            "friction": (0.0, 1.5),
+            "mass": (0.1, 0.5),
+        },
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Played:
+    """Goals of all joints, as a generator of signals.
+
+    An action has, for each joint, a kind (below .5 a chirp, else a multisine of four),
+    the share of the reach that it takes, where its center lies in what is left, and two
+    numbers that a chirp takes for the logarithms of its frequencies, a multisine for
+    the band of its own.
+    """
+
+    machine: Machine
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the entries."""
+        each = ("kind", "share", "center", "low", "high")
+        return [f"{drive} {what}" for drive in self.machine.drives for what in each]
+
+    def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:
+        """Return the goals, {drive: (n, m)}."""
+        t = input_times - input_times[0]
+        found = {}
+        parts = zip(
+            self.machine.drives,
+            action.split(5, 1),
+            self.machine.center,
+            self.machine.reach,
+            strict=True,
+        )
+        for j, (drive, entries, center, reach) in enumerate(parts):
+            kind, share, place, low, high = (e[:, None] for e in entries.unbind(1))
+            f0, f1 = (_hertz(e) for e in (low, high))
+            sweep = torch.sin(2 * math.pi * (f0 * t + (f1 - f0) * t**2 / (2 * t[-1])))
+            tones = [
+                torch.sin(
+                    2 * math.pi * _hertz(low + (high - low) * k / 3) * t
+                    + 1.7 * j
+                    + k**2
+                )
+                for k in range(4)
+            ]
+            signal = torch.where(kind < 0.5, sweep, torch.stack(tones).sum(0) / 2.5)
+            around = center + (1 - share) * place * reach
+            # The first second leads from rest to the signal.
+            found[drive] = center + t.clamp(max=1.0) * (
+                around - center + share * reach * signal
+            )
+        return found
+
+
+def _hertz(share: Tensor) -> Tensor:
+    return BAND[0] * (BAND[1] / BAND[0]) ** share
+
+
+@cache
+def robot_of(name: str, seconds: float) -> Robot:
+    """Return a robot whose trials have a length, with its actions."""
+    machine = MACHINES[name]
+    num = len(machine.joints)
+    grid = torch.arange(0, seconds, 1 / GRID, dtype=torch.float64)
+    space = SignalActions(
+        Played(machine),
+        [0.0, 0.02, -1.0, 0.0, 0.0] * num,
+        [1.0, 1.0, 1.0, 1.0, 1.0] * num,
+        input_times=grid,
+    )
+    return from_mjcf(
+        machine.spec if isinstance(machine.spec, str) else machine.spec(),
+        machine.parameters(),
+        inputs=space,
+        sensors=[*machine.joints],
+        times=np.arange(1 / RATE, seconds, 1 / RATE),
+        noise=NOISE,
+        start=dict(zip(machine.joints, machine.center, strict=True)),
+    )
+
+
+def limits_of(name: str, robot: Robot, belief: Any = None) -> MotionLimits:
+    """Return the limits of a machine's motion."""
+    machine = MACHINES[name]
+    ends = zip(machine.joints, machine.center, machine.reach, strict=True)
+    return MotionLimits(
+        robot,
+        position={j: (c - 1.1 * r, c + 1.1 * r) for j, c, r in ends},
+        velocity=dict.fromkeys(machine.joints, machine.speed),
+        torque=dict.fromkeys(machine.drives, machine.torque),
+        belief=belief,
+        num_draws=4,
+    )
+
+
+def chirps(name: str) -> Tensor:
+    """Return the largest permitted chirp of all joints, shape (1, action_dim)."""
+    robot = robot_of(name, SWEEP)
+    num = len(MACHINES[name].joints)
+    shares = torch.linspace(1.0, 0.05, 20)
+    action = torch.tensor([[0.0, 1.0, 0.0, 0.0, 1.0] * num]).repeat(len(shares), 1)
+    action[:, 1::5] = shares[:, None]
+    permitted = limits_of(name, robot)(action)
+    return action[permitted][:1]
+
+
+def permitted_pool(name: str, robot: Robot, belief: Any, seed: int) -> Tensor:
+    """Return random signals as large as the limits permit, (POOL, action_dim)."""
+    limits = limits_of(name, robot, belief)
+    assert robot.actions is not None
+    found, k = [], 0
+    while sum(map(len, found)) < POOL:
+        left = robot.actions.sample((POOL,), seed=derive_seed(seed, "pool", k))
+        for scale in SCALES:
+            tried = left.clone()
+            tried[:, 1::5] *= scale  # the shares of all joints
+            permitted = limits(tried)
+            found.append(tried[permitted])
+            left = left[~permitted]
+        k += 1
+    pool = torch.cat(found)
+    with forked_generators(seed):
+        return pool[torch.randperm(len(pool))[:POOL]]
+
+
+def recorded(robot: Robot, action: Tensor, theta: Tensor, seed: int) -> Trials:
+    """Return trials of a simulated robot."""
+    assert isinstance(robot.actions, SignalActions)
+    mean = robot.simulator.mean(theta.expand(len(action), -1), action).double()
+    noise = robot.simulator.noise
+    assert noise is not None
+    x = noise.sample(mean, row_seeds(seed, len(mean)))
+    return Trials(
+        action,
+        x,
+        sample_times=robot.simulator.sample_times,
+        inputs=robot.actions.inputs(action.double()),
+        input_times=robot.actions.input_times,
+    )
+
+
+def score(name: str, case: int) -> list[dict[str, object]]:
+    """Return a row for the chirps, the chosen and the random signals."""
+    robot = robot_of(name, LENGTH)
+    with forked_generators(case, "truth"):
+        low, high = robot.prior.base_dist.low, robot.prior.base_dist.high
+        theta = low + (high - low) * (0.25 + 0.5 * torch.rand(1, len(low)))
+    rows = []
+
+    def keep(arm: str, belief: Any, seconds: float, begin: float) -> None:
+        ends = np.array([*belief.interval(LEVEL).values()])
+        true = theta[0].numpy()
+        rows.append(
+            {
+                "machine": name,
+                "case": case,
+                "arm": arm,
+                "seconds": seconds,
+                "sds": json.dumps([float(f"{v:.4g}") for v in belief.draws.std(0)]),
+                "covered": int(((ends[:, 0] <= true) & (true <= ends[:, 1])).sum()),
+                "cpu_seconds": round(time.process_time() - begin, 1),
+            }
+        )
+
+    begin, sweeps = time.process_time(), robot_of(name, SWEEP)
+    own = recorded(sweeps, chirps(name).repeat(SWEEPS, 1), theta, case)
+    belief = identify(sweeps.simulator, sweeps.prior, own, seed=case)
+    keep("chirps", belief, SWEEP * SWEEPS, begin)
+    for arm in ("chosen", "random"):
+        begin, action, belief = time.process_time(), [], robot.prior
+        for k in range(NUM_CHOSEN):
+            pool = permitted_pool(name, robot, belief, derive_seed(case, k))
+            if arm == "chosen":
+                designer = InformationGainDesigner(
+                    DiscreteActions(pool),
+                    num_samples=NUM_SAMPLES,
+                    estimator="linear",
+                )
+                pool = designer.select(
+                    None, robot.simulator, belief=belief, seed=derive_seed(case, k)
+                ).action[None]
+            action.append(pool[:1])
+            trials = recorded(robot, torch.cat(action), theta, case)
+            belief = identify(robot.simulator, robot.prior, trials, seed=case)
+            keep(arm, belief, LENGTH * (k + 1), begin)
+    return rows
+
+
+def summary(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return the table: deviations beside those of the chirps."""
+    lines = [
+        "| machine | cases | signals | s | deviations, of the chirps' in 60 s: median, "
+        "largest | all parameters at most the chirps' | 90 % intervals that cover | "
+        "CPU s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name in MACHINES:
+        own = [row for row in rows if row["machine"] == name]
+        base = {
+            r["case"]: np.array(json.loads(r["sds"]))
+            for r in own
+            if r["arm"] == "chirps"
+        }
+        kinds = dict.fromkeys((r["arm"], float(r["seconds"])) for r in own)
+        for arm, seconds in kinds:
+            some = [
+                r for r in own if r["arm"] == arm and float(r["seconds"]) == seconds
+            ]
+            ratio = np.array([json.loads(r["sds"]) / base[r["case"]] for r in some])
+            inside = sum(int(r["covered"]) for r in some)
+            cpu = np.median([float(r["cpu_seconds"]) for r in some])
+            lines.append(
+                f"| {name} | {len(some)} | {arm} | {seconds:g} | "
+                f"{np.median(ratio):.2f}, {ratio.max():.2f} | "
+                f"{int((ratio <= 1).all(1).sum())} of {len(some)} | "
+                f"{inside} of {ratio.size} | {cpu:.0f} |"
+            )
+    return lines
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the cases that are missing and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--machine", choices=[*MACHINES])
+    parser.add_argument("--first", type=int, default=2000)
+    parser.add_argument("--cases", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    arguments = parser.parse_args(argv)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    done = {(row["machine"], int(row["case"])) for row in read(arguments.out)}
+    machines = [arguments.machine] if arguments.machine else [*MACHINES]
+    for name in [] if arguments.summary else machines:
+        for case in range(arguments.first, arguments.first + arguments.cases):
+            if (name, case) not in done:
+                append(arguments.out, score(name, case), COLUMNS)
+                print(name, case, flush=True)
+    print(*summary(read(arguments.out)), sep="\n")
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main()

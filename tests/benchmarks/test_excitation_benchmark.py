@@ -1,0 +1,75 @@
+"""Signals of the excitation benchmark, and its table."""
+
+import json
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+if find_spec("mujoco") is None:
+    pytest.skip("needs mujoco", allow_module_level=True)
+
+from benchmarks.robots import excitation
+from benchmarks.robots.excitation import (
+    MACHINES,
+    Played,
+    limits_of,
+    permitted_pool,
+    robot_of,
+    summary,
+)
+
+
+def test_goals_begin_at_rest_and_stay_within_reach():
+    machine = MACHINES["arm"]
+    played = Played(machine)
+    torch.manual_seed(0)
+    action = torch.rand(50, len(played.names))
+    action[:, 2::5] = 2 * action[:, 2::5] - 1
+    goals = played(action, torch.linspace(0, 8, 1601))
+    for drive, center, reach in zip(
+        machine.drives, machine.center, machine.reach, strict=True
+    ):
+        assert (goals[drive][:, 0] == center).all()
+        # Four tones together may pass a fifth beyond what they rarely reach.
+        assert ((goals[drive] - center).abs() <= 1.7 * reach).all()
+    chirp = torch.tensor([[0.0, 1.0, 0.0, 0.0, 1.0] * 2])
+    sweep = played(chirp, torch.linspace(0, 20, 4001))["shoulder servo"][0]
+    assert float(sweep.abs().max()) == pytest.approx(0.8, rel=1e-3)
+    turns = int((sweep[1:] * sweep[:-1] < 0).sum())
+    assert turns == pytest.approx(2 * 20 * (0.1 + 10) / 2, abs=2)
+
+
+def test_a_pool_keeps_the_limits_and_is_as_large_as_they_permit(monkeypatch):
+    monkeypatch.setattr(excitation, "POOL", 6)
+    robot = robot_of("arm", 2.0)
+    limits = limits_of("arm", robot)
+    pool = permitted_pool("arm", robot, None, seed=1)
+    assert pool.shape == (6, 10)
+    assert limits(pool).all()
+    larger = pool.clone()
+    larger[:, 1::5] *= 1 / 0.7  # the next scale above
+    whole = (larger[:, 1::5] <= 1).all(1)
+    assert not (limits(larger) & whole).all()
+
+
+def test_the_table_compares_with_the_chirps_of_the_same_case():
+    def row(case, arm, seconds, sds, covered):
+        return {
+            "machine": "arm",
+            "case": str(case),
+            "arm": arm,
+            "seconds": str(seconds),
+            "sds": json.dumps(sds),
+            "covered": str(covered),
+            "cpu_seconds": "2",
+        }
+
+    rows = [
+        row(0, "chirps", 60, [1.0, 2.0], 2),
+        row(0, "chosen", 24.75, [0.5, 1.0], 2),
+        row(1, "chirps", 60, [2.0, 2.0], 2),
+        row(1, "chosen", 24.75, [1.0, 3.0], 1),
+    ]
+    _, _, _, chosen = summary(rows)
+    assert chosen == "| arm | 2 | chosen | 24.75 | 0.50, 1.50 | 1 of 2 | 3 of 4 | 2 |"
