@@ -11,10 +11,11 @@ half of the prior, encoders with white noise of 1 mrad at 50 Hz.
 
 *Chirps* are those of common practice: every joint sweeps from 0.1 to 10 Hz in 20 s, all
 at once, three times over (60 s), with the largest amplitude that keeps the limits of
-position, speed and torque at parameters of the prior. *Chosen*: three signals of 8.25 s,
-one after the other. Each is the best of 150 random ones (chirps and multisines of each
-joint about centers of its own, as large as the same limits permit) by the Gauss-Newton
-information under the belief of that time, the first under the prior. *Random* takes the
+position, speed and torque at parameters of the prior.
+*Chosen*: three signals of 8.25 s, one after the other. Each is the best of 150 random
+ones (chirps and multisines of each joint about centers of its own, as large as the same
+limits permit) by the Gauss-Newton information under the belief of that time, the first
+under the prior. *Random* takes the
 first of pools made in the same way. Every belief is that of ``identify`` from the
 simulated recordings.
 
