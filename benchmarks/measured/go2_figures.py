@@ -52,6 +52,8 @@ def draw(row: Mapping[str, Any], leg: Leg, folder: Path) -> Path:
         axis.axvspan(leg.time[leg.split], leg.time[-1], color="0.93", zorder=0)
         axis.legend(fontsize=7, frameon=False, loc="upper left", ncol=4)
         axis.set_xlim(0, leg.time[-1])
+        low, high = axis.get_ylim()
+        axis.set_ylim(low, high + 0.2 * (high - low))  # room for the legend
     axes[-1].set_xlabel("time [s]")
     top.set_title(f"{leg.name}: one free run; grey: held out", fontsize=9)
     figure.tight_layout()
