@@ -56,8 +56,9 @@ def test_differences_of_evidence_are_those_of_samples(few):
     rivals = few.rivals
     sampled = [rivals.fit(k).evidence.log_evidence for k in keys]
     linear, sampled = (np.diff(np.array(v)) for v in (linear, sampled))
-    # The scale of a prior is unknown to one and not to the other: up to .7 nats each.
-    assert linear == pytest.approx(sampled, abs=1.5)
+    # The scale of a prior is unknown to one and not to the other: up to .7 nats each;
+    # hundreds of nats behind a model is linear no more.
+    assert linear == pytest.approx(sampled, abs=1.5, rel=0.01)
 
 
 def test_a_fit_is_as_good_as_that_of_a_long_search(few):

@@ -93,7 +93,9 @@ def check_against_closed_form(posterior):
     assert float(gap.mean()) < 0.1
 
 
-@pytest.mark.parametrize("density_estimator", ["mdn", "maf"])
+@pytest.mark.parametrize(
+    "density_estimator", ["mdn", pytest.param("maf", marks=pytest.mark.slow)]
+)
 def test_single_round_meets_the_closed_form(density_estimator):
     theta = PRIOR.sample((2_500,))
     trainer = ASBI(PRIOR, density_estimator, show_progress_bars=False)

@@ -11,6 +11,7 @@ from sbi_active.information_gain import (
     EntropyGain,
     InfoNCEGain,
     LikelihoodGain,
+    LinearGain,
     NestedGain,
     PosteriorGain,
     RatioGain,
@@ -41,13 +42,14 @@ ESTIMATORS = {
     "entropy": EntropyGain(),
     "info_nce": InfoNCEGain(num_contrastive=31),
     "likelihood": LikelihoodGain(num_contrastive=50),
+    "linear": LinearGain(),
     "nested": NestedGain(),
     "posterior": PosteriorGain(),
     "ratio": RatioGain(),
     "variational_nested": VariationalNestedGain(num_contrastive=4),
 }
 DRAWING = {"entropy", "nested", "variational_nested"}  # other numbers in turn
-FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "nested"})
+FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "linear", "nested"})
 
 
 @pytest.fixture

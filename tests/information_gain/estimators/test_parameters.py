@@ -48,7 +48,9 @@ def assert_lower_bound(gain, exact, slack=SLACK):
     assert (gain.mean(1) > exact - slack - 3 * error).all()
 
 
-@pytest.mark.parametrize("index", [[0], [2], [0, 1], [1, 2]])
+@pytest.mark.parametrize(
+    "index", [[0], [2], [0, 1], pytest.param([1, 2], marks=pytest.mark.slow)]
+)
 def test_the_closed_form(index):
     gain = ParameterGain(index)(None, simulations(), BELIEF)
     exact = information(index)
