@@ -138,13 +138,15 @@ def test_campaigns(run, capsys):
 
 @pytest.mark.slow
 def test_robots(run, capsys):
-    cart, verdict = run("docs/robots.md")
+    cart, verdict, motion = run("docs/robots.md")
     printed = capsys.readouterr().out
     assert "x depends on them through mass / gear alone" in printed
     assert {t.action[1].item() for t in cart.campaign.history} == {0.0, 1.0}
     belief = cart.campaign.belief
     assert ((belief.mean - cart.truth[0]).abs() < 4 * belief.variance.sqrt()).all()
     assert verdict.report.verdict == "hinge friction loss"
+    assert motion.design.estimator == "LinearGain"
+    assert motion.limits(motion.design.action[None]).all()
     text = (ROOT / "docs/robots.md").read_text()
     for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
