@@ -331,7 +331,7 @@ def summary(rows: Sequence[Mapping[str, str]]) -> list[str]:
     """Return the table: deviations beside those of the chirps."""
     lines = [
         "| machine | cases | signals | s | deviations, of the chirps' in 60 s: median, "
-        "largest | all parameters at most the chirps' | 90 % intervals that cover | "
+        "largest | deviations at most the chirps' | 90 % intervals that cover | "
         "CPU s |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -353,7 +353,7 @@ def summary(rows: Sequence[Mapping[str, str]]) -> list[str]:
             lines.append(
                 f"| {name} | {len(some)} | {arm} | {seconds:g} | "
                 f"{np.median(ratio):.2f}, {ratio.max():.2f} | "
-                f"{int((ratio <= 1).all(1).sum())} of {len(some)} | "
+                f"{int((ratio <= 1).sum())} of {ratio.size} | "
                 f"{inside} of {ratio.size} | {cpu:.0f} |"
             )
     return lines

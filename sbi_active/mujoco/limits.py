@@ -176,7 +176,7 @@ def _watched(
     found = []
     for name, limit in limits.items():
         require_name(name, known, kind)
-        low, high = limit if isinstance(limit, tuple) else (-limit, limit)
+        low, high = limit if np.ndim(limit) else (-limit, limit)
         if not low < high or math.isinf(low) and math.isinf(high):
             raise ValueError(
                 f"expected limits of {name}{what} that leave room; got {limit}; pass "

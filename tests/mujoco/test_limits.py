@@ -63,6 +63,7 @@ def test_limits_are_those_of_the_motion_itself():
         ({"velocity": {"shoulder": 3.0}}, [True, False]),
         ({"torque": {"shoulder servo": 12.0}}, [True, False]),
         ({"velocity": {"shoulder": 100.0}}, [True, True]),
+        ({"velocity": {"shoulder": [-3.0, 3.0]}}, [True, False]),
     ],
 )
 def test_each_kind_of_limit_refuses(limit, kept):

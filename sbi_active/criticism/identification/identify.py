@@ -20,6 +20,7 @@ from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
+from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 
@@ -205,22 +206,13 @@ def _weighed(found: Fitted, rng: np.random.Generator) -> tuple[Array, float, boo
         return every.copy(), float(len(every)), True
     some = order[:NUM_WEIGHED]
     log_w = _log_ratio(found, some)
-    effective = _effective(log_w)
+    effective = effective_sample_size(log_w)
     # Few draws would make for a narrow interval: rather that of the linear model.
     power = 1.0
-    while _effective(power * log_w) < FEWEST_KEPT:
+    while effective_sample_size(power * log_w) < FEWEST_KEPT:
         power *= 0.8
-    picked = rng.choice(len(some), size=len(every), p=_shares(power * log_w))
+    picked = rng.choice(len(some), size=len(every), p=normalized(power * log_w))
     return every[some[picked]].copy(), effective, False
-
-
-def _shares(log_w: Array) -> Array:
-    w = np.exp(log_w - log_w.max())
-    return w / w.sum()
-
-
-def _effective(log_w: Array) -> float:
-    return float(1 / (_shares(log_w) ** 2).sum())
 
 
 def _log_ratio(found: Fitted, at: Array) -> Array:

@@ -14,7 +14,7 @@ from sbi_active.criticism.evidence.importance import ImportanceSample
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.search import Search
+from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
@@ -52,8 +52,18 @@ CLOSE = 1.0
 def detected(misfit: Misfit) -> Detection:
     """Return that the bare model misses the trials, by the evidence of the verdict."""
     bare = misfit.search.found[ModelKey()]
+    return detection_of(bare, misfit.log_bayes_factor, LEVEL)
+
+
+def detection_of(bare: Candidate, log_b: float, level: float) -> Detection:
+    """Return what a linear bare model says of the trials.
+
+    Args:
+        bare: The model.
+        log_b: Log Bayes factor of everything else against it, nats.
+        level: Tail probability of its chi-square that is an alarm by itself.
+    """
     square, freedom, p_value = bare.model.chi_square
-    log_b = misfit.log_bayes_factor
     return Detection(
         log_bayes_factor=log_b,
         standard_error=0.0,
@@ -62,7 +72,7 @@ def detected(misfit: Misfit) -> Detection:
         chi_square=square,
         degrees_of_freedom=float(freedom),
         p_value=p_value,
-        level=LEVEL,
+        level=level,
         null_log_evidence=bare.posterior.log_sensor,
         null_cross_check=None,
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.misfit.processes import Posterior
-from sbi_active.criticism.misfit.record import alike, keep_draws
+from sbi_active.criticism.misfit.record import alike, detection_of, keep_draws
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     OUTLIER,
@@ -48,6 +48,7 @@ from sbi_active.criticism.steps.tracing import (
     estimate_of,
     likeliest_first,
     log_priors,
+    probabilities_of,
 )
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -104,21 +105,9 @@ class BySensor:
 
     def detected(self) -> Detection:
         """Return whether the bare model misses the trials."""
-        bare = self.search.found[ModelKey()]
-        square, freedom, p_value = bare.model.chi_square
+        level = LEVEL if self.rivals.has_known_noise else 0.0
         log_b = self._log_bayes_factor(self._log_z)
-        return Detection(
-            log_bayes_factor=log_b,
-            standard_error=0.0,
-            lower=log_b,
-            threshold=THRESHOLD,
-            chi_square=square,
-            degrees_of_freedom=float(freedom),
-            p_value=p_value,
-            level=LEVEL if self.rivals.has_known_noise else 0.0,
-            null_log_evidence=bare.posterior.log_sensor,
-            null_cross_check=None,
-        )
+        return detection_of(self.search.found[ModelKey()], log_b, level)
 
     def traced(self) -> Tracing:
         """Return which effects the trials point to, and record the models' draws."""
@@ -137,7 +126,7 @@ class BySensor:
             if self._verdict(log_p) == process and both[0] > both[1]:
                 beside = verdict.effects
             verdict = self._verdict(log_p)
-        p = _normalized(log_p)
+        p = probabilities_of(log_p)
         probabilities = {str(key): share for key, share in p.items()}
         inclusion = {
             name: sum(share for key, share in p.items() if name in key.effects)
@@ -211,7 +200,7 @@ class BySensor:
 
     def _verdict(self, log_p: dict[ModelKey, float]) -> ModelKey:
         """Return the most probable set of the most probable families."""
-        p = _normalized(log_p)
+        p = probabilities_of(log_p)
         errors = {key: share for key, share in p.items() if key.error}
         declared = {key: share for key, share in p.items() if key.effects}
         if errors and max(errors.values()) > sum(declared.values()):
@@ -283,11 +272,3 @@ class BySensor:
         trials = np.unique(self.rivals.measurements.trial)
         index = self.rivals.trials.index.numpy()[trials]
         return (*index[own - bare < THRESHOLD].tolist(),)
-
-
-def _normalized(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
-    values = np.array([*log_p.values()])
-    p = np.exp(values - log_sum_exp(values))
-    order = np.argsort(-p, kind="stable")
-    keys = [*log_p]
-    return {keys[i]: float(p[i]) for i in order}

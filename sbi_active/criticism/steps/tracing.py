@@ -110,7 +110,7 @@ def trace(
             log_z[key] = log_evidence(rivals, key)[0]
             log_prior[key] = value - log_z[key]
     log_p = {key: log_prior[key] + log_z[key] for key in log_z}
-    p = _normalized(log_p)
+    p = probabilities_of(log_p)
     verdict = _verdict(p, equivalent, alarm=detection.alarm)
     beside: tuple[str, ...] = ()
     found = verdict.effects
@@ -120,7 +120,7 @@ def trace(
         alone = log_z[process]
         log_z[process] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
         log_p[process] = log_prior[process] + log_z[process]
-        p = _normalized(log_p)
+        p = probabilities_of(log_p)
         verdict = _verdict(p, equivalent, alarm=detection.alarm)
         if verdict == process and rest > alone:
             beside = found
@@ -156,7 +156,8 @@ def trace(
     return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 
 
-def _normalized(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
+def probabilities_of(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
+    """Return probabilities from unnormalized logarithms, most probable first."""
     values = np.array([*log_p.values()])
     p = np.exp(values - log_sum_exp(values))
     order = np.argsort(-p, kind="stable")
@@ -284,7 +285,7 @@ def _is_robust(
         log_b = log_sum_exp(np.array(singles)) - scaled[ModelKey()]
         alarm = bool(log_b > THRESHOLD) or detection.by_chi_square
         log_p = {key: log_prior[key] + scaled[key] for key in scaled}
-        if _verdict(_normalized(log_p), equivalent, alarm=alarm) != verdict:
+        if _verdict(probabilities_of(log_p), equivalent, alarm=alarm) != verdict:
             return False
     return True
 
