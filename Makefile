@@ -8,8 +8,8 @@ INSTALLED := $(VENV)/.installed
 demo: $(INSTALLED)  ## Run the main job and show its result.
 	$(BIN)/sbi-active run numerical --method asbi --rounds 4 --seed 0 --out demo
 
-test: $(INSTALLED)  ## Run the default tests.
-	$(BIN)/python -m pytest -n auto --dist worksteal --durations=25
+test: $(INSTALLED)  ## Run the default tests, one thread for each worker.
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations=25
 
 check: $(INSTALLED)  ## Lint and types.
 	$(BIN)/ruff check .
