@@ -86,8 +86,8 @@ def number(value: float | None) -> str:
     return "" if value is None or value != value else f"{value:.3g}"
 
 
-def parameters(names: Sequence[str], draws: Tensor) -> Markup:
-    """Return mean, standard deviation and central 90 % of each parameter.
+def parameter_rows(names: Sequence[str], draws: Tensor) -> list[tuple[str, ...]]:
+    """Return name, mean, standard deviation and central 90 % of each parameter.
 
     Args:
         names: One a parameter.
@@ -96,10 +96,15 @@ def parameters(names: Sequence[str], draws: Tensor) -> Markup:
     values = draws.double().numpy()
     low, high = np.quantile(values, [0.05, 0.95], axis=0)
     mean, sd = values.mean(0), values.std(0)
-    rows = [
+    return [
         (name, f"{m:.4g}", f"{s:.2g}", f"{a:.4g} to {b:.4g}")
         for name, m, s, a, b in zip(names, mean, sd, low, high, strict=True)
     ]
+
+
+def parameters(names: Sequence[str], draws: Tensor) -> Markup:
+    """Return :func:`parameter_rows` as a table."""
+    rows = parameter_rows(names, draws)
     left = len(rows) - MOST_PARAMETERS
     header = ("parameter", "mean", "sd", "central 90 %")
     more = f"<div>and {left} more</div>" if left > 0 else ""

@@ -21,6 +21,7 @@ FLOORS = (
     "seeding",
     "threads",
     "notebook",
+    "page",
     "progress",
     "arviz_versions",
     "arrays",

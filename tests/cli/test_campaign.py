@@ -176,5 +176,5 @@ def test_a_missing_effect_is_found_and_adopted(made, capsys, monkeypatch):
     assert main(["report", "camp"]) == 0
     page = (made / "report.html").read_text()
     assert "bias" in page
-    assert "data:image/png;base64," in page
+    assert "data:image/svg+xml;base64," in page
     assert "http" not in page.replace("http-equiv", "")

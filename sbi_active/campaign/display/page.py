@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import os
 from pathlib import Path
 from typing import Any
 
-from sbi_active.notebook import badge, escaped, items, parameters, table
+from sbi_active.notebook import parameter_rows
+from sbi_active.page import Part, Picture, Table, render
 from sbi_active.seeding import forked_generators
 
-STYLE = """
-:root { color-scheme: light dark; }
-body { font-family: system-ui, sans-serif; margin: 2em auto; max-width: 62em;
-  padding: 0 1em; line-height: 1.45; }
-img { max-width: 100%; background: white; border-radius: .4em; }
-h2 { font-size: 1.1em; margin: 1.6em 0 .4em; }
-footer { opacity: .65; margin-top: 2em; font-size: .9em; }
-"""
 #: Draws behind the page's numbers: a mean is then known to a 60th of a deviation.
 NUM_DRAWS = 4_000
 #: Columns of the table of trials that a reader of the page does not need.
@@ -36,24 +27,24 @@ def page(campaign: Any) -> str:
 
     has_simulator = campaign.simulator is not None
     figure = campaign.plot(**({} if has_simulator else {"num_predicted": 0}))
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=110)
+    known = _belief(campaign)
+    picture = Picture.of(figure, _in_words(campaign, known))
     plt.close(figure)
-    picture = base64.b64encode(image.getvalue()).decode()
-    title = escaped(f"Campaign: {campaign.actions!r}")
-    sections = [
-        ("What is known", _belief(campaign)),
-        ("Course", f'<img alt="course" src="data:image/png;base64,{picture}">'),
-        ("Trials", _trials(campaign)),
-        ("Compared with what it may lack", _verdicts(campaign)),
-        ("Limits", _limits(campaign)),
+    limits = _limits(campaign)
+    parts = [
+        Part("Limits", items=limits, warns=True) if limits else None,
+        Part("What is known", table=known, text=_together(campaign)),
+        Part("Course", picture=picture),
+        Part("Trials", table=_trials(campaign)) if campaign.state.trials else None,
+        _verdicts(campaign),
     ]
-    body = "".join(f"<h2>{name}</h2>{part}" for name, part in sections if part)
-    return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{title}</title><style>{STYLE}</style></head><body>"
-        f"<h1>{title}</h1>{_summary(campaign)}{body}"
-        f"<footer>{escaped(_origin(campaign))}</footer></body></html>\n"
+    kinds = {"ok": "good", "watch": "fair", "alarm": "bad"}
+    return render(
+        f"Campaign: {campaign.actions!r}",
+        [part for part in parts if part is not None],
+        badge=(f"health {campaign.health}", kinds[campaign.health]),
+        lead=[_summary(campaign)],
+        footer=_origin(campaign),
     )
 
 
@@ -65,27 +56,44 @@ def write_page(campaign: Any, path: str | os.PathLike[str]) -> Path:
 
 
 def _summary(campaign: Any) -> str:
-    kinds = {"ok": "good", "watch": "fair", "alarm": "bad"}
     waiting = [t.index for t in campaign.history if not campaign.contains(t)]
     late = f"; not in the belief yet: {waiting}" if waiting else ""
     pending = campaign.pending
     asked = "" if pending is None else f"; trial {pending.index} is pending"
-    health = badge(campaign.health, kinds[campaign.health])
-    told = escaped(f"{len(campaign.history)} trials told{asked}{late}")
-    return f"<p>health {health} {told}</p>"
+    return f"{len(campaign.history)} trials told{asked}{late}"
 
 
-def _belief(campaign: Any) -> str:
+def _belief(campaign: Any) -> Table:
     with forked_generators(0, "page"):
         draws = campaign.belief.sample((NUM_DRAWS,))
-    return parameters(campaign.parameter_names, draws)
+    header = ("parameter", "mean", "sd", "central 90 %")
+    return Table(header, parameter_rows(campaign.parameter_names, draws))
 
 
-def _trials(campaign: Any) -> str:
+def _together(campaign: Any) -> list[str]:
+    """Return what is known of parameters that are not known one by one."""
+    diagnostics = getattr(campaign.belief, "diagnostics", None)
+    found = getattr(diagnostics, "combinations", None)
+    return [str(found)] if found else []
+
+
+def _in_words(campaign: Any, known: Table) -> str:
+    ends = "; ".join(f"{row[0]} {row[1]}, {row[3]}" for row in known.rows)
+    gained = [t.information_gained for t in campaign.history]
+    told = sum(g for g in gained if g is not None)
+    return (
+        "The belief of each parameter by round, the information that each action was "
+        "expected to tell, outcomes beside their predictions, and the information "
+        f"gained by trial. After {len(campaign.history)} trials and {told:.3g} nats: "
+        f"{ends}."
+    )
+
+
+def _trials(campaign: Any) -> Table:
     frame = campaign.to_dataframe().drop(columns=[*LEFT_OUT], errors="ignore")
     kept = frame.loc[:, [c for c in frame.columns if not frame[c].isna().all()]]
     rows = [[_cell(value) for value in row] for row in kept.itertuples(index=False)]
-    return table([*kept.columns], rows) if rows else ""
+    return Table([*map(str, kept.columns)], rows)
 
 
 def _cell(value: Any) -> str:
@@ -94,18 +102,19 @@ def _cell(value: Any) -> str:
     return "" if value is None else f"{value!s:.60}"
 
 
-def _verdicts(campaign: Any) -> str:
+def _verdicts(campaign: Any) -> Part | None:
     rows = [
         (entry["time"][:16].replace("T", " "), entry["verdict"])
         for entry in campaign.events
         if entry["event"] == "examined"
     ]
-    return table(("when", "verdict"), rows) if rows else ""
+    table = Table(("when", "verdict"), rows)
+    return Part("Compared with what it may lack", table=table) if rows else None
 
 
-def _limits(campaign: Any) -> str:
+def _limits(campaign: Any) -> list[str]:
     diagnostics = getattr(campaign.belief, "diagnostics", None)
-    return "" if diagnostics is None else items(diagnostics.warnings)
+    return [] if diagnostics is None else [*diagnostics.warnings]
 
 
 def _origin(campaign: Any) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sbi_active.criticism.report.conditions import first_paragraph
 from sbi_active.criticism.report.contents import Contents
@@ -17,9 +17,9 @@ from sbi_active.criticism.report.figures import (
     plot_residuals,
 )
 from sbi_active.criticism.report.headline import added, verdict_line
-from sbi_active.criticism.report.section import Section
 from sbi_active.criticism.report.sections import sections
 from sbi_active.notebook import card, items, number, table
+from sbi_active.page import Part, Picture, Table, render
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,22 +34,6 @@ CAPTIONS = {
     "before_after": "One line a scored trial; the bars are over all of them. "
     "Lower is better for the first two, higher for the third; the dotted line is 90 %.",
 }
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #20262b; max-width: 60rem;
-       margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.35rem; line-height: 1.35; border-left: 5px solid #2f6f9f;
-     padding-left: .8rem; }
-h2 { font-size: 1.05rem; margin: 2rem 0 .5rem; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums;
-        font-size: .9rem; }
-th, td { text-align: right; padding: .25rem .8rem .25rem 0;
-         border-bottom: 1px solid #e2e6e9; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-div.wide { overflow-x: auto; }
-figure { margin: 1rem 0; } img { max-width: 100%; }
-figcaption { font-size: .85rem; color: #5d6870; }
-.warnings { background: #fdf3e1; padding: .6rem 1rem .6rem 2rem; margin: 0; }
-""".strip()
 
 
 def figures(report: Contents) -> dict[str, Figure]:
@@ -107,31 +91,27 @@ def to_markdown(report: Contents) -> str:
 
 def to_html(report: Contents) -> str:
     """Return the report as one page without references to other files."""
-    title, e = html.escape(verdict_line(report)), html.escape
     drawn = figures(report)
-    parts = [
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f"<title>{title}</title>\n<style>\n{STYLE}\n</style>\n</head>\n<body>",
-        f"<h1>{title}</h1>",
-        f"<p>{e(first_paragraph(report))}</p>",
-    ]
+    parts = []
     for section in sections(report):
-        parts.append(f"<h2>{e(section.title)}</h2>")
-        parts += [f"<p>{e(paragraph)}</p>" for paragraph in section.text]
-        if section.items:
-            kind = ' class="warnings"' if section.title == "Warnings" else ""
-            points = "".join(f"<li>{e(item)}</li>" for item in section.items)
-            parts.append(f"<ul{kind}>{points}</ul>")
-        if section.rows:
-            parts.append(_html_table(section))
+        text = tuple(map(_with_signs, section.text))
+        rows = [[*map(_with_signs, row)] for row in section.rows]
+        picture = None
         if section.figure is not None:
             caption = CAPTIONS[section.figure]
-            image = _embedded(drawn[section.figure])
-            parts.append(
-                f'<figure><img alt="{e(caption)}" src="{image}">'
-                f"<figcaption>{e(caption)}</figcaption></figure>"
-            )
-    return "\n".join([*parts, "</body>\n</html>\n"]).replace(" +- ", " &plusmn; ")
+            words = f"{caption} {_told(report, section.figure)}".strip()
+            picture = Picture.of(drawn[section.figure], words, caption)
+        part = Part(
+            section.title,
+            text=text,
+            items=[*map(_with_signs, section.items)],
+            table=Table(section.header, rows) if rows else None,
+            picture=picture,
+            warns=section.title == "Warnings",
+        )
+        parts.append(part)
+    lead = [_with_signs(first_paragraph(report))]
+    return render(_with_signs(verdict_line(report)), parts, lead=lead)
 
 
 def to_notebook(report: Contents) -> str:
@@ -152,21 +132,24 @@ def to_notebook(report: Contents) -> str:
     )
 
 
-def _html_table(section: Section) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        inner = "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells)
-        return f"<tr>{inner}</tr>"
-
-    body = "\n".join(line(row, "td") for row in section.rows)
-    table = f"<table>\n{line(section.header, 'th')}\n{body}\n</table>"
-    return f'<div class="wide">{table}</div>'
+def _with_signs(text: str) -> str:
+    return text.replace(" +- ", " \N{PLUS-MINUS SIGN} ")
 
 
-def _embedded(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
-    code = base64.b64encode(buffer.getvalue()).decode()
-    return f"data:image/png;base64,{code}"
+def _told(report: Contents, figure: str) -> str:
+    """Return the numbers of a figure in words, for who does not see it."""
+    if figure == "probabilities":
+        shares = sorted(report.probabilities.items(), key=lambda item: -item[1])[:5]
+        return ", ".join(f"{name}: {share:.2f}" for name, share in shares) + "."
+    if figure == "before_after":
+        names = report.before_after["metric"]
+        values = report.before_after[["before", "after"]].to_numpy(dtype=float)
+        pairs = zip(names, values, strict=True)
+        return "; ".join(f"{n}: {a:.3g} to {b:.3g}" for n, (a, b) in pairs) + "."
+    each = report.residuals.refitted
+    finite = each[np.isfinite(each)]
+    largest = np.abs(finite).max(initial=0.0)
+    return f"The largest of the bare model is {largest:.3g} standard deviations."
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
