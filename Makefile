@@ -2,8 +2,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+DOCS := $(VENV)/.docs-installed
+SITE := docs/_build/html
 
-.PHONY: demo test check clean
+.PHONY: demo test check docs docs-serve clean
 
 demo: $(INSTALLED)  ## Run the main job and show its result.
 	$(BIN)/sbi-active run numerical --method asbi --rounds 4 --seed 0 --out demo
@@ -16,10 +18,21 @@ check: $(INSTALLED)  ## Lint and types.
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+docs: $(DOCS)  ## Build the site, without network, and check its links and names.
+	$(BIN)/python -m sphinx -b html -W --keep-going docs $(SITE)
+	$(BIN)/python docs/_ext/check_site.py $(SITE)
+
+docs-serve: docs  ## Show the site at http://localhost:8000.
+	$(BIN)/python -m http.server --directory $(SITE) --bind 127.0.0.1 8000
+
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	touch $@
 
+$(DOCS): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo build dist
+	rm -rf $(VENV) demo build dist docs/_build docs/reference/api

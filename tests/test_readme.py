@@ -152,11 +152,33 @@ def test_robots(run, capsys):
         assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
 
 
+def test_getting_started(run, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (page,) = run("docs/start.md")
+    assert "Belief(refined: friction" in capsys.readouterr().out
+    assert len(page.campaign.history) == 1
+
+
+def test_questions(run, capsys):
+    """The pages of one question each, and what their snippets are to show."""
+    (enough,) = run("docs/howto/how_many_simulations.md")
+    assert 0 < enough.found.num_simulations <= 3_000
+    (failed,) = run("docs/howto/failed_trial.md")
+    assert [t.status for t in failed.campaign.history] == ["invalid", "missing"]
+    # Off the table, further than 1 m: friction is below what slides as far.
+    speed = failed.campaign.history[0].action
+    assert failed.campaign.belief.mean < speed**2 / (2 * 9.81)
+    run("docs/howto/which_parameters.md")
+    assert "friction * mass" in capsys.readouterr().out
+    run("docs/howto/two_models.md")
+    assert "speed" in capsys.readouterr().out
+
+
 def test_no_page_is_forgotten():
     pages = {
         page.name
-        for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-        if "```python" in page.read_text()
+        for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+        if "```python" in page.read_text() and "_build" not in page.parts
     }
     assert pages == {
         "README.md",
@@ -167,4 +189,9 @@ def test_no_page_is_forgotten():
         "closing_the_loop.md",
         "identifiability.md",
         "robots.md",
+        "start.md",
+        "how_many_simulations.md",
+        "failed_trial.md",
+        "which_parameters.md",
+        "two_models.md",
     }

@@ -18,7 +18,7 @@ TABLE = Table(
 def test_all_text_is_escaped():
     parts = [Part("<b>", text=["<i>"], items=["<u>"], table=Table(("<p>",), [("&",)]))]
     made = render("<h>", parts, lead=["<q>"], badge=("<x>", "bad"), footer="<y>")
-    for tag in "<b> <i> <u> <h> <q> <x> <y>".split():
+    for tag in ["<b>", "<i>", "<u>", "<h>", "<q>", "<x>", "<y>"]:
         assert tag not in made
         assert tag.replace("<", "&lt;").replace(">", "&gt;") in made
     assert "<td>&amp;</td>" in made

@@ -1,0 +1,161 @@
+"""Write the reference: a page a package, every public name on it.
+
+The names are those of ``__all__``, and of the modules in ``FURTHER`` what users get
+back or declare with and need not import, so that no name can be forgotten.
+"""
+
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from sphinx.application import Sphinx
+
+import sbi_active
+
+PAGES = Path(__file__).parents[1] / "reference" / "api"
+PACKAGES = [name for name in (*sbi_active._HOMES, "tasks") if name != "export"]
+#: Modules whose classes and functions users meet without importing them, by package.
+FURTHER = {
+    "actions": {"sbi_active.actions.waveforms": ()},
+    "criticism": {
+        "sbi_active.criticism.results": (),
+        "sbi_active.criticism.effects.first_samples": (
+            "start_from_first_samples",
+            "zero_from_first_samples",
+        ),
+    },
+    "design": {"sbi_active.export": ("to_inference_data",)},
+    "inference": {"sbi_active.inference.beliefs.diagnostics": ()},
+    "mujoco": {
+        "sbi_active.mujoco.models.changes": ("ModelChange", "StateChange"),
+    },
+    "simulation": {"sbi_active.simulation.report": ("SimulatorReport",)},
+}
+#: Ancestors of other projects: their members are documented there.
+#: A shape such as (n, *x_shape), whose star is no emphasis.
+STAR = re.compile(r"(?<![\\\w*`])\*(?=[a-z_]+\b(?!\*))")
+END = re.compile(r"(?<=[A-Za-z])_(?=\W|$)")  # of a column's prefix: no link
+FOREIGN = "Distribution,NPE_C,NLE_A,NRE_A,NeuralPosterior,RuntimeError,Warning,object"
+
+
+def public(module: ModuleType, names: tuple[str, ...] = ()) -> list[str]:
+    """Return the names of a module that are documented."""
+    if names:
+        return [*names]
+    if hasattr(module, "__all__"):
+        return [*module.__all__]
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and getattr(value, "__module__", None) == module.__name__
+        and (inspect.isclass(value) or inspect.isfunction(value))
+    ]
+
+
+def groups(package: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the modules of a page, and which of their names it holds."""
+    home = f"sbi_active.{package}"
+    yield home, public(importlib.import_module(home))
+    for name, chosen in FURTHER.get(package, {}).items():
+        yield name, public(importlib.import_module(name), chosen)
+
+
+def first_line(value: object) -> str:
+    """Return what a name is, in a line."""
+    text = (inspect.getdoc(value) or "").split("\n\n")[0].replace("\n", " ")
+    return text.replace("|", "\\|") if callable(value) else ""
+
+
+def page(package: str) -> str:
+    """Return the page of a package, as MyST."""
+    home = importlib.import_module(f"sbi_active.{package}")
+    lines = [f"# `sbi_active.{package}`", "", "```{eval-rst}"]
+    lines += [inspect.getdoc(home) or "", "```", ""]
+    for module_name, names in groups(package):
+        module = importlib.import_module(module_name)
+        if module is not home:
+            lines += [f"## From `{module_name}`", ""]
+        lines += ["```{eval-rst}", f".. py:currentmodule:: {module_name}", ""]
+        for name in names:
+            lines += [_directive(module_name, name, getattr(module, name)), ""]
+        lines += ["```", ""]
+    return "\n".join(lines)
+
+
+def _directive(module: str, name: str, value: Any) -> str:
+    if inspect.isclass(value):
+        head = f".. autoclass:: {module}.{name}{_arguments(value)}\n   :members:"
+        if issubclass(value, (tuple, Enum)):
+            return head.removesuffix("\n   :members:")  # fields stand in its docstring
+        return f"{head}\n   :inherited-members: {FOREIGN}"
+    if inspect.isroutine(value):
+        return f".. autofunction:: {module}.{name}"
+    head = f".. py:data:: {name}\n   :module: {module}"
+    return f"{head}\n\n   All of them: {', '.join(value)}."
+
+
+def _arguments(value: type) -> str:
+    """Return the arguments of a class where autodoc cannot: it takes self off twice."""
+    if not any(base.__module__.startswith("sbi.inference") for base in value.__mro__):
+        return ""
+    bare = [
+        p.replace(annotation=inspect.Parameter.empty)
+        for p in inspect.signature(value).parameters.values()
+    ]
+    return str(inspect.Signature(bare))
+
+
+def overview() -> str:
+    """Return the table of all public names."""
+    lines = ["| name | package | what it is |", "|---|---|---|"]
+    rows = {}
+    for package in PACKAGES:
+        module = importlib.import_module(f"sbi_active.{package}")
+        for name in module.__all__:
+            text = first_line(getattr(module, name))
+            link = f"[`{name}`](#sbi_active.{package}.{name})"
+            top = "**top level**, " if name in sbi_active.__all__ else ""
+            rows[name] = f"| {link} | {top}`{package}` | {text} |"
+    return "\n".join([*lines, *(rows[n] for n in sorted(rows, key=str.lower))]) + "\n"
+
+
+def _prepared(
+    app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]
+) -> None:
+    """Escape stars of shapes; of other projects' docstrings take the first line."""
+    home = getattr(inspect.unwrap(value), "__module__", "") if callable(value) else ""
+    if home and not home.startswith("sbi_active"):
+        lines[:] = [" ".join(lines).split(". ")[0].rstrip(".") + f" (of ``{home}``)."]
+    lines[:] = [_escaped(line) for line in lines]
+
+
+def _escaped(line: str) -> str:
+    parts = re.split(r"(``.*?``|`.*?`)", line)  # what is literal stays
+    return "".join(
+        p if p.startswith("`") else STAR.sub(r"\\*", END.sub(r"\\_", p)) for p in parts
+    )
+
+
+def _write(path: Path, text: str) -> None:
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def _generate(app: Sphinx) -> None:
+    PAGES.mkdir(parents=True, exist_ok=True)
+    for package in PACKAGES:
+        _write(PAGES / f"{package}.md", page(package))
+    _write(PAGES / "names.txt", overview())
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the pages before they are read."""
+    app.connect("builder-inited", _generate)
+    app.connect("autodoc-process-docstring", _prepared, priority=800)  # after Google's
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
