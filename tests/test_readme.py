@@ -47,16 +47,20 @@ def run(tmp_path, monkeypatch):
 
 
 def test_readme(run, capsys):
-    campaign, style, loop = run("README.md")
-    printed = capsys.readouterr().out
-    assert "Design(action [4], EIG" in printed
-    assert "theta[theta_1]" in printed
+    (campaign,) = run("README.md")
+    assert "Design(action [4], EIG" in capsys.readouterr().out
     assert len(campaign.campaign.history) == 3
     deviation = campaign.belief.variance.sqrt()
     assert (deviation < torch.tensor([0.03, 0.06])).all()  # of priors .26 wide
     truth = torch.tensor([0.4, 0.3])
     assert ((campaign.belief.mean - truth).abs() < 4 * deviation).all()
     assert not campaign.belief.diagnostics.combinations
+
+
+def test_overview(run, capsys):
+    style, loop = run("docs/overview.md")
+    printed = capsys.readouterr().out
+    assert "theta[theta_1]" in printed
     assert len(style.inference.trials) == 2
     assert loop.report.verdict == "bias"
     assert "Verdict: bias (P" in printed
@@ -190,6 +194,7 @@ def test_no_page_is_forgotten():
         "identifiability.md",
         "robots.md",
         "start.md",
+        "overview.md",
         "how_many_simulations.md",
         "failed_trial.md",
         "which_parameters.md",

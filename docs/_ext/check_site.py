@@ -62,9 +62,11 @@ def problems(site: Path) -> tuple[list[str], set[str]]:
             target = target.resolve()
             if not target.exists():
                 found.append(f"{name} links to {link}, which is not there")
-            elif parts.fragment and target in pages:
-                if unquote(parts.fragment) not in pages[target].anchors:
-                    found.append(f"{name} links to {link}, an anchor that is not there")
+            elif target in pages and unquote(parts.fragment) not in (
+                "",
+                *pages[target].anchors,
+            ):
+                found.append(f"{name} links to {link}, an anchor that is not there")
     return found, outside
 
 

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Swap SNPE for ASBI
 #
-# sbi's own first example with one line changed, and then with actions. Nothing that works
-# with sbi stops working: without `action=`, `ASBI` *is* sbi's `NPE_C`, with the same
-# numbers at the same seed.
+# sbi's own first example with one line changed, and then with actions. Nothing that
+# works with sbi stops working: without `action=`, `ASBI` *is* sbi's `NPE_C`, with the
+# same numbers at the same seed.
 #
 # Sizes here are small, so that the page is executed in seconds.
 
@@ -35,8 +35,8 @@ draws.mean(0), draws.std(0)
 # ## With an action
 #
 # Now the robot chooses what it does. A simulator takes the parameters, shape
-# `(n, theta_dim)`, and the actions, shape `(n, action_dim)`. Here the action decides how
-# much of each parameter shows.
+# `(n, theta_dim)`, and the actions, shape `(n, action_dim)`. Here the action decides
+# how much of each parameter shows.
 
 # %%
 from sbi_active import ASBI, DiscreteActions, InformationGainDesigner
@@ -67,8 +67,9 @@ for trial in range(2):
 
 # %% [markdown]
 # The same four calls as in sbi, `append_simulations`, `train`, `build_posterior` and
-# `sample`, and two more: `select` picks the action, `update` takes the outcome. `belief`
-# is a `torch.distributions.Distribution`; what was found about its quality stands in
+# `sample`, and two more: `select` picks the action, `update` takes the outcome.
+# `belief` is a `torch.distributions.Distribution`; what was found about its quality
+# stands in
 
 # %%
 print(belief.diagnostics)

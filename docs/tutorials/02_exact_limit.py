@@ -1,10 +1,10 @@
 # %% [markdown]
 # # The active loop beside the exact limit
 #
-# The numerical model of Kim & Matsubara (2025) has two parameters, and its posterior can
-# be computed: $x = \theta_1 e^{3 - \xi} + \theta_2\, \xi + \varepsilon$. So whatever the
-# loop says can be compared with the right answer: the belief, and the information that
-# an action gives.
+# The numerical model of Kim & Matsubara (2025) has two parameters, and its posterior
+# can be computed: $x = \theta_1 e^{3 - \xi} + \theta_2\, \xi + \varepsilon$. So
+# whatever the loop says can be compared with the right answer: the belief, and the
+# information that an action gives.
 #
 # Reduced sizes: one campaign of three trials. The full comparison, 60 campaigns, stands
 # in [what was measured](../benchmarks.md).

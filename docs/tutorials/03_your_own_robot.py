@@ -103,8 +103,8 @@ campaign.close()
 
 # %% [markdown]
 # A trial that ran and gave no measurement (the sled fell off the table) is
-# `tell(status="invalid")`, which is information. A fault that has nothing to do with the
-# parameters is `tell(status="missing")`.
+# `tell(status="invalid")`, which is information. A fault that has nothing to do with
+# the parameters is `tell(status="missing")`.
 #
 # ## From another language
 #
@@ -126,5 +126,5 @@ print(json.dumps(status["belief"]["parameters"], indent=1))
 
 # %% [markdown]
 # `ask` needs the simulator's file, `tell`, `status` and `correct` do not: the computer
-# beside the robot needs no simulator. See [campaigns](../campaigns.md) for all commands,
-# and `sbi-active report sled` for one page that can be sent.
+# beside the robot needs no simulator. See [campaigns](../campaigns.md) for all
+# commands, and `sbi-active report sled` for one page that can be sent.

@@ -83,5 +83,6 @@ print(
 # ## A simulator that takes a minute
 #
 # A campaign takes `CampaignOptions(bank="folder", num_workers=8, time_limit=600,
-# max_simulations=2_000)`: rows go to the bank, and a round that ends for want of rows
-# says so. How many a belief needs: see [how many](../howto/how_many_simulations.md).
+# network="on demand")`: rows go to the bank, and only those are simulated that the
+# belief and the design need: see
+# [how many](../howto/how_many_simulations.md).

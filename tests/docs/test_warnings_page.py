@@ -48,6 +48,7 @@ def named() -> set[str]:
         for path in files()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.ClassDef)
+        and node.bases  # an error of a fit is none
         and re.search("(Error|Warning|Interrupted)$", node.name)
     }
 
