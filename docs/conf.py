@@ -47,6 +47,7 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # paths of the machine that built the site
 nb_ipywidgets_js = {}  # would be fetched by the reader's browser
 nb_mime_priority_overrides = [("html", "text/plain", 50)]
 

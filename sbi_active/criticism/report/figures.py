@@ -101,7 +101,7 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
         names,
         values,
         height=0.65,
-        color=[AFTER if i else "#d8dee3" for i in inside],
+        color=[AFTER if i else "#aab3ba" for i in inside],
     )
     for y, value in enumerate(values):
         text = f"{value:.2f}" if value >= 0.005 else "< 0.01"
