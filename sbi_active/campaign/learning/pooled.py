@@ -30,7 +30,6 @@ from sbi_active.inference.emulation.joint import candidate_gains
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.posterior import PooledPosterior, PooledTrial
 from sbi_active.inference.emulation.summaries import fitted_summaries
-from sbi_active.inference.refinement.simulated_likelihood import MeanTable
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.simulation.noise.base import NoiseModel
@@ -118,11 +117,11 @@ class PooledLearner(Learner):
     def pool(self) -> Pool:
         """All simulations for the current model."""
         simulator, workers = self.simulator, self._state.options.workers
-        if self.noise is not None:
-            simulator = MeanTable(simulator, workers)._bare
+        if self.noise is not None and isinstance(simulator, SimulatorModel):
+            simulator = simulator.without_noise()
         return Pool(simulator, self._state.batches, workers)
 
-    def _posterior(self, *key: object) -> PooledPosterior:
+    def _posterior(self, *key: int | str) -> PooledPosterior:
         return PooledPosterior(
             self.prior,
             self.pool,

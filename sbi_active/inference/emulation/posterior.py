@@ -116,7 +116,7 @@ class PooledPosterior:
         at_start, start = len(self.pool), self.pool.num_missing
         reference = self.draws(before)
         labels = [self.best_summary(t, reference) for t in trials]
-        first, errors = None, None
+        first, errors = None, np.full(1, np.inf)
         left = allowance
         for stage in range(NUM_STAGES + 1):
             fitted = tuple(
@@ -125,7 +125,7 @@ class PooledPosterior:
             )
             likelihood = PooledLikelihood(self.coordinates, fitted)
             # What is not known yet may have its peak elsewhere.
-            sure = errors is not None and errors.sum() < LARGE
+            sure = errors.sum() < LARGE
             particles = self._sample(likelihood, first if sure else None)
             reference = particles.resample(NUM_REFERENCE, self.rng)
             errors = np.array([one.error(reference) for one in fitted])
@@ -191,8 +191,8 @@ class PooledPosterior:
         if used.any() and valid.sum() < needed:
             raise UnexplainedOutcomeError(
                 f"expected at least {needed} simulations with a measurement at "
-                f"{trial.action.tolist()}; got {int(valid.sum())} of {len(rows)}; allow "
-                "more simulations, or leave the trial out"
+                f"{trial.action.tolist()}; got {int(valid.sum())} of {len(rows)}; allow"
+                " more simulations, or leave the trial out"
             )
         if used.any():
             most = MOST_ROWS[self.noise is not None]
@@ -236,9 +236,9 @@ class PooledPosterior:
     ) -> TrialOutcome | None:
         """Return the probability that a trial has a measurement, as it had, or none."""
         if used.any():
-            agrees = np.isfinite(numbers[:, used]).all(1)
+            agrees = np.asarray(np.isfinite(numbers[:, used]).all(1))
         else:
-            agrees = ~np.isfinite(numbers).any(1)
+            agrees = np.asarray(~np.isfinite(numbers).any(1))
         if agrees.all() and len(agrees):
             return None
         pairs = np.zeros((0, 2), dtype=bool)
