@@ -186,8 +186,11 @@ def table(rows: list[dict[str, str]]) -> str:
     text = [as_table(lines, header), ""]
     prices = [[task] for task in costs]
     for line, options in zip(prices, costs.values(), strict=True):
-        good = [o for o in options if o[1] <= 0.2] or options
+        good = [o for o in options if o[1] <= 0.2]
         for price in PRICES:
+            if not good:  # none is worth its price
+                line.append("none")
+                continue
             best = min(good, key=lambda o: o[2] * price + o[3])
             line.append(f"{best[0]}: {best[2] * price + best[3]:.3g} s")
     text.append("cheapest round with a median KL <= .2 nat, by CPU s of a simulation:")
