@@ -8,6 +8,7 @@ from sbi_active.actions.discrete import DiscreteActions
 from sbi_active.actions.mixed import MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.space import ActionSpace
+from sbi_active.actions.summaries import SummaryAction
 
 __all__ = [
     "ActionSpace",
@@ -15,4 +16,5 @@ __all__ = [
     "DiscreteActions",
     "MixedActions",
     "SignalActions",
+    "SummaryAction",
 ]

@@ -17,12 +17,13 @@ from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.campaign.display.progress import StageWatch, rounds
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.learning.draws import keep_draws
-from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.planner import Planner
+from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import criticize, recompute, revise
 from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.spending import learned, require_left
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.loading import load
@@ -30,6 +31,7 @@ from sbi_active.campaign.storage.manifest import new_manifest, write_manifest
 from sbi_active.campaign.storage.simulations import num_rows
 from sbi_active.campaign.storage.storage import Storage, stored
 from sbi_active.campaign.trials import CampaignTrials
+from sbi_active.simulation.workers.meter import metering
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
@@ -114,7 +116,8 @@ class Campaign(CampaignTrials):
         find_method(method)  # an unknown name is an error here
         actions, options = action_space(actions), CampaignOptions.of(options)
         state = CampaignState(method, seed, options, num_earlier=num_rows(options.bank))
-        learner = Learner(simulator, prior, actions, state)
+        with metering(state.meter):
+            learner = make_learner(simulator, prior, actions, state)
         limits = Limits(actions, constraint, cost)
         state.watch = StageWatch(show_progress)
         self._begin(state, actions, learner, Planner(limits, state, effects))
@@ -263,6 +266,7 @@ class Campaign(CampaignTrials):
             return self.pending
         self._planner.require(target)
         self.update()
+        require_left(self.state)
         index = len(self.state.trials)
         self.state.trials.append(Trial(index, torch.empty(0)))
         try:
@@ -291,10 +295,8 @@ class Campaign(CampaignTrials):
         for trial in self.history:
             if trial.index in state.processed:
                 continue
-            if trial.is_measured:
-                if trial.version != state.version.number:
-                    learner.score(trial)
-                learner.learn(state.trials[trial.index])
+            if trial.is_measured and not learned(learner, state, trial):
+                break
             state.processed.append(trial.index)
             if trial.is_measured:
                 keep_draws(state, learner.belief)

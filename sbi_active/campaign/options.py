@@ -58,6 +58,13 @@ class CampaignOptions:
             any simulator fits, and nothing tells that it is wrong. None never checks.
             A campaign that is given effects turns to the model by itself.
         stop: When :meth:`.Campaign.run` ends before its last round.
+        max_simulations: Of the whole campaign, which never simulates more: belief,
+            designs and scores then share one pool of rows
+            (:mod:`sbi_active.inference.emulation`), and no network is trained. When
+            they are used up, :meth:`.Campaign.run` ends, :meth:`.Campaign.ask` says so
+            and the last belief stands. ``Campaign.state.meter`` has what was spent.
+        planned_trials: Trials that ``max_simulations`` is to last for; each further one
+            gets half of what is left.
         num_workers: Of all simulations, as in :class:`.Workers`.
         time_limit: As in :class:`.Workers`.
         num_retries: As in :class:`.Workers`.
@@ -84,6 +91,8 @@ class CampaignOptions:
     num_scored: int = 2_000
     check_every: int | None = None
     stop: StopRules = StopRules()
+    max_simulations: int | None = None
+    planned_trials: int = 6
     num_workers: int = 1
     time_limit: float | None = None
     num_retries: int = 0
@@ -160,6 +169,16 @@ class CampaignOptions:
             raise ValueError(
                 "expected network 'each round' or 'on demand'; got "
                 f"{self.network!r}; pass one of these"
+            )
+        if self.max_simulations is not None and self.max_simulations < 100:
+            raise ValueError(
+                f"expected max_simulations >= 100 or None; got {self.max_simulations}; "
+                "use some hundred a trial"
+            )
+        if self.planned_trials < 1:
+            raise ValueError(
+                f"expected planned_trials >= 1; got {self.planned_trials}; pass the "
+                "number of trials that you can run"
             )
         if self.num_scored < 100:
             raise ValueError(

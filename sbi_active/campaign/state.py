@@ -13,6 +13,8 @@ from torch import Tensor
 from sbi_active.campaign.display.html import trial_html
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.design.designer import Design
+from sbi_active.inference.emulation.pool import Batch
+from sbi_active.simulation.workers.meter import Meter
 
 Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
 
@@ -56,6 +58,8 @@ class Trial:
             refined, its "start", which adds simulations there and no weight, and its
             "diagnostics", which compare the two; and :attr:`.Campaign.posterior`, as
             "posterior".
+        summary: The summary of the outcome that the belief rests on, where the action
+            chooses among several.
         reason: Why it was withdrawn.
         version: Number of the model that scored the trial.
         seconds: Wall time by stage; this and what follows add up where the campaign is
@@ -78,6 +82,7 @@ class Trial:
     misfit: float | None = None
     outlyingness: float | None = None
     network_used_by: tuple[str, ...] = ()
+    summary: str | None = None
     reason: str = ""
     version: int | None = None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -157,6 +162,9 @@ class CampaignState:
         num_earlier: Rows that were in ``options.bank`` before the campaign.
         draws: Some of the belief after each trial, for pictures, by the trial's index,
             shape (n, theta_dim); of the parameters that the model had then.
+        batches: What was simulated for the current model where belief, designs and
+            scores share their simulations.
+        meter: Counts the campaign's simulations.
         watch: Entered around whatever may take long, with the state, the index of the
             trial that it is for (of the next one where it is for none) and its name.
     """
@@ -170,7 +178,12 @@ class CampaignState:
     is_stale: bool = False
     num_earlier: int = 0
     draws: dict[int, Tensor] = field(default_factory=dict)
+    batches: list[Batch] = field(default_factory=list)
+    meter: Meter = field(default_factory=Meter)
     watch: Watch = field(default=unwatched, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self.meter.limit = self.options.max_simulations
 
     @property
     def version(self) -> ModelVersion:

@@ -14,6 +14,7 @@ from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.frame import to_dataframe
 from sbi_active.campaign.display.html import campaign_html
+from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
@@ -168,8 +169,9 @@ class CampaignView:
 
         None while the health is not "ok": a confident wrong belief would stop first.
         """
-        if self.health != "ok":
-            return None
+        spent = used_up(self.state)
+        if spent is not None or self.health != "ok":
+            return spent
         design = None if self.pending is None else self.pending.design
         return self.state.options.stop.reason(
             self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
@@ -216,5 +218,5 @@ class CampaignView:
             self.prior,
             parameter_names=self.parameter_names,
             theta_true=theta_true,
-            num_predicted=num_predicted,
+            num_predicted=0 if self.state.meter.limit else num_predicted,
         )

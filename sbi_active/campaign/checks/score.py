@@ -95,13 +95,24 @@ def score_outcome(
     )
     drawn = rows.without_missing().x.double().flatten(1)
     drawn = torch.where(drawn.isfinite(), drawn, torch.nan)
-    observed = x.double().flatten()
+    surprise, log_score = compared(drawn, x.double().flatten())
     return Score(
-        surprise=_surprise(torch.cat([drawn, observed[None]])),
-        log_score=_log_score(drawn, observed),
+        surprise=surprise,
+        log_score=log_score,
         num_simulations=num_samples,
         num_missing=num_samples - len(drawn),
     )
+
+
+def compared(drawn: Tensor, observed: Tensor) -> tuple[float, float]:
+    """Return tail probability and log density of an outcome.
+
+    Args:
+        drawn: Predictions, shape (n, q), NaN where nothing is measured.
+        observed: The outcome, shape (q,).
+    """
+    surprise = _surprise(torch.cat([drawn, observed[None]]))
+    return surprise, _log_score(drawn, observed)
 
 
 def _surprise(rows: Tensor) -> float:

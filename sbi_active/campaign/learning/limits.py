@@ -44,6 +44,22 @@ class Limits:
         """
         return {"constraint": self.constraint, "exclude": exclude}
 
+    def design(self, exclude: Tensor | None, least: float) -> DesignLimits:
+        """Return the limits of one design.
+
+        Args:
+            exclude: Actions not to repeat, shape (t, action_dim).
+            least: Share of measurements that a choice needs.
+        """
+        none = torch.empty(0, self.actions.action_dim)
+        return DesignLimits(
+            self.actions,
+            self.constraint,
+            none if exclude is None else exclude,
+            pricing(self.cost, self.actions),
+            least,
+        )
+
     def permitted(self, exclude: Tensor | None = None) -> ActionSpace:
         """Return the space, where it is limited as a list of what is permitted.
 

@@ -12,6 +12,7 @@ from sbi_active.campaign.checks.unlike import most_unlike
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
+from sbi_active.campaign.learning.pooled import PooledLearner
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, equal_errors, naming
@@ -146,6 +147,15 @@ class Planner:
         if about_model is not None and (target == "model" or alarmed):
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
+        if isinstance(learner, PooledLearner):
+            pooled = learner.design(
+                index,
+                self._limits.design(exclude, options.min_probability_valid),
+                options.exponent,
+            )
+            if about_model is not None and _utility(about_model) > _utility(pooled):
+                return about_model, "model"
+            return pooled, "theta"
         model = learner.model(index)
         design = self._select(
             index,

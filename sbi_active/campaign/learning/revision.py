@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -125,12 +126,15 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
         trials=(*state.processed,),
     )
     state.versions.append(version)
+    batches = [*state.batches]
+    state.batches.clear()  # they are of another simulator
     try:
-        revised = Learner(report.simulator, report.prior, actions, state)
+        revised = make_learner(report.simulator, report.prior, actions, state)
         with state.watch(state, len(state.trials), "inference from all trials"):
             misfit = revised.infer(state.measured)
     except BaseException:
         state.versions.pop()
+        state.batches[:] = batches
         raise
     state.versions[-1] = replace(version, misfit=misfit)
     keep_draws(state, revised.belief)

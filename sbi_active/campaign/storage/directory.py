@@ -116,6 +116,8 @@ class CampaignDirectory:
             "draws": state.draws,
             "versions": state.versions,
             "is_stale": state.is_stale,
+            "batches": state.batches,
+            "num_simulated": state.meter.spent,
             "belief": name,
         }
         self._put(STATE, encode(saved, known={}))
@@ -141,6 +143,8 @@ class CampaignDirectory:
             state.processed[:] = saved["processed"]
             state.draws |= saved.get("draws", {})  # earlier files have none
             state.versions[:] = saved["versions"]
+            state.batches[:] = saved.get("batches", [])
+            state.meter.spent = saved.get("num_simulated", 0)
             state.is_stale = saved["is_stale"]
         for entry in self._log.entries[lines:]:
             apply(state, entry)

@@ -15,6 +15,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.checks.unexplained import doubts, in_doubt
 from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import rebuilt
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState
@@ -164,7 +165,7 @@ def load(
     else:
         require_same_simulator(manifest, simulator)
     model, joint = rebuilt(state, simulator, first_prior, space, effects)
-    learner = Learner(model, joint, space, state, x_shape=shape)
+    learner = make_learner(model, joint, space, state, x_shape=shape)
     if name is not None and not state.is_stale:
         known = {"simulator": model, "prior": first_prior}
         learner.resume(lambda: _belief(disk, name, known, learner))

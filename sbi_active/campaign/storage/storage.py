@@ -15,6 +15,7 @@ from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.simulations import CampaignBanks
+from sbi_active.simulation.workers.meter import metering
 from sbi_active.simulation.workers.store import storing
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -30,7 +31,10 @@ def stored(method: Method) -> Method:
     @functools.wraps(method)
     def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
         learner, version = campaign._learner, campaign.state.version.number
-        with campaign._storage.working(learner.simulator, version):
+        with (
+            metering(campaign.state.meter),
+            campaign._storage.working(learner.simulator, version),
+        ):
             return apart(campaign, *arguments, **options)
 
     return kept  # type: ignore[return-value]

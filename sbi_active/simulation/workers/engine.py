@@ -23,6 +23,7 @@ from sbi_active.simulation.outcomes import (
 )
 from sbi_active.simulation.simulator import require_noise, require_rows
 from sbi_active.simulation.workers.cluster import configured_pool
+from sbi_active.simulation.workers.meter import spend
 from sbi_active.simulation.workers.pace import pace_of
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
 from sbi_active.simulation.workers.schedule import Schedule
@@ -153,6 +154,7 @@ def simulate(
         if check_noise:
             few = slice(0, 16)
             again = derive_seed(seed, "again")
+            spend(len(theta[few]))
             other = Schedule(theta[few], action[few], seed=again, **options)
             other.run(pool)
             if other.x is not None:
@@ -198,6 +200,7 @@ def _run(
             recorder.add(index, x, status)
 
     schedule.on_rows = on_rows
+    spend(len(theta) - num_restored)
     try:
         schedule.run(pool)
     except KeyboardInterrupt:

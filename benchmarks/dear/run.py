@@ -1,0 +1,253 @@
+"""Campaigns with few simulations, beside the default and stock sbi with as many.
+
+    python -m benchmarks.dear.run --tasks numerical oscillator --trials 4
+
+The trials (actions, outcomes) of the campaign with a budget are given to the methods of
+sbi, which simulate all executed actions at once and choose none: what is compared is
+the belief. Truths are drawn from the prior at seeds from 2100 on. Resumable; one row a
+round in benchmarks/dear/results/rows.csv, and the table is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from sbi.inference import NPE_C
+from sbi.utils import RestrictedPrior, get_density_thresholder
+
+from sbi_active import Campaign
+from sbi_active.plots import as_table
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import get_task
+
+ROWS = Path(__file__).parent / "results" / "rows.csv"
+COLUMNS = ["task", "method", "per_round", "seed", "round", "action", "gap", "kl"]
+COLUMNS += ["regret", "num_simulations", "cpu"]
+FIRST_SEED, ROUNDS = 2100, 4
+PRICES = (0.0001, 0.001, 0.01, 0.1, 1.0, 10.0)  # CPU s of a simulation
+
+
+def figures(task: Any, trials: list[Any], belief: Any) -> dict[str, float]:
+    """Return gap at the truth and KL from the reference, nats."""
+    exact = task.reference(*map(torch.stack, zip(*trials, strict=True)))
+    draws, truth = exact.sample(1_000, seed=0), task.theta_true
+    log_q = belief.log_prob(torch.cat([truth[None], draws.float()])).double()
+    log_p = exact.log_prob(torch.cat([truth[None].double(), draws.double()]))
+    return {
+        "gap": float(log_p[0] - log_q[0]),
+        "kl": float((log_p[1:] - log_q[1:]).mean()),
+    }
+
+
+def campaign(task: Any, per_round: int | None, seed: int) -> list[dict[str, Any]]:
+    """Return a row a round of a campaign; None is the default's sizes."""
+    options: dict[str, Any] = {"network": "on demand"}
+    if per_round is not None:
+        options = {"max_simulations": per_round * ROUNDS, "planned_trials": ROUNDS}
+    start = time.process_time()
+    made = Campaign(
+        task.simulator, task.prior, task.actions, seed=seed, options=options
+    )
+    spent, rows, trials = 0, [], []
+    for k in range(ROUNDS):
+        regret = None
+        trial = made.ask()
+        if task.name == "numerical":
+            before = [torch.empty(0, 1), torch.empty(0, 1)]
+            if trials:
+                before = [*map(torch.stack, zip(*trials, strict=True))]
+            gain = task.reference(*before).expected_information_gain(
+                task.actions.values
+            )
+            chosen = (task.actions.values == trial.action).all(1).int().argmax()
+            regret = float(gain.max() - gain[chosen])
+        x = task.real_system(trial.action, seed=derive_seed(seed, "real", k))
+        made.tell(x)
+        made.update()
+        trials.append((trial.action, x))
+        cpu = time.process_time() - start
+        now = sum(t.num_simulations for t in made.history)
+        if per_round is not None:
+            now = made.state.meter.spent
+        rows.append(
+            {
+                "round": k + 1,
+                "action": " ".join(f"{v:g}" for v in trial.action.tolist()),
+                **figures(task, trials, made.belief),
+                "regret": regret,
+                "num_simulations": now - spent,
+                "cpu": cpu,
+            }
+        )
+        spent, start = now, time.process_time() - cpu
+        rows[-1]["x"] = x
+    # Judging is not on the campaign's account; rows have what was spent so far.
+    for k in range(ROUNDS - 1, 0, -1):
+        rows[k]["cpu"] -= rows[k - 1]["cpu"]
+    return rows
+
+
+def stock(task: Any, method: str, num: int, trials: list[Any], seed: int) -> Any:
+    """Return sbi's posterior of all trials by rounds of simulations at their actions.
+
+    A row simulates every trial, so that num / len(trials) parameters are drawn, in two
+    rounds: SNPE-C with atomic proposals, or TSNPE with a truncated prior.
+    """
+    action = torch.stack([a for a, _ in trials])
+    x_o = torch.cat([x.flatten() for _, x in trials])[None]
+    with forked_generators(derive_seed(seed, method, num, len(trials))):
+        inference = NPE_C(task.prior, show_progress_bars=False)
+        proposal: Any = task.prior
+        posterior: Any = None
+        for _ in range(2):
+            theta = proposal.sample((max(num // len(trials) // 2, 20),))
+            many = theta.repeat_interleave(len(action), 0)
+            x = task.simulator(many, action.repeat(len(theta), 1))
+            x = x.reshape(len(theta), -1)
+            if method == "TSNPE":
+                inference.append_simulations(theta, x)
+                inference.train(force_first_round_loss=True, max_num_epochs=500)
+            else:
+                inference.append_simulations(theta, x, proposal=proposal)
+                inference.train(max_num_epochs=500)
+            posterior = inference.build_posterior().set_default_x(x_o)
+            proposal = posterior
+            if method == "TSNPE":
+                accept = get_density_thresholder(
+                    posterior, quantile=1e-4, num_samples_to_estimate_support=2_000
+                )
+                proposal = RestrictedPrior(task.prior, accept, sample_with="rejection")
+        return posterior
+
+
+def read() -> list[dict[str, str]]:
+    """Return the rows so far."""
+    if not ROWS.exists():
+        return []
+    with ROWS.open(newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def write(rows: list[dict[str, Any]]) -> None:
+    """Append rows."""
+    new = not ROWS.exists()
+    with ROWS.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
+        if new:
+            writer.writeheader()
+        for row in rows:
+            short = {
+                k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()
+            }
+            writer.writerow(short)
+
+
+def cell(rows: list[dict[str, str]], key: str, rounds: tuple[int, ...]) -> Any:
+    """Return a column of some rounds."""
+    kept = [r[key] for r in rows if int(r["round"]) in rounds and r[key]]
+    return np.array([float(v) for v in kept])
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """Return figures by task and method, and the best method by price."""
+    lines, names = [], {}
+    for row in rows:
+        key = row["task"], row["method"], row["per_round"]
+        names.setdefault(key, []).append(row)
+    costs: dict[str, list[tuple[str, float, float, float]]] = {}
+    every = (*range(1, ROUNDS + 1),)
+    for (task, method, per_round), own in names.items():
+        last, kl = cell(own, "gap", (ROUNDS,)), cell(own, "kl", (ROUNDS,))
+        regret = cell(own, "regret", every)
+        sims, cpu = cell(own, "num_simulations", (ROUNDS,)), cell(own, "cpu", (ROUNDS,))
+        used, work = sims.mean(), cpu.mean()
+        if method == "campaign":
+            used = cell(own, "num_simulations", every).mean()
+            work = cell(own, "cpu", every).mean()
+        lines.append(
+            [
+                *(task, method, per_round, str(len(last))),
+                f"{np.median(last):.3f} / {last.mean():.3f}",
+                f"{np.median(kl):.3f}",
+                f"{regret.mean():.3f}" if len(regret) else "",
+                *(f"{used:.0f}", f"{work:.1f}"),
+            ]
+        )
+        name = f"{method} {per_round}"
+        costs.setdefault(task, []).append((name, float(np.median(kl)), used, work))
+    header = ["task", "method", "a round", "trials", "gap r4: median / mean"]
+    header += ["median KL r4", "regret", "simulations", "CPU s a round"]
+    text = [as_table(lines, header), ""]
+    prices = [[task] for task in costs]
+    for line, options in zip(prices, costs.values(), strict=True):
+        good = [o for o in options if o[1] <= 0.2]
+        for price in PRICES:
+            if not good:  # none is worth its price
+                line.append("none")
+                continue
+            best = min(good, key=lambda o: o[2] * price + o[3])
+            line.append(f"{best[0]}: {best[2] * price + best[3]:.3g} s")
+    text.append("cheapest round with a median KL <= .2 nat, by CPU s of a simulation:")
+    text.append(as_table(prices, ["task", *[f"{p:g} s" for p in PRICES]]))
+    return "\n".join(text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Few simulations, beside stock sbi.")
+    parser.add_argument("--tasks", nargs="*", default=["numerical", "oscillator"])
+    parser.add_argument("--trials", type=int, default=4)
+    parser.add_argument("--sizes", nargs="*", type=int, default=[500, 250, 1_000])
+    parser.add_argument("--methods", nargs="*", default=["campaign", "TSNPE", "SNPE-C"])
+    parser.add_argument("--table", action="store_true", help="print, run nothing")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    jobs = [
+        (name, size, FIRST_SEED + k)
+        for k in range(given.trials)
+        for size in [*given.sizes, None]
+        for name in given.tasks
+    ]
+    for name, size, seed in jobs if not given.table else ():
+        label = "default" if size is None else str(size)
+        task = get_task(name)
+        with forked_generators(derive_seed(seed, "truth")):
+            task = task.with_truth(task.prior.sample((1,))[0])
+        key = {"task": name, "per_round": label, "seed": seed}
+        done = {
+            r["method"]
+            for r in read()
+            if (r["task"], r["per_round"], int(r["seed"])) == (name, label, seed)
+        }
+        methods = [m for m in given.methods if size is not None or m == "campaign"]
+        if {*methods} <= done:
+            continue
+        rows = campaign(task, size, seed)
+        if "campaign" not in done:
+            write([{**key, "method": "campaign", **row} for row in rows])
+        if size is None:
+            continue
+        trials = [
+            (torch.tensor([float(v) for v in r["action"].split()]), r["x"])
+            for r in rows
+        ]
+        for method in methods:
+            if method == "campaign" or method in done:
+                continue
+            start = time.process_time()
+            belief = stock(task, method, size * ROUNDS, trials, seed)
+            cpu = time.process_time() - start
+            found = figures(task, trials, belief)
+            more = {"round": ROUNDS, "num_simulations": size, "cpu": cpu / ROUNDS}
+            write([{**key, "method": method, **found, **more}])
+        print(name, label, seed, flush=True)
+    print(table(read()))
+
+
+if __name__ == "__main__":
+    main()

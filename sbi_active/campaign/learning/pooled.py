@@ -1,0 +1,374 @@
+"""Inference of a campaign whose simulations are dear: one pool serves all that asks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, NoReturn
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.actions.summaries import find_summaries
+from sbi_active.campaign.checks.misfit import error_nats, misfit
+from sbi_active.campaign.checks.score import compared
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.learning.methods import find_method
+from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.design.choice import choose
+from sbi_active.design.design import Design
+from sbi_active.design.eligibility import DesignLimits
+from sbi_active.design.elimination import Estimates
+from sbi_active.inference.beliefs.belief import information_gained
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.beliefs.identifiability import note_combinations
+from sbi_active.inference.emulation.joint import candidate_gains
+from sbi_active.inference.emulation.pool import Pool
+from sbi_active.inference.emulation.posterior import PooledPosterior, PooledTrial
+from sbi_active.inference.emulation.summaries import fitted_summaries
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import SimulatorModel, simulate
+from sbi_active.simulation.noise.base import NoiseModel
+from sbi_active.simulation.workers.meter import SimulationBudgetError
+
+DESIGN_SHARE = 0.4  # of a round's simulations
+MOST_CANDIDATES = 48  # of a space without end
+NUM_LEADERS = 6  # that the second half of a design's simulations goes to
+FEW = 8  # rows to look at a simulator
+BESIDE = 8  # rows at an executed action, beyond one a parameter, before it is used
+NUM_PREDICTED = 2_000  # that an outcome is compared with, at no simulation
+
+
+class PooledLearner(Learner):
+    """Learns from one pool of raw simulations, see :class:`.Learner`.
+
+    Simulators that change from trial to trial are not for it.
+
+    Raises:
+        ValueError: If the method is neither "asbi" nor "nsbi", or beliefs are not
+            refined.
+    """
+
+    def __init__(
+        self,
+        simulator: Callable[..., Any],
+        prior: Distribution,
+        actions: ActionSpace,
+        state: CampaignState,
+        *,
+        x_shape: torch.Size | None = None,
+    ) -> None:
+        if state.method not in ("asbi", "nsbi") or not state.options.refine:
+            raise ValueError(
+                "expected the method 'asbi' or 'nsbi' with refine=True for "
+                f"max_simulations or a SummaryAction; got {state.method!r} with refine="
+                f"{state.options.refine}; leave them out, or pass one of these"
+            )
+        found = find_summaries(actions)
+        self._choice, self._entry = (None, 0) if found is None else found
+        super().__init__(simulator, prior, actions, state, x_shape=x_shape)
+
+    def simulated(self, action: Tensor) -> Tensor:
+        """Return actions (..., action_dim) as the simulator gets them."""
+        action = action.clone()
+        if self._choice is not None:
+            action[..., self._entry] = 0.0
+        return action
+
+    def _probe(self) -> torch.Size:
+        seed = self._state.seed
+        with forked_generators(seed, "probe"):
+            theta: Tensor = self.prior.sample(torch.Size([FEW]))
+        action = self._actions.sample((FEW,), seed=derive_seed(seed, "probe"))
+        rows = simulate(
+            self.simulator,
+            theta,
+            self.simulated(action),
+            seed=derive_seed(seed, "probe", 1),
+            check_noise=True,
+            workers=self._state.options.workers,
+        )
+        return rows.x.shape[1:]
+
+    @cached_property
+    def noise(self) -> NoiseModel | None:
+        """The declared noise; None where the simulator itself is random."""
+        model = self.simulator
+        if self._choice is not None or not isinstance(model, SimulatorModel):
+            return None
+        if model.noise is None or not bool((model.noise.parameters > 0).all()):
+            return None
+        seed = self._state.seed
+        with forked_generators(seed, "probe"):
+            theta: Tensor = self.prior.sample(torch.Size([FEW]))
+        action = self._actions.sample((FEW,), seed=derive_seed(seed, "probe"))
+        bare, workers = model.without_noise(), self._state.options.workers
+        first, second = (
+            simulate(bare, theta, action, seed=k, workers=workers).x for k in (1, 2)
+        )
+        same = torch.equal(first.nan_to_num(0.0), second.nan_to_num(0.0))
+        return model.noise if same else None
+
+    @cached_property
+    def pool(self) -> Pool:
+        """All simulations for the current model."""
+        simulator, workers = self.simulator, self._state.options.workers
+        if self.noise is not None and isinstance(simulator, SimulatorModel):
+            simulator = simulator.without_noise()
+        return Pool(simulator, self._state.batches, workers)
+
+    def _posterior(self, *key: int | str) -> PooledPosterior:
+        return PooledPosterior(
+            self.prior,
+            self.pool,
+            self.noise,
+            tuple(self.x_shape),
+            fitted_summaries(self._choice, self.pool.rows.x),
+            seed=derive_seed(self._state.seed, "pooled", *key),
+        )
+
+    def _trial(self, trial: Trial) -> PooledTrial:
+        assert trial.x is not None
+        label = None
+        if self._choice is not None and self._choice.use == "chosen":
+            label = self._choice.label(trial.action[self._entry])
+        return PooledTrial(self.simulated(trial.action), trial.x.float(), label)
+
+    def _add(self, theta: Tensor, action: Tensor, belief: Distribution) -> None:
+        seed = derive_seed(self._state.seed, "pool", len(self._state.batches))
+        self.pool.simulate(
+            theta, action, seed=seed, log_proposal=belief.log_prob(theta).double()
+        )
+
+    def _drawn(self, num: int) -> Tensor:
+        """Return parameters from the belief, shape (num, theta_dim)."""
+        with forked_generators(self._state.seed, "pool", len(self._state.batches)):
+            return self.belief.sample(torch.Size([num])).float()
+
+    def _rows_left(self, part: str, index: int) -> int:
+        """Return how many rows the design or the belief of a trial may take."""
+        state, options = self._state, self._state.options
+        designs = find_method(state.method).designs
+        share = DESIGN_SHARE if designs else 0.0
+        if options.max_simulations is None:
+            total = options.num_simulations
+            if part == "design":
+                return int(share * total)
+            spent = (
+                0 if index >= len(state.trials) else state.trials[index].num_simulations
+            )
+            return max(total - spent, 0)
+        to_go = options.planned_trials - len(state.measured)
+        to_go = to_go if to_go >= 1 else 2
+        left = state.meter.left
+        if part == "design":
+            return int(share * left / to_go)
+        return int(min(left, left * (1 - share) / (to_go - share)))
+
+    def design(self, index: int, limits: DesignLimits, exponent: float) -> Design:
+        """Return the design of a trial, by simulations of the pool."""
+        with self._state.stage(index, "design"):
+            return self._design(index, limits, exponent)
+
+    def _design(self, index: int, limits: DesignLimits, exponent: float) -> Design:
+        seed = derive_seed(self._state.seed, "design", index)
+        listed, notes = limits.listed()
+        if listed is None:
+            listed = limits.drawn(seed)[:MOST_CANDIDATES]
+            if self._choice is not None:  # all summaries of the same actions
+                values = self._choice.values[:, 0]
+                few = listed[: max(1, MOST_CANDIDATES // len(values))]
+                listed = few.repeat_interleave(len(values), 0)
+                listed[:, self._entry] = values.repeat(len(few))
+        places, which = self.simulated(listed).unique(dim=0, return_inverse=True)
+        start, allowed = self._state.meter.spent, self._rows_left("design", index)
+        half = allowed // 2
+        if half < 1 and not len(self._state.batches):
+            raise SimulationBudgetError(
+                f"expected simulations for a design; got {allowed}; raise "
+                "max_simulations"
+            )
+        if half:
+            self._spread(places, half)
+        gains, valid = self._gains(places, seed)
+        if allowed > half:
+            best = gains.mean(2).max(1)
+            leaders = np.argsort(-best, kind="stable")[:NUM_LEADERS]
+            self._spread(places[torch.from_numpy(leaders.copy())], allowed - half)
+            gains, valid = self._gains(places, seed)
+        summary = np.zeros(len(listed), dtype=int)
+        if self._choice is not None:
+            summary = listed[:, self._entry].long().numpy()
+        rows = torch.from_numpy(gains[which.numpy(), summary])
+        shares = torch.from_numpy(valid)[which]
+        eligible = limits.reached_by(shares)
+        utility = (rows.mean(1) / limits.cost(listed)).masked_fill(~eligible, -math.inf)
+        middle = rows.shape[1] // 2
+        estimates = Estimates(
+            action=listed,
+            choosing=[*rows[:, :middle]],
+            reporting=[*rows[:, middle:]],
+            num_samples=torch.full((len(listed),), rows.shape[1]),
+            probability_valid=shares,
+            eligible=eligible,
+            leader=int(utility.argmax()),
+            stopped="budget spent",
+            notes=(*notes, *limits.excluded_note(eligible)),
+        )
+        return choose(
+            estimates,
+            limits,
+            exponent=exponent,
+            estimator="PooledGain",
+            bound="none",
+            num_simulations=self._state.meter.spent - start,
+            num_missing=0,
+            seed=seed,
+        )
+
+    def _spread(self, places: Tensor, num: int) -> None:
+        """Simulate parameters from the belief where the pool is worth least."""
+        worth = torch.zeros(len(places), dtype=torch.float64)
+        if self._state.batches:
+            weight, rows = self.pool.weights(self.belief), self.pool.rows.action
+            for k, place in enumerate(places):
+                own = weight[torch.isclose(rows, place, atol=1e-7).all(1)]
+                if float(own.sum()) > 0:  # Kish's effective sample size
+                    worth[k] = own.sum() ** 2 / own.square().sum()
+        jitter = torch.rand(
+            len(places),
+            generator=torch.Generator().manual_seed(len(self._state.batches)),
+        )
+        counts = torch.zeros(len(places), dtype=torch.int64)
+        for _ in range(num):
+            counts[(worth + counts + 1e-3 * jitter).argmin()] += 1
+        self._add(self._drawn(num), places.repeat_interleave(counts, 0), self.belief)
+
+    def _gains(self, places: Tensor, seed: int) -> tuple[Any, Any]:
+        posterior = self._posterior("design", seed)
+        return candidate_gains(
+            self.pool,
+            posterior.draws(self.belief),
+            places,
+            posterior.summaries,
+            self.noise,
+            posterior.coordinates,
+            seed=seed,
+        )
+
+    def _require_rows(self, trials: Sequence[PooledTrial], allowed: int) -> None:
+        """Simulate each trial's action where the pool has hardly any row of it.
+
+        Raises:
+            SimulationBudgetError: If more are needed than are allowed.
+        """
+        dim, lacking = self.belief.sample(torch.Size([1])).shape[-1], []
+        for trial in trials:
+            here = len(self.pool.at(trial.action)) if self._state.batches else 0
+            if here < dim + BESIDE:
+                lacking.append((trial.action, 2 * (dim + BESIDE) - here))
+        total = sum(num for _, num in lacking)
+        if total > max(allowed, 0):
+            state = self._state
+            raise SimulationBudgetError(
+                f"expected {total} simulations for the belief; got {allowed} of "
+                f"max_simulations = {state.options.max_simulations}, of which "
+                f"{state.meter.spent} are spent; the last belief stands. Load the "
+                "campaign with a larger max_simulations"
+            )
+        if total:
+            action = torch.cat([a.expand(num, -1) for a, num in lacking])
+            self._add(self._drawn(total), action, self.belief)
+
+    def score(self, trial: Trial) -> None:
+        """Compare a trial with what the belief before it and the pool predict."""
+        state, start = self._state, self._state.meter.spent
+        with state.stage(trial.index, "scoring"):
+            own = self._trial(trial)
+            self._require_rows([own], self._rows_left("belief", trial.index))
+            posterior = self._posterior("score", trial.index)
+            reference = posterior.draws(self.belief)
+            fitted = posterior.fit(
+                own, posterior.best_summary(own, reference), reference
+            )
+            rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
+            z = reference[rng.integers(len(reference), size=NUM_PREDICTED)]
+            if fitted.processes:
+                drawn = torch.from_numpy(fitted.draw(z, rng))
+                surprise, log_score = compared(drawn, torch.from_numpy(fitted.observed))
+            else:
+                share = 1.0
+                if fitted.outcome is not None:
+                    share = float(np.exp(fitted.outcome.log_prob(z)).mean())
+                surprise, log_score = (share if share < 0.5 else 1.0), math.log(share)
+        state.account(
+            trial.index,
+            state.meter.spent - start,
+            0,
+            surprise=surprise,
+            belief_error=error_nats(getattr(self.belief, "diagnostics", Diagnostics())),
+            log_score=log_score,
+            version=state.version.number,
+        )
+
+    def _learn(self, trial: Trial) -> None:
+        state, before = self._state, self.belief
+        start = state.meter.spent
+        with state.stage(trial.index, "update"):
+            trials = [*(t for t in state.explained if t.index != trial.index), trial]
+            belief = self._infer(trials, trial.index)
+            gained = information_gained(
+                belief, before, seed=derive_seed(state.seed, "gain", trial.index)
+            )
+        state.account(
+            trial.index,
+            state.meter.spent - start,
+            self.pool.num_missing,
+            information_gained=gained,
+            misfit=misfit(belief.diagnostics),
+        )
+
+    def _infer(self, trials: Sequence[Trial], key: int) -> Any:
+        own = [self._trial(t) for t in trials]
+        index = trials[-1].index
+        allowed, start = self._rows_left("belief", index), self._state.meter.spent
+        self._require_rows(own, allowed)
+        allowed -= self._state.meter.spent - start
+        belief, labels = self._posterior("belief", key).run(
+            own, before=self.belief, allowance=max(allowed, 0)
+        )
+        if self._choice is not None:
+            for trial, label in zip(trials, labels, strict=True):
+                self._state.change(trial.index, summary=label)
+        note_combinations(belief, self._names, seed=self._state.seed)
+        self._trainer.resume(belief, [self._observation(t) for t in trials])
+        self._saved = None
+        return belief
+
+    def _examine(self, trial: Trial) -> Trial:
+        return trial  # few simulations tell nothing about all of the prior
+
+    def posterior(self, index: int) -> NoReturn:
+        """Raise: there is no network."""
+        raise ValueError(
+            "expected a campaign that trains networks; got max_simulations or a "
+            "SummaryAction, with which none is trained; use the belief"
+        )
+
+
+def make_learner(
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    actions: ActionSpace,
+    state: CampaignState,
+    *,
+    x_shape: torch.Size | None = None,
+) -> Learner:
+    """Return the learner that a campaign's options and actions ask for."""
+    dear = state.options.max_simulations is not None
+    kind = PooledLearner if dear or find_summaries(actions) is not None else Learner
+    return kind(simulator, prior, actions, state, x_shape=x_shape)

@@ -1,0 +1,160 @@
+r"""What each action would tell, by one regression over parameters and actions.
+
+Few simulations of each action suffice where what is learned of one serves the others.
+The noise of a simulator that is itself random is learned by action,
+
+.. math::
+    \tau_\xi^2 = \frac{\nu \tau^2 + \sum_{i \in \xi} r_i^2}{\nu + n_\xi},
+
+from the residuals r of left-out rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.inference.emulation.gain import mixture_gain
+from sbi_active.inference.emulation.likelihood import correlation_root
+from sbi_active.inference.emulation.pool import Pool
+from sbi_active.inference.emulation.posterior import nearest
+from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.inference.emulation.statistics import FEW, learned_statistic
+from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.seeding import derive_seed
+from sbi_active.simulation.noise.base import NoiseModel
+
+Array = NDArray[Any]
+
+NUM_OUTER, NUM_INNER = 160, 1_000
+MOST_ROWS = 600  # nearest to the belief
+OWN_ROWS = 8.0  # that the noise of all actions counts for at each
+
+
+def candidate_gains(
+    pool: Pool,
+    reference: Array,
+    candidates: Tensor,
+    summaries: Sequence[Summary],
+    noise: NoiseModel | None,
+    coordinates: PriorCoordinates,
+    *,
+    seed: int,
+) -> tuple[Array, Array]:
+    """Return contributions to the gain and the share of measurements.
+
+    All actions and summaries are compared at the same parameters, with the same noise,
+    from the same raw rows.
+
+    Args:
+        pool: Of raw simulations.
+        reference: Coordinates of draws from the belief, shape (n, d).
+        candidates: As simulated, shape (a, action_dim).
+        summaries: K of them.
+        noise: That was declared, or None.
+        coordinates: Of the prior.
+        seed: Of outcomes.
+
+    Returns:
+        Shapes (a, K, m), nats, and (a,).
+    """
+    rows = pool.rows
+    z, action = coordinates.to_z(rows.theta), rows.action.double().numpy()
+    near, region = nearest(z, np.ones(len(z), dtype=bool), reference, MOST_ROWS)
+    near = np.sort(near)
+    rng = np.random.default_rng(derive_seed(seed, "outcomes"))
+    draws = reference[rng.integers(len(reference), size=NUM_OUTER + NUM_INNER)]
+    places = candidates.double().numpy()
+    center, scale = places.mean(0), places.std(0)
+    varied = scale > 0
+    inputs = np.concatenate(
+        [
+            region.scaled(z[near]),
+            ((action[near] - center) / (scale + ~varied))[:, varied],
+        ],
+        1,
+    )
+    unit = ((places - center) / (scale + ~varied))[:, varied]
+    same = np.abs(action[near][:, None] - places).max(2) < 1e-5
+    gains = []
+    raw = rows.x[torch.from_numpy(near)]
+    measured = raw.flatten(1).isfinite().any(1).numpy()
+    valid = _share(measured, same)
+    for summary in summaries:
+        numbers = summary(raw)
+        full = np.isfinite(numbers).all(1)
+        gains.append(
+            _gains(
+                *(inputs[full], z[near][full], numbers[full], same[full]),
+                *(region.scaled(draws), unit, noise, tuple(raw.shape[1:])),
+                rng=np.random.default_rng(derive_seed(seed, "noise")),
+                seed=seed,
+            )
+        )
+    return np.stack(gains, 1) * valid[:, None, None], valid
+
+
+def _share(measured: NDArray[np.bool_], same: NDArray[np.bool_]) -> Array:
+    """Return the share of rows with a measurement at each action, shape (a,)."""
+    count, found = same.sum(0), (same & measured[:, None]).sum(0)
+    overall = measured.mean()
+    return (found + overall) / (count + 1)
+
+
+def _gains(
+    inputs: Array,
+    z: Array,
+    numbers: Array,
+    same: NDArray[np.bool_],
+    draws: Array,
+    unit: Array,
+    noise: NoiseModel | None,
+    x_shape: tuple[int, ...],
+    *,
+    rng: np.random.Generator,
+    seed: int,
+) -> Array:
+    """Return contributions of one summary at each action, shape (a, NUM_OUTER)."""
+    if len(inputs) < z.shape[1] + 4:
+        return np.zeros((len(unit), NUM_OUTER))
+    if noise is not None:
+        process = GaussianProcess.fit(inputs, numbers, noisy=False, kind="rough")
+        processes = [process]
+        zeros = torch.zeros(max(400, 4 * numbers.shape[1]), *x_shape).double()
+        seeds = torch.from_numpy(rng.integers(2**62, size=len(zeros)))
+        sampled = noise.sample(zeros, seeds).reshape(len(zeros), -1).numpy()
+        covariance = np.atleast_2d(np.cov(sampled.T))
+        root = np.linalg.cholesky(covariance + 1e-9 * np.diag(np.diag(covariance)))
+        roots = [root] * len(unit)
+    else:
+        dim, features = z.shape[1], numbers
+        if numbers.shape[1] > FEW * dim and inputs.shape[1] > dim:
+            crossed = [numbers * inputs[:, [j]] for j in range(dim, inputs.shape[1])]
+            features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
+        _, own = learned_statistic(features, z, seed=derive_seed(seed, "folds"))
+        processes = [
+            GaussianProcess.fit(inputs, own[:, [j]], noisy=True)
+            for j in range(own.shape[1])
+        ]
+        left_out = np.concatenate([p.left_out for p in processes], 1)
+        common = np.concatenate([p.noise_sd for p in processes]) ** 2
+        total = OWN_ROWS * common + same.T.astype(float) @ left_out**2
+        sd = np.sqrt(total / (OWN_ROWS + same.sum(0))[:, None])
+        root = correlation_root(left_out)
+        roots = [s[:, None] * root for s in sd]
+    normal = rng.standard_normal((NUM_OUTER, len(roots[0])))
+    result = np.zeros((len(unit), NUM_OUTER))
+    for k, place in enumerate(unit):
+        at = np.concatenate(
+            [draws, np.broadcast_to(place, (len(draws), len(place)))], 1
+        )
+        parts = [process.predict(at) for process in processes]
+        mean, variance = (np.concatenate(p, 1) for p in zip(*parts, strict=True))
+        result[k] = mixture_gain(mean, variance, roots[k], normal, NUM_OUTER)
+    return result

@@ -1,0 +1,200 @@
+"""Campaigns on dear simulators: summaries as a choice, and a budget of simulations."""
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from sklearn.decomposition import PCA
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    MixedActions,
+    SimulatorModel,
+)
+from sbi_active.actions import SummaryAction
+from sbi_active.simulation.workers.meter import SimulationBudgetError
+
+PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
+SIZE = 8  # pixels a side
+
+
+class Blobs:
+    """Grains fall about a place by theta_1, spread by theta_2; counts its rows."""
+
+    def __init__(self):
+        self.num_rows, self.summary_seen = 0, set()
+
+    def __call__(self, theta, action):
+        self.num_rows += len(theta)
+        self.summary_seen |= {*action[:, 1].tolist()}
+        place = (theta[:, :1] - 0.5) * action[:, :1] + 0.05 * torch.randn(len(theta), 1)
+        spread = 0.05 + 0.3 * theta[:, 1:]
+        grains = 0.5 + 0.3 * place + spread * torch.randn(len(theta), 40)
+        at = (grains.clamp(0, 0.999) * SIZE * SIZE).long()
+        image = torch.zeros(len(theta), SIZE * SIZE)
+        return image.scatter_add(1, at, torch.ones_like(grains))
+
+
+def place(x):
+    """Where the grains lie; it changes what it is given."""
+    x /= x.sum(1, keepdim=True)
+    return x @ torch.linspace(0, 1, x.shape[1])[:, None]
+
+
+def nothing(x):
+    return torch.zeros(len(x), 1)
+
+
+def choice(**options):
+    summaries = {"pca": PCA(5, random_state=0), "place": place, "nothing": nothing}
+    return MixedActions(
+        DiscreteActions([0.2, 2.0], names=["force"]),
+        SummaryAction(summaries, **options),
+    )
+
+
+def outcome(theta, action, seed):
+    torch.manual_seed(seed)
+    return Blobs()(torch.tensor([theta]), action[None])[0]
+
+
+def run(simulator, actions, rounds=1, **options):
+    sizes = {"max_simulations": 300, "planned_trials": 1, **options}
+    c = Campaign(simulator, PRIOR, actions, seed=1, options=sizes)
+    for k in range(rounds):
+        trial = c.ask()
+        c.tell(outcome([0.7, 0.2], trial.action, k))
+        c.update()
+    return c
+
+
+def test_a_summary_is_chosen_and_costs_nothing():
+    simulator = Blobs()
+    c = run(simulator, choice())
+    assert simulator.num_rows == c.state.meter.spent <= 300
+    assert simulator.summary_seen == {0.0}  # simulated once for all summaries
+    design = c.history[0].design
+    gain = dict(
+        zip(map(tuple, design.candidates.tolist()), design.utility, strict=True)
+    )
+    assert all(gain[force, 2.0] < 0.05 for force in gain_forces(gain))
+    assert all(gain[force, 0.0] > gain[force, 2.0] + 0.3 for force in gain_forces(gain))
+    assert {t.summary for t in c.history} <= {"pca", "place"}
+    assert c.history[0].x.shape == (SIZE * SIZE,)  # raw
+    draws = c.belief.sample((1_000,))
+    off = (draws.mean(0) - torch.tensor([0.7, 0.2])) / draws.std(0)
+    assert bool((off.abs() < 3).all())
+    assert 0.01 < float(draws[:, 0].std()) < 0.15  # a prior has .29
+
+
+def gain_forces(gain):
+    return {force for force, _ in gain}
+
+
+def test_a_belief_may_keep_to_the_chosen_summary():
+    c = Campaign(Blobs(), PRIOR, choice(use="chosen"), options={"max_simulations": 300})
+    c.tell(outcome([0.7, 0.2], torch.tensor([2.0, 2.0]), 0), action=[2.0, 2.0])
+    belief = c.update()
+    assert c.history[0].summary == "nothing"
+    draws = belief.sample((2_000,))  # nothing was learned
+    assert torch.allclose(draws.std(0), torch.full((2,), 12**-0.5), atol=0.05)
+
+
+def test_the_choice_is_checked():
+    with pytest.raises(ValueError, match="one or more summaries"):
+        SummaryAction({})
+    with pytest.raises(TypeError, match="fit and transform"):
+        SummaryAction({"a": 3})
+    with pytest.raises(ValueError, match="'best' or 'chosen'"):
+        SummaryAction({"a": nothing}, use="all")
+    one = SummaryAction({"a": nothing})
+    with pytest.raises(ValueError, match="one SummaryAction; got 2"):
+        Campaign(Blobs(), PRIOR, MixedActions(one, one))
+    with pytest.raises(ValueError, match="refine=True"):
+        Campaign(Blobs(), PRIOR, choice(), options={"refine": False})
+    short = MixedActions(
+        DiscreteActions([1.0]), SummaryAction({"short": lambda x: x[:1]})
+    )
+    c = Campaign(Blobs(), PRIOR, short, options={"max_simulations": 100})
+    with pytest.raises(ValueError, match="one row of numbers an outcome"):
+        c.ask()
+
+
+def slide(theta, action):
+    return torch.cat([theta[:, :1] * action, theta[:, 1:] + action * theta[:, :1]], 1)
+
+
+class Counted:
+    def __init__(self):
+        self.num_rows = 0
+
+    def __call__(self, theta, action):
+        self.num_rows += len(theta)
+        return slide(theta, action)
+
+
+def test_no_simulation_beyond_the_budget():
+    fn = Counted()
+    model = SimulatorModel(fn, noise=GaussianNoise(0.05))
+    options = CampaignOptions(max_simulations=160, planned_trials=2)
+    c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
+    truth = torch.tensor([[0.6, 0.3]])
+    for _ in range(6):
+        if c.stop_reason:
+            break
+        c.run(lambda a: slide(truth, a[None])[0], num_rounds=1)
+        assert fn.num_rows == c.state.meter.spent <= 160
+    while not c.stop_reason:  # converged beliefs leave some
+        c.state.meter.spent += 30
+    assert "used up" in c.stop_reason
+    belief = c.belief
+    with pytest.raises(SimulationBudgetError, match="used up"):
+        c.ask()
+    c.state.meter.spent = 160
+    c.tell([0.4, 1.0], action=[0.7])
+    with pytest.warns(UserWarning, match="recorded and not in the belief"):
+        assert c.update() is belief
+    assert fn.num_rows <= 160
+    assert len(c.history) > len(c.state.processed)
+    mean = belief.sample((1_000,)).mean(0)
+    assert torch.allclose(mean, truth[0], atol=0.15)
+
+
+def test_it_goes_on_where_it_was_left(tmp_path):
+    model = SimulatorModel(slide, noise=GaussianNoise(0.05))
+    actions = DiscreteActions([0.5, 1.0])
+    options = {"max_simulations": 300, "planned_trials": 2}
+
+    def told(c):
+        trial = c.ask()
+        return c.tell(0.5 * torch.ones(2) * trial.action)
+
+    whole = Campaign(model, PRIOR, actions, options=options)
+    told(whole), told(whole), whole.update()
+    with Campaign(model, PRIOR, actions, options=options, directory=tmp_path) as c:
+        told(c)
+        c.ask()
+    with Campaign.load(tmp_path, simulator=model) as c:
+        spent = c.state.meter.spent
+        told(c), c.update()
+        assert spent <= c.state.meter.spent == whole.state.meter.spent
+        theta = PRIOR.sample((50,))
+        same = c.belief.log_prob(theta), whole.belief.log_prob(theta)
+        assert torch.allclose(*same, atol=1e-6)
+
+
+def test_bad_budgets_are_refused():
+    with pytest.raises(ValueError, match="max_simulations >= 100"):
+        CampaignOptions(max_simulations=10)
+    with pytest.raises(ValueError, match="planned_trials"):
+        CampaignOptions(planned_trials=0)
+    with pytest.raises(ValueError, match="'asbi' or 'nsbi'"):
+        Campaign(
+            SimulatorModel(slide, noise=GaussianNoise(0.1)),
+            PRIOR,
+            [0.5],
+            method="alhi",
+            options={"max_simulations": 200},
+        )
