@@ -101,10 +101,47 @@ class Pours:
         return found
 
     def images(
-        self, theta: Tensor, action: Tensor, seeds: Tensor, **effects: Any
+        self,
+        theta: Tensor,
+        action: Tensor,
+        *,
+        seeds: Tensor,
+        linear_damping: Any = 0.0,
+        angular_damping: Any = 0.0,
+        tilt: Any = 0.0,
+        bucket_y: Any = 0.0,
+        bucket_height: Any = 0.0,
+        cohesion: Any = 0.0,
+        lag: Any = 0.0,
     ) -> Tensor:
-        """Return depth images, shape (n, 22500), see :func:`images_of`."""
-        return images_of(self.poses(theta, action, seeds, **effects), self.particles)
+        """Return depth images, shape (n, 22500), see :func:`images_of`.
+
+        Args:
+            theta: As for :meth:`poses`.
+            action: As for :meth:`poses`.
+            seeds: Of the rows, shape (n,).
+            linear_damping: As in :class:`.Surroundings`, and so what follows; a number
+                or one a row.
+            angular_damping: 1/s.
+            tilt: Degrees.
+            bucket_y: m.
+            bucket_height: m.
+            cohesion: In units of theta's rolling friction.
+            lag: s.
+        """
+        poses = self.poses(
+            theta,
+            action,
+            seeds,
+            linear_damping=linear_damping,
+            angular_damping=angular_damping,
+            tilt=tilt,
+            bucket_y=bucket_y,
+            bucket_height=bucket_height,
+            cohesion=cohesion,
+            lag=lag,
+        )
+        return images_of(poses, self.particles)
 
     def _split(
         self, row: list[float], around: Surroundings

@@ -1,4 +1,4 @@
-r"""A bucket of particles poured on the ground in PyBullet: the world, and one run of it.
+r"""A bucket of particles poured on the ground in PyBullet: the world, and one run.
 
 A bucket of 10 cm sides stands upright at (0, p, h), turns about its middle at v rad/s
 toward +y until it hangs upside down, and what was in it comes to rest on the ground.
@@ -59,7 +59,7 @@ LAST_ANGLE = 2.6  # rad
 STEPS_PER_LOOK = 24
 LONGEST_REST = 1.2  # s after the last particle can have reached the ground
 SLOW = 0.05  # m/s: one step of gravity is .04, the tremor of what lies still
-FAR = 0.6  # m beyond the bucket, from where no particle comes back into view
+FAR = 0.6  # m from the origin, from where no particle comes back into view
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    r"""What a robot's pour may have and the model leaves out; the defaults are the model.
+    r"""What a real pour may have and the model leaves out; the defaults are the model.
 
     Attributes:
         linear_damping: Share of a particle's velocity that is lost in a second.
@@ -141,8 +141,9 @@ class Particles:
         layers = -(-len(self) // side**2) if side else 0
         if not side or layers * pitch > BUCKET_SIDE:
             raise ValueError(
-                f"expected particles that fit a bucket of {BUCKET_SIDE * 1e3:g} mm; got"
-                f" {len(self)} of up to {tallest * 1e3:g} mm; pour fewer or smaller ones"
+                f"expected particles that fit a bucket of {BUCKET_SIDE * 1e3:g} mm; "
+                f"got {len(self)} of up to {tallest * 1e3:g} mm; pour fewer or smaller "
+                "ones"
             )
         grid = np.arange(side) - (side - 1) / 2
         squares = np.add.outer(grid**2, grid**2).ravel()
@@ -173,6 +174,7 @@ class World:
         ground: Its surface.
         around: What else there is.
         seed: Of where the particles start.
+        position: Of the bucket's middle, y and z, m.
 
     Raises:
         ImportError: If PyBullet is not installed.
@@ -274,7 +276,7 @@ class World:
         )
 
     def _make_bucket(self) -> int:
-        """Return an open box; dynamic, since a fixed one has no velocity in contacts."""
+        """Return an open box; a dynamic body, as a fixed one has no velocity."""
         p, own = self.engine, {"physicsClientId": self.client}
         a, w = BUCKET_SIDE / 2 * SCALE, BUCKET_WALL / 2 * SCALE
         walls = [
@@ -365,6 +367,7 @@ def pour(
     around: Surroundings = NOTHING_ELSE,
     seed: int = 0,
     watch: Callable[[World, float], None] | None = None,
+    at_rest: Callable[[World], None] | None = None,
 ) -> np.ndarray:
     """Pour once, in a new world.
 
@@ -377,6 +380,7 @@ def pour(
         around: What else there is.
         seed: Of where the particles start.
         watch: Called after each step with the world and the bucket's angle.
+        at_rest: Called with the world at the end.
 
     Returns:
         Positions at rest, m, and quaternions (x, y, z, w), shape (n, 7), float32.
@@ -391,16 +395,15 @@ def pour(
         position=(place, height),
     ) as world:
         friction = _GroundFriction(world, ground)
-        steps = 0
-        angle, speed = 0.0, 0.0
-        for angle, speed in _rotation(float(rate), around.lag):
+        angle = 0.0
+        rotation = _rotation(float(rate), around.lag)
+        for steps, (angle, speed) in enumerate(rotation, 1):
             world.step(angle, speed)
-            steps += 1
             if watch is not None:
                 watch(world, angle)
             if steps % STEPS_PER_LOOK == 0:
                 friction.follow()
-                if angle > PRETILT and _is_empty(world, angle, height, place):
+                if angle > PRETILT and _is_empty(world, height):
                     break
         longest = math.sqrt(2 * height / GRAVITY) + LONGEST_REST
         for steps in range(1, int(longest / DT) + 1):
@@ -411,6 +414,8 @@ def pour(
                 friction.follow()
                 if _rests(world):
                     break
+        if at_rest is not None:
+            at_rest(world)
         return world.poses().astype(np.float32)
 
 
@@ -438,7 +443,7 @@ def _rotation(rate: float, lag: float) -> Iterator[tuple[float, float]]:
         yield angle, speed
 
 
-def _is_empty(world: World, angle: float, height: float, place: float) -> bool:
+def _is_empty(world: World, height: float) -> bool:
     """Return whether every particle is below the bucket's reach."""
     z = world.poses()[:, 2]
     return bool((z < height - BUCKET_SIDE).all())

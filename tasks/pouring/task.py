@@ -11,8 +11,10 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.actions import DiscreteActions
+from sbi_active.criticism import Effect
 from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks.base import Task
+from sbi_active.tasks.pouring.effects import make_effects
 from sbi_active.tasks.pouring.model import ACTION_NAMES, ACTION_UNITS, Pours
 from sbi_active.tasks.pouring.scene import cubes, load_pybullet
 from sbi_active.tasks.pouring.summaries import ImagePCA, mesh_coverage
@@ -97,6 +99,10 @@ class PouringTask(Task):
         """
         pca = ImagePCA(images, num_components)
         return {"pca": pca, "mesh coverage": mesh_coverage}
+
+    def effects(self) -> list[Effect]:
+        """Return what a real pour may have and the model lacks."""
+        return make_effects()
 
     def _options(self) -> dict[str, Any]:
         return {

@@ -114,7 +114,9 @@ def images(num, seed=0):
     place = torch.linspace(-1, 1, 150)
     weight = torch.rand(num, 3, generator=generator)
     blobs = [torch.exp(-((place - c) ** 2) / 0.05) for c in (-0.5, 0.0, 0.5)]
-    basis = torch.stack([torch.outer(a, b) for a, b in zip(blobs, blobs[::-1])])
+    basis = torch.stack(
+        [torch.outer(a, b) for a, b in zip(blobs, blobs[::-1], strict=True)]
+    )
     return (weight @ basis.reshape(3, -1)).float(), weight
 
 
