@@ -295,7 +295,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--effective",
         type=float,
-        default=1_500,
+        default=4_000,
         help="pours that a round rests on at least; 0 chains beliefs as the paper does",
     )
     parser.add_argument("--components", type=int, default=36)

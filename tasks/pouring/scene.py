@@ -435,10 +435,7 @@ def _rotation(rate: float, lag: float) -> Iterator[tuple[float, float]]:
     angle, speed = 0.0, 0.0
     while angle < LAST_ANGLE:
         wanted = max(rate, PRETILT_RATE) if angle < PRETILT else rate
-        if angle < PRETILT or lag <= 0:
-            speed = wanted
-        else:
-            speed += (wanted - speed) * min(1.0, DT / lag)
+        speed += (wanted - speed) * (min(1.0, DT / lag) if lag > 0 else 1.0)
         angle = min(LAST_ANGLE, angle + speed * DT)
         yield angle, speed
 
