@@ -1,7 +1,6 @@
 """Pours from the prior, kept as poses: what a first round may cost nothing of.
 
     python -m benchmarks.pouring.bank FOLDER --rows 6000             # 27 actions
-    python -m benchmarks.pouring.bank FOLDER --part real --rows 1000
     python -m benchmarks.pouring.bank FOLDER --report
 
 Resumable: files of 50 rows each, written whole. Row i of a part is a function of the
@@ -17,6 +16,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,8 @@ from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 
 ROWS_A_FILE = 50
-#: Task and its options by part.
-PARTS = {"prior": "pouring", "real": "pouring_real"}
+#: Task by part.
+PARTS = {"prior": "pouring"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Rows:
         return len(self.theta)
 
 
-def draw(task, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
+def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return parameters, actions and seeds of a file of rows."""
     seed = derive_seed(0, "pouring bank", part, number)
     with forked_generators(seed):
@@ -61,7 +61,7 @@ def draw(task, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def fill(folder: Path, part: str, num: int, share: tuple[int, int]) -> None:
     """Simulate the files that are missing."""
-    task = get_task(PARTS[part])
+    task: Any = get_task(PARTS[part])
     folder = folder / part
     folder.mkdir(parents=True, exist_ok=True)
     mine, of = share

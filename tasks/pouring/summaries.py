@@ -7,6 +7,7 @@ of them; which one is used is part of the action (delta).
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,11 +50,9 @@ def mesh_coverage(images: Tensor) -> Tensor:
     for k, blur in enumerate(BLURS):
         smooth = x
         if blur > 1:
-            smooth = uniform_filter(x, (0, blur, blur), mode="constant")
+            smooth = _blurred(x, blur)
             if holes:
-                share = uniform_filter(
-                    known.astype(np.float32), (0, blur, blur), mode="constant", cval=1.0
-                )
+                share = _blurred(known.astype(np.float32), blur, rim=1.0)
                 smooth = smooth / np.maximum(share, 1e-6)
         covered = (smooth > COVERED) & known
         blocks = _blocks(covered)
@@ -116,6 +115,12 @@ class ImagePCA:
         """Return components, (n, 22500) -> (n, k), float32."""
         x = _pictures(images).reshape(len(images), -1)
         return torch.from_numpy(np.nan_to_num(x - self.mean) @ self.components)
+
+
+def _blurred(x: np.ndarray, blur: int, *, rim: float = 0.0) -> np.ndarray:
+    """Return means over squares of pixels, with a value beyond the rim."""
+    size: Any = (0, blur, blur)
+    return uniform_filter(x, size, mode="constant", cval=rim)
 
 
 def _pictures(images: Tensor) -> np.ndarray:
