@@ -11,6 +11,7 @@ from sbi_active.tasks.box_collision import BoxCollisionTask
 from sbi_active.tasks.location_finding import LocationFindingTask
 from sbi_active.tasks.numerical import NumericalTask
 from sbi_active.tasks.oscillator import OscillatorTask
+from sbi_active.tasks.pouring import PouringTask
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask
 
 __all__ = ["TASKS", "Task", "get_task"]
@@ -19,6 +20,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "numerical": NumericalTask,
     "oscillator": OscillatorTask,
     "box_collision": BoxCollisionTask,
+    "pouring": PouringTask,
     "servo_pendulum": ServoPendulumTask,
     "ball_drops": BallDropsTask,
     "location_finding": LocationFindingTask,

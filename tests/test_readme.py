@@ -140,6 +140,13 @@ def test_campaigns(run, capsys):
     assert page.campaign.history[1].reason == "read off the wrong tape"
 
 
+def test_pouring(run, capsys):
+    pytest.importorskip("pybullet")
+    (page,) = run("docs/pouring.md")
+    assert page.image.shape == (22_500,)
+    assert "'mesh coverage': torch.Size([1, 36])" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_robots(run, capsys):
     cart, verdict, motion = run("docs/robots.md")
@@ -199,4 +206,5 @@ def test_no_page_is_forgotten():
         "failed_trial.md",
         "which_parameters.md",
         "two_models.md",
+        "pouring.md",
     }

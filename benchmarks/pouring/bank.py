@@ -1,0 +1,134 @@
+"""Pours from the prior, kept as poses: what a first round may cost nothing of.
+
+    python -m benchmarks.pouring.bank FOLDER --rows 6000             # 27 actions
+    python -m benchmarks.pouring.bank FOLDER --report
+
+Resumable: files of 50 rows each, written whole. Row i of a part is a function of the
+part's name and i alone, so that any number of processes may fill one folder, each with
+its own share (``--share 0/2``). The folder stands outside the repository: a row of 100
+cubes is 2.8 kB of poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.tasks import get_task
+
+ROWS_A_FILE = 50
+#: Task by part.
+PARTS = {"prior": "pouring"}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Pours as they were stored.
+
+    Attributes:
+        theta: Shape (n, d).
+        action: Shape (n, 3).
+        poses: Shape (n, particles, 7), float32.
+        cpu_seconds: Of all of them.
+    """
+
+    theta: Tensor
+    action: Tensor
+    poses: np.ndarray
+    cpu_seconds: float
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+
+def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return parameters, actions and seeds of a file of rows."""
+    seed = derive_seed(0, "pouring bank", part, number)
+    with forked_generators(seed):
+        theta = task.prior.sample(torch.Size([ROWS_A_FILE]))
+    action = task.actions.sample((ROWS_A_FILE,), seed=seed)
+    return theta, action, row_seeds(seed, ROWS_A_FILE)
+
+
+def fill(folder: Path, part: str, num: int, share: tuple[int, int]) -> None:
+    """Simulate the files that are missing."""
+    task: Any = get_task(PARTS[part])
+    folder = folder / part
+    folder.mkdir(parents=True, exist_ok=True)
+    mine, of = share
+    for number in range(mine, -(-num // ROWS_A_FILE), of):
+        path = folder / f"{number:05d}.npz"
+        if path.exists():
+            continue
+        theta, action, seeds = draw(task, part, number)
+        start = time.process_time()
+        poses = task.pours.poses(theta, action, seeds)
+        spent = time.process_time() - start
+        whole = path.with_suffix(f".{os.getpid()}.part")
+        with whole.open("wb") as file:
+            np.savez(
+                file,
+                theta=theta.numpy(),
+                action=action.numpy(),
+                poses=poses,
+                cpu_seconds=spent,
+            )
+        whole.replace(path)
+
+
+def read(folder: Path, part: str = "prior", *, most: int | None = None) -> Rows:
+    """Return the rows of a part.
+
+    Raises:
+        FileNotFoundError: If there are none; the text says how to make some.
+    """
+    paths = sorted((folder / part).glob("*.npz"))
+    if most is not None:
+        paths = paths[: -(-most // ROWS_A_FILE)]
+    if not paths:
+        raise FileNotFoundError(
+            f"expected pours in {folder / part}; got none; run python -m "
+            f"benchmarks.pouring.bank {folder} --part {part}"
+        )
+    files = [np.load(path) for path in paths]
+    return Rows(
+        torch.from_numpy(np.concatenate([f["theta"] for f in files])),
+        torch.from_numpy(np.concatenate([f["action"] for f in files])),
+        np.concatenate([f["poses"] for f in files]),
+        sum(float(f["cpu_seconds"]) for f in files),
+    )
+
+
+def report(folder: Path, part: str) -> str:
+    """Return what a part holds and what it cost."""
+    rows = read(folder, part)
+    seconds = rows.cpu_seconds / len(rows)
+    return f"{part}: {len(rows)} pours, {seconds:.3f} CPU s each at the mean"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Pours from the prior, as poses.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--part", choices=[*PARTS], default="prior")
+    parser.add_argument("--rows", type=int, default=6_000)
+    parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
+    parser.add_argument("--report", action="store_true", help="simulate nothing")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if not arguments.report:
+        mine, of = map(int, arguments.share.split("/"))
+        fill(arguments.folder, arguments.part, arguments.rows, (mine, of))
+    print(report(arguments.folder, arguments.part))
+
+
+if __name__ == "__main__":
+    main()
