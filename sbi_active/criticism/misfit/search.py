@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.least_squares import descend
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.left_out import LeftOut, leave_out
 from sbi_active.criticism.misfit.linear import LinearModel, enlarged, linearize

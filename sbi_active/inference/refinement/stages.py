@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import require_support
+from sbi_active.inference.beliefs.belief import parameter_dim, require_support
 from sbi_active.inference.beliefs.comparison import compare_orders
+from sbi_active.inference.refinement.bridged import refine_many
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
 from sbi_active.inference.refinement.regression_error import SMALL, widened
@@ -92,6 +93,9 @@ def refine(
     A trial without a measurement counts by the probability of having none, one that was
     partly observed by the numbers that were (:mod:`.outcomes`).
 
+    Beyond six parameters such a simulator's posterior is sampled at once, from
+    Gauss-Newton modes (:func:`.refine_many`), at a cost linear in their number.
+
     Args:
         simulator: ``simulator(theta, action)``; not kept in the result.
         prior: The original prior, with a support.
@@ -134,6 +138,16 @@ def refine(
     task = _Task(simulator, prior, action, outcome, [*hints], settings)
     with single_thread():
         belief = None
+        if parameter_dim(prior) > MANY:
+            belief = refine_many(
+                *(simulator, prior, action, outcome),
+                hints=hints,
+                past=past,
+                settings=settings,
+                seed=seed,
+            )
+        if belief is not None:
+            return belief
         if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
             past.table.workers = settings.workers
             belief = refine_exactly(
