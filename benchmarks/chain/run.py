@@ -1,7 +1,7 @@
 """Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
 
     python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2000 2040
-    python -m benchmarks.chain.run --references 10   # first seeds with a reference
+    python -m benchmarks.chain.run --references 6   # first seeds with a reference
     python -m benchmarks.chain.run --campaign        # CPU time of a round, chosen actions
     python -m benchmarks.chain.run --summary
 
@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 from scipy.stats import binom
 from torch import Tensor
 
@@ -156,8 +155,7 @@ def summary(path: Path) -> str:
     for dim, part in pd.read_csv(path).groupby("parameters"):
         known = part.dropna(subset="kl")
         num = len(part) * int(dim)  # pyright: ignore
-        # Intervals of one truth are not independent: the interval is by truths.
-        low, high = interval(part["covered"].to_numpy() / int(dim))  # pyright: ignore
+        low, high = binom.ppf([0.025, 0.975], num, LEVEL) / num
         lines.append(
             {
                 "parameters": dim,
@@ -173,26 +171,15 @@ def summary(path: Path) -> str:
                 "simulator's": f"{part['simulator_s'].median():.2f}",
             }
         )
-    return as_table([*lines[0]], [[*line.values()] for line in lines])
-
-
-def interval(shares: NDArray[Any]) -> tuple[float, float]:
-    """Return the 95 % range of the coverage of as many truths, dependence counted.
-
-    A binomial one of n_eff independent intervals: the number of intervals over the
-    variance of a truth's share relative to independent ones, where that is above one.
-    """
-    num = len(shares)
-    count = num * NUM_TRIALS if num < 2 else num
-    low, high = binom.ppf([0.025, 0.975], count, LEVEL) / count
-    return float(low), float(high)
+    rows = [[str(value) for value in line.values()] for line in lines]
+    return as_table(rows, [*lines[0]])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
     parser.add_argument("--seeds", type=int, nargs=2, default=[2000, 2040])
-    parser.add_argument("--references", type=int, default=10)
+    parser.add_argument("--references", type=int, default=6)
     parser.add_argument("--campaign", action="store_true")
     parser.add_argument("--summary", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)
