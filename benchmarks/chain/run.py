@@ -1,12 +1,13 @@
 """Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
 
-    python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2000 2040
-    python -m benchmarks.chain.run --references 6   # first seeds with a reference
+    python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2100 2140
+    python -m benchmarks.chain.run --references 4   # first seeds with a reference
     python -m benchmarks.chain.run --campaign        # CPU time of a round, chosen actions
     python -m benchmarks.chain.run --summary
 
 Each seed has a truth drawn from the prior and six trials at random actions, refined with
-the defaults. "kl" is the divergence between normal fits to the logarithms of draws,
+the defaults but for a defensive share of 1e-6, since one draw of the prior among 20,000
+dominates the moments of a sharp posterior. "kl" is the divergence between normal fits to the logarithms of draws,
 from the reference to the belief; "kl_error" the same between two seeds of the reference.
 "covered" counts parameters within their central 90 % interval. CPU time is that of the
 refinement, and "simulator_s" what the same rows cost the simulator alone. Rows are
@@ -28,7 +29,7 @@ import torch
 from scipy.stats import binom
 from torch import Tensor
 
-from sbi_active import Campaign
+from sbi_active import Campaign, RefinementOptions
 from sbi_active.inference import refine
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -71,7 +72,10 @@ def simulator_seconds(task: Any, num: int) -> float:
 def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any]:
     task, action, x = problem(parameters, seed)
     start = time.process_time()
-    belief = refine(task.simulator, task.prior, action, x, seed=seed)
+    settings = RefinementOptions(defensive=1e-6)
+    belief = refine(
+        task.simulator, task.prior, action, x, settings=settings, seed=seed
+    )
     seconds = time.process_time() - start
     with forked_generators(seed, "draws"):
         draws = belief.sample(torch.Size([NUM_DRAWS]))
@@ -178,8 +182,8 @@ def summary(path: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
-    parser.add_argument("--seeds", type=int, nargs=2, default=[2000, 2040])
-    parser.add_argument("--references", type=int, default=6)
+    parser.add_argument("--seeds", type=int, nargs=2, default=[2100, 2140])
+    parser.add_argument("--references", type=int, default=4)
     parser.add_argument("--campaign", action="store_true")
     parser.add_argument("--summary", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)

@@ -44,6 +44,8 @@ Array = NDArray[Any]
 
 PER_PARAMETER = 0.4  # times num_effective: particles a parameter
 FEWEST = 400  # particles
+FEW = 4  # parameters up to which three times the histories are enough
+REMEMBERED = 0.3  # correlation of particles with where they began that is too much
 NUM_INTEGRAL = 4_000  # draws, which cost no simulation
 NUM_PROBES = 32  # draws at which uninformed parameters are changed
 MOVING = 0.02  # share of moves accepted, below which particles are stuck
@@ -169,11 +171,11 @@ def refine_many(
     )
     known = diagnose_exactly(likelihood, base, pool, seed)
     doubts = []
-    moves = found.acceptance >= MOVING
+    moves = found.acceptance >= MOVING and found.memory <= REMEMBERED
     if not moves:
         doubts.append(
-            f"only {found.acceptance:.1%} of the moves of the particles were accepted, "
-            "so that they may not have reached the posterior; raise num_effective"
+            f"{found.acceptance:.1%} of the moves of the particles were accepted, too "
+            "few for them to reach the posterior; raise num_histories"
         )
     twice = laplace.num_found >= 2
     if not twice:
@@ -256,7 +258,7 @@ def _bridged(
         own,
         rng,
         num_particles=max(num, FEWEST),
-        most=ROUGH * settings.num_histories,
+        most=ROUGH * settings.num_histories * max(1.0, len(axes) / FEW),
     )
     if found is None:
         return None

@@ -24,7 +24,7 @@ SHARE = 0.5  # particles that a step leaves effective
 MAX_STEPS = 200
 ACCEPTED = 0.35  # share of moves that the step's length is adapted to
 FORGOTTEN = 0.5  # correlation with the start after the moves of a step
-SETTLED = 0.2  # the same after the last ones
+SETTLED = 0.03  # the same after the last ones
 SHRUNK = 0.05  # share of the guess's covariance in that of the particles
 
 
@@ -70,6 +70,7 @@ class Bridged:
         standard_error: Of log_evidence.
         effective_sample_size: Of the particles, by families and what moves forgot.
         acceptance: Of the last moves.
+        memory: Correlation with where the last moves began.
         num_steps: Between the two densities.
     """
 
@@ -79,6 +80,7 @@ class Bridged:
     standard_error: float
     effective_sample_size: float
     acceptance: float
+    memory: float
     num_steps: int
 
 
@@ -90,7 +92,7 @@ def bridge(
     *,
     num_particles: int,
     most: float = np.inf,
-    max_moves: int = 40,
+    max_moves: int = 100,
     forgotten: float = FORGOTTEN,
     settled: float = SETTLED,
 ) -> Bridged | None:
@@ -182,7 +184,9 @@ def bridge(
             if kept <= goal:
                 break
             if spent > most:
-                return None
+                break
+        if spent > most and b < 1:
+            return None
         if b == 1:
             break
     else:
@@ -191,7 +195,7 @@ def bridge(
     effective = n / (1 + kept**2 * shared)
     log_l = target - log_prior(u)
     error = float(np.sqrt(2 * variance + 1e-12))
-    return Bridged(u, log_l, log_z, error, effective, acceptance, step)
+    return Bridged(u, log_l, log_z, error, effective, acceptance, kept, step)
 
 
 def _power(ratio: Array, b: float, num: int) -> float:
