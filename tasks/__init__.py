@@ -7,8 +7,8 @@ from typing import Any
 
 from sbi_active.tasks.ball_drops import BallDropsTask
 from sbi_active.tasks.base import Task
-from sbi_active.tasks.chain import ChainTask
 from sbi_active.tasks.box_collision import BoxCollisionTask
+from sbi_active.tasks.chain import ChainTask
 from sbi_active.tasks.location_finding import LocationFindingTask
 from sbi_active.tasks.numerical import NumericalTask
 from sbi_active.tasks.oscillator import OscillatorTask

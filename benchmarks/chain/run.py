@@ -1,17 +1,18 @@
 """Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
 
     python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2100 2140
-    python -m benchmarks.chain.run --references 4   # first seeds with a reference
-    python -m benchmarks.chain.run --campaign        # CPU time of a round, chosen actions
+    python -m benchmarks.chain.run --references 2   # first seeds with a reference
+    python -m benchmarks.chain.run --campaign      # CPU time of a round, chosen actions
     python -m benchmarks.chain.run --summary
 
-Each seed has a truth drawn from the prior and six trials at random actions, refined with
-the defaults but for a defensive share of 1e-6, since one draw of the prior among 20,000
-dominates the moments of a sharp posterior. "kl" is the divergence between normal fits to the logarithms of draws,
-from the reference to the belief; "kl_error" the same between two seeds of the reference.
-"covered" counts parameters within their central 90 % interval. CPU time is that of the
-refinement, and "simulator_s" what the same rows cost the simulator alone. Rows are
-added to results/, and those that are there are not run again.
+Each seed has a truth drawn from the prior and six trials at random actions, refined
+with the defaults but for a defensive share of 1e-6, since one draw of the prior among
+20,000 dominates the moments of a sharp posterior. "kl" is the divergence between normal
+fits to the logarithms of draws, from the reference to the belief; "kl_error" the same
+between two seeds of the reference. "covered" counts parameters within their central
+90 % interval. CPU time is that of the refinement, and "simulator_s" what the same rows
+cost the simulator alone. Rows are added to results/, and those that are there are not
+run again.
 """
 
 from __future__ import annotations
@@ -73,9 +74,7 @@ def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any
     task, action, x = problem(parameters, seed)
     start = time.process_time()
     settings = RefinementOptions(defensive=1e-6)
-    belief = refine(
-        task.simulator, task.prior, action, x, settings=settings, seed=seed
-    )
+    belief = refine(task.simulator, task.prior, action, x, settings=settings, seed=seed)
     seconds = time.process_time() - start
     with forked_generators(seed, "draws"):
         draws = belief.sample(torch.Size([NUM_DRAWS]))
@@ -183,7 +182,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
     parser.add_argument("--seeds", type=int, nargs=2, default=[2100, 2140])
-    parser.add_argument("--references", type=int, default=4)
+    parser.add_argument("--references", type=int, default=2)
     parser.add_argument("--campaign", action="store_true")
     parser.add_argument("--summary", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)

@@ -18,7 +18,7 @@ from torch import Tensor
 from sbi_active.inference.sampling.population import GaussianMixture
 from sbi_active.seeding import forked_generators
 
-NUM_CHAINS, NUM_WARMUP, NUM_DRAWS = 2, 150, 200
+NUM_WARMUP, NUM_DRAWS = 100, 150  # of each of two chains
 NUM_COMPONENTS = 4  # of the predictive, at most
 
 
@@ -126,7 +126,7 @@ def denoise(
 
 def _chain(program: Callable[[], None], start: Tensor) -> tuple[Tensor, int]:
     """Return the draws of a chain, shape (n, q), and its divergences."""
-    kernel = NUTS(program, max_tree_depth=6)
+    kernel = NUTS(program, max_tree_depth=5)
     run = MCMC(
         kernel,
         NUM_DRAWS,

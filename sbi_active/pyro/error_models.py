@@ -68,7 +68,9 @@ class StudentError:
 
     def __call__(self, x: Tensor, x_o: Tensor) -> None:
         """Condition on an outcome; x of shape (..., q)."""
-        pyro.sample("outcome", dist.StudentT(self.df, x, self.scale).to_event(1), obs=x_o)
+        pyro.sample(
+            "outcome", dist.StudentT(self.df, x, self.scale).to_event(1), obs=x_o
+        )
 
     def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
         """Return whether errors are gross at denoised outcomes (n, q), shape (n, q)."""

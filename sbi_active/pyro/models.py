@@ -39,15 +39,15 @@ class SitesPrior(Distribution):
     @property
     @override
     def support(self) -> Any:
-        parts = [
-            constraints.independent(_base(d.support), 1) for d in self.sites.values()
-        ]
-        return constraints.cat(parts, dim=-1, lengths=self.sizes)
+        parts = [_base(d.support) for d in self.sites.values()]
+        whole = constraints.cat(parts, dim=-1, lengths=self.sizes)
+        return constraints.independent(whole, 1)
 
-    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+    def sample(self, sample_shape: Any = ()) -> Tensor:
         """Return draws, shape (*sample_shape, d), float32."""
         shape = torch.Size(sample_shape)
-        parts = [d.sample(shape).reshape(*shape, -1) for d in self.sites.values()]
+        pairs = zip(self.sites.values(), self.sizes, strict=True)
+        parts = [d.sample(shape).reshape(*shape, size) for d, size in pairs]
         return torch.cat(parts, -1).float()
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -124,6 +124,11 @@ def from_pyro(
             raise ValueError(
                 f"expected continuous parameters; got {name!r}, which is discrete; sum "
                 "it out in the model"
+            )
+        if _base(d.support).event_dim:
+            raise ValueError(
+                f"expected parameters with bounds of their own; got {name!r} on "
+                f"{d.support}; write it as a function of free ones"
             )
         if any(name not in other or not _same(d, other[name]) for other in sites):
             raise ValueError(
@@ -210,8 +215,10 @@ def _noise(found: list[Any]) -> GaussianNoise | StudentTNoise | None:
 
 
 def _inner(d: Any) -> Any:
-    while isinstance(d, Independent) or hasattr(d, "base_dist") and not hasattr(
-        d, "transforms"
+    while (
+        isinstance(d, Independent)
+        or hasattr(d, "base_dist")
+        and not hasattr(d, "transforms")
     ):
         d = d.base_dist
     return d

@@ -14,9 +14,9 @@ times with Gaussian noise. Springs beyond the clamp and clamped masses change no
 trials that all clamp early leave them as the prior has them.
 
 The parameters are the stiffnesses of the n springs and the first masses,
-:math:`\theta = (k_1, \dots, k_n, m_1, \dots)`; with an odd number of parameters the last
-mass is known. In modes :math:`M^{-1/2} K M^{-1/2} = V \omega^2 V^\top` the motion has a
-closed form.
+:math:`\theta = (k_1, \dots, k_n, m_1, \dots)`; of an odd number of parameters the last
+mass is missing and known. In modes :math:`M^{-1/2} K M^{-1/2} = V \omega^2 V^\top` the
+motion has a closed form.
 """
 
 from __future__ import annotations

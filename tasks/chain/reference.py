@@ -1,4 +1,4 @@
-"""The posterior of a chain by long tempered SMC from the prior, weighted at its end."""
+"""The posterior of a chain by long tempered SMC from the prior."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ class ChainReference:
 
     No derivative and no guess at the posterior enters: the first particles are draws of
     the prior, and the likelihood is the closed form. At the end, draws of a normal fit
-    to the particles are weighted; where many of them count, they replace the particles,
-    and their mean weight is the evidence. That of the particles alone is too low by half
-    a nat, since their moves lag behind the temperature. Two seeds tell the error.
+    to the particles are weighted; where many of them count, they replace the
+    particles, and their mean weight is the evidence. That of the particles alone is too
+    low by half a nat, since their moves lag behind the temperature. Two seeds tell the
+    error.
 
     Args:
         prior: Of the task.

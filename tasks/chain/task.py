@@ -67,7 +67,9 @@ class ChainTask(Task):
         masses = parameters - springs
         median = torch.tensor([STIFFNESS] * springs + [MASS] * masses)
         if theta_true is None:
-            theta_true = median * torch.exp(0.3 * torch.sin(2.4 * torch.arange(parameters)))
+            theta_true = median * torch.exp(
+                0.3 * torch.sin(2.4 * torch.arange(parameters))
+            )
         self.theta_true = torch.as_tensor(theta_true, dtype=torch.float32)
         positive = self.theta_true.isfinite() & (self.theta_true > 0)
         if self.theta_true.shape != (parameters,) or not bool(positive.all()):

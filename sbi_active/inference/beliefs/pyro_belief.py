@@ -31,7 +31,7 @@ class PyroBelief(TorchDistribution):
         return self.belief.support
 
     @override
-    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+    def sample(self, sample_shape: Any = ()) -> Tensor:
         return self.belief.sample(torch.Size(sample_shape))
 
     @override

@@ -47,7 +47,8 @@ FEWEST = 400  # particles
 FEW = 4  # parameters up to which three times the histories are enough
 REMEMBERED = 0.3  # correlation of particles with where they began that is too much
 NUM_INTEGRAL = 4_000  # draws, which cost no simulation
-NUM_PROBES = 32  # draws at which uninformed parameters are changed
+UNCHANGED = 2e-3  # deviations of the noise, which single precision may change
+NUM_PROBES = 16  # draws at which uninformed parameters are changed
 MOVING = 0.02  # share of moves accepted, below which particles are stuck
 
 
@@ -214,17 +215,22 @@ def _free(
     """Return parameters that change no trial and do not depend on others."""
     c, free = trials.coordinates, ~laplace.informed
     none = np.zeros(c.dim, dtype=bool)
-    if not free.any() or free.all() or not c.splits_off(free, rng):
+    if not free.any() or free.all():
         return none
-    drawn = c.sample(NUM_PROBES, rng)
-    other = np.where(free, c.sample(NUM_PROBES, rng), drawn)
-    at, off = (laplace.guess.sample(NUM_PROBES, rng) for _ in range(2))
-    off = np.where(free, off, at)
-    same = all(
-        np.array_equal(trials.residual(a)[0], trials.residual(b)[0])
-        for a, b in ((drawn, other), (at, off))
-    )
-    return free if same else none
+    drawn, other = (c.sample(NUM_PROBES, rng) for _ in range(2))
+    near, off = (laplace.guess.sample(NUM_PROBES, rng) for _ in range(2))
+
+    def changes(axes: NDArray[np.bool_]) -> bool:
+        pairs = (drawn, np.where(axes, other, drawn)), (near, np.where(axes, off, near))
+        return any(
+            np.abs(trials.residual(a)[0] - trials.residual(b)[0]).max() > UNCHANGED
+            for a, b in pairs
+        )
+
+    for axis in np.flatnonzero(free):
+        free[axis] = not changes(np.arange(c.dim) == axis)
+    is_free = free.any() and c.splits_off(free, rng) and not changes(free)
+    return free if is_free else none
 
 
 def _bridged(

@@ -34,6 +34,7 @@ KEPT = 3  # starts of a round that go on after the early ones
 SAME = 2.0  # fall of the cost within which two searches found the same mode
 NEGLIGIBLE = 40.0  # rise of the cost beyond which a mode holds no mass
 WIDER = 1.1  # than the Laplace approximation
+FAINT = 0.1  # derivative, which rounding may give, below which more is asked
 LARGEST = 1e6  # bound on a whitened residual
 
 
@@ -160,7 +161,7 @@ def find_laplace(
     # A mode that is worth little is still visited.
     mass = 0.9 * mass / mass.sum() + 0.1 / len(mass)
     factors = WIDER * np.linalg.cholesky(cov)
-    informed = (jac != 0).any((0, 1))
+    informed = (np.abs(jac) > FAINT).any((0, 1))
     return Laplace(NormalMixture(mass, modes, factors), modes, informed, num_found, num)
 
 

@@ -87,14 +87,12 @@ def refine(
     Misfit that stays, as of a response that jumps, is no noise. Where the simulator is
     noise-free beside a declared noise, a simulation gives the likelihood itself, and
     the posterior is then sampled with that
-    (:func:`.importance_sample`), from the learned
-    posterior or from the draws of the earlier call.
+    (:func:`.importance_sample`), from the learned posterior or from the draws of the
+    earlier call; beyond six parameters at once, from Gauss-Newton modes.
 
     A trial without a measurement counts by the probability of having none, one that was
     partly observed by the numbers that were (:mod:`.outcomes`).
 
-    Beyond six parameters such a simulator's posterior is sampled at once, from
-    Gauss-Newton modes (:func:`.refine_many`), at a cost linear in their number.
 
     Args:
         simulator: ``simulator(theta, action)``; not kept in the result.
@@ -137,15 +135,10 @@ def refine(
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
     task = _Task(simulator, prior, action, outcome, [*hints], settings)
     with single_thread():
+        many = {"past": past, "settings": settings, "seed": seed}
         belief = None
         if parameter_dim(prior) > MANY:
-            belief = refine_many(
-                *(simulator, prior, action, outcome),
-                hints=hints,
-                past=past,
-                settings=settings,
-                seed=seed,
-            )
+            belief = refine_many(simulator, prior, action, outcome, hints=hints, **many)
         if belief is not None:
             return belief
         if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):

@@ -146,7 +146,9 @@ def bridge(
     log_z = variance = b = spent = 0.0
     spent += n
     length, acceptance = 1.0, 1.0
-    for step in range(1, MAX_STEPS + 1):
+    step = 0
+    while step < MAX_STEPS:
+        step += 1
         ratio = target - start
         with np.errstate(invalid="ignore"):
             ratio = np.where(np.isfinite(target), ratio, -np.inf)
