@@ -3,8 +3,8 @@
     python -m benchmarks.chain.robust --seeds 2000 2010
 
 Ten trials at random actions. In "gross" one of them, drawn by the seed, is off by 100
-deviations of the noise; "clean" has none. Both methods take the word of the same kind of
-network (no refinement), trained under their own belief in each round. Rows are added
+deviations of the noise; "clean" has none. Both methods take the word of the same kind
+of network (no refinement), trained under their own belief in each round. Rows are added
 to results/robust.csv, and those that are there are not run again.
 """
 

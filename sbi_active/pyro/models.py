@@ -12,7 +12,6 @@ import torch
 from pyro import poutine
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, StudentT, constraints
-from typing_extensions import override
 
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel, StudentTNoise
@@ -37,7 +36,6 @@ class SitesPrior(Distribution):
         )
 
     @property
-    @override
     def support(self) -> Any:
         parts = [_base(d.support) for d in self.sites.values()]
         whole = constraints.cat(parts, dim=-1, lengths=self.sizes)

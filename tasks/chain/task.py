@@ -96,8 +96,10 @@ class ChainTask(Task):
 
     def reference(
         self, action: Tensor, x: Tensor, *, seed: int = 0, num_particles: int = 2_000
-    ) -> ChainReference:
+    ) -> Any:
         """Return the posterior given trials by long tempered SMC.
+
+        It is a :class:`.ChainReference`, which knows no information gain.
 
         Args:
             action: Shape (t, 2).

@@ -161,7 +161,7 @@ def find_laplace(
     # A mode that is worth little is still visited.
     mass = 0.9 * mass / mass.sum() + 0.1 / len(mass)
     factors = WIDER * np.linalg.cholesky(cov)
-    informed = (np.abs(jac) > FAINT).any((0, 1))
+    informed = np.abs(jac).max((0, 1)) > FAINT
     return Laplace(NormalMixture(mass, modes, factors), modes, informed, num_found, num)
 
 
