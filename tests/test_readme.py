@@ -199,4 +199,10 @@ def test_no_page_is_forgotten():
         "failed_trial.md",
         "which_parameters.md",
         "two_models.md",
+        "robust.md",
     }
+
+
+def test_robust_updates(run):
+    (snippet,) = run("docs/robust.md")
+    assert snippet.model.misspecified(snippet.x, torch.tensor([0.0, 30.0]))[0, 1] > 0.99

@@ -37,6 +37,7 @@ class SitesPrior(Distribution):
 
     @property
     def support(self) -> Any:
+        """Bounds of every entry, those of its site."""
         parts = [_base(d.support) for d in self.sites.values()]
         whole = constraints.cat(parts, dim=-1, lengths=self.sizes)
         return constraints.independent(whole, 1)
