@@ -8,6 +8,7 @@ from typing import Any
 from sbi_active.tasks.ball_drops import BallDropsTask
 from sbi_active.tasks.base import Task
 from sbi_active.tasks.box_collision import BoxCollisionTask
+from sbi_active.tasks.chain import ChainTask
 from sbi_active.tasks.location_finding import LocationFindingTask
 from sbi_active.tasks.numerical import NumericalTask
 from sbi_active.tasks.oscillator import OscillatorTask
@@ -24,6 +25,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "servo_pendulum": ServoPendulumTask,
     "ball_drops": BallDropsTask,
     "location_finding": LocationFindingTask,
+    "chain": ChainTask,
 }
 
 

@@ -42,6 +42,7 @@ FLOORS = (
     "inference.networks",
     "inference.models",
     "inference.trainers",
+    "pyro",
     "information_gain",
     "information_gain.fits",
     "information_gain.estimators",

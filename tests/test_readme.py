@@ -207,4 +207,10 @@ def test_no_page_is_forgotten():
         "which_parameters.md",
         "two_models.md",
         "pouring.md",
+        "robust.md",
     }
+
+
+def test_robust_updates(run):
+    (snippet,) = run("docs/robust.md")
+    assert snippet.model.misspecified(snippet.x, torch.tensor([0.0, 30.0]))[0, 1] > 0.99

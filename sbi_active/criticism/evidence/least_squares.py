@@ -11,27 +11,22 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.importance import INFLATION, lower_factors
 from sbi_active.criticism.rivals.error_models import Whitener
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.least_squares import descend, floored
 from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
-#: Times that coordinates are held at their bounds, or let go, in a step.
-HELD = 20
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
 NUM_POINTS, RANGE = 64, 4.0
-#: Precision that stands for a uniform prior where a proposal must have some.
-FLAT = 0.3
 #: Iterations that bring a point back to where the data put it.
 RETURN = 5
 #: Iterations of the first phase in two halves and of each later phase.
 EARLY, LATE = (3, 3), 4
 #: Coordinates within which two points count as the same, early and late.
 NEAR_MODE, SAME_MODE = 0.05, 0.02
-#: Expected fall of a sum of squares that is worth no further iteration.
-CONVERGED = 0.02
 #: Sum of squares that a phase must take off the best start to be worth another.
 PROGRESS = 0.5
 MAX_MODES = 8
@@ -206,7 +201,7 @@ def along_ridges(
         return modes.proposal
     u = u[target >= target.max() - NEGLIGIBLE / 2]
     _, jac = rival.jacobian(modes.u[:1], modes.whiten, step)
-    known = np.linalg.svd(jac[0] / np.sqrt(_floor(rival)), compute_uv=False) > 1
+    known = np.linalg.svd(jac[0] / np.sqrt(floored(rival)), compute_uv=False) > 1
     num_open = max(int(rival.searched.sum() - known.sum()), 1)
     width = min(RANGE * NUM_POINTS ** (-1 / num_open), 1.0)
     return StudentMixture(u, _factors(rival, u, modes.whiten, step, width))
@@ -219,18 +214,13 @@ def local_proposal(
     return StudentMixture(u, _factors(rival, u, whiten, step, 1.0))
 
 
-def _floor(rival: Rival) -> Array:
-    """Return the prior's precision, shape (dim,), a wide one between two bounds."""
-    return np.maximum(rival.coordinates.precision, FLAT)
-
-
 def _factors(
     rival: Rival, u: Array, whiten: Whitener, step: float, width: float
 ) -> Array:
     """Return Cholesky factors of the local covariances, within a width."""
     _, jac = rival.jacobian(u, whiten, step)
     precision = np.einsum("nij,nik->njk", jac, jac)
-    precision = precision + np.diag(_floor(rival) / width**2)
+    precision = precision + np.diag(floored(rival) / width**2)
     fixed = ~rival.searched
     precision[:, fixed] = 0.0
     precision[:, :, fixed] = 0.0
@@ -249,112 +239,3 @@ def _which_distinct(u: Array, apart: float) -> list[int]:
 
 def _distinct(u: Array, apart: float) -> Array:
     return u[_which_distinct(u, apart)]
-
-
-def descend(
-    rival: Rival,
-    u: Array,
-    whiten: Whitener,
-    step: float,
-    iterations: int,
-    *,
-    center: Array | None = None,
-    secant: bool = False,
-    known: tuple[Array, Array] | None = None,
-) -> tuple[Array, Array]:
-    """Return improved starts and their cost, shapes (n, dim) and (n,).
-
-    Args:
-        rival: The model.
-        u: Starts, shape (n, dim).
-        whiten: Of the residuals.
-        step: Of finite differences.
-        iterations: At most; a start that is expected to gain nothing stops.
-        center: Of the penalty, shape (n, dim); None has that of the prior.
-        secant: Derivatives are updated from the steps made, by Broyden's rule, and not
-            computed again.
-        known: Whitened residuals at the starts and their derivatives, shapes (n, N) and
-            (n, N, dim), where they need no simulation.
-    """
-    c, dim = rival.coordinates, rival.dim
-    weight = c.precision if center is None else _floor(rival)
-    center = np.broadcast_to(c.center if center is None else center, u.shape)
-    free = rival.searched
-    damping = np.full(len(u), 1e-2)
-    u = u.copy()
-
-    def penalized(r: Array, at: Array, rows: Array) -> Array:
-        return (r**2).sum(1) + ((at - center[rows]) ** 2 * weight).sum(1)
-
-    if known is None:
-        known = rival.jacobian(u, whiten, step)
-    r, jac = (part.copy() for part in known)
-    cost = penalized(r, u, np.arange(len(u)))
-    rows = np.arange(len(u))
-    for i in range(iterations):
-        part = jac[rows]
-        normal = np.einsum("nij,nik->njk", part, part) + np.diag(weight)
-        gradient = np.einsum("nij,ni->nj", part, r[rows])
-        gradient = gradient + (u[rows] - center[rows]) * weight
-        diagonal = np.einsum("njj->nj", normal)
-        lift = damping[rows, None] * diagonal + 1e-8
-        system = normal + lift[:, :, None] * np.eye(dim)
-        move = within(system, gradient, u[rows], c.low, c.high)
-        new = np.clip(u[rows] - np.where(free, move, 0.0), c.low, c.high)
-        linear = np.einsum("nij,nj->ni", part, new - u[rows])
-        expected = cost[rows] - penalized(r[rows] + linear, new, rows)
-        worth = expected > CONVERGED
-        rows, new, linear = rows[worth], new[worth], linear[worth]
-        if not len(rows):
-            break
-        new_r = whiten(rival.residual(new)[0])
-        new_cost = penalized(new_r, new, rows)
-        if secant:
-            change = new - u[rows]
-            miss = new_r - r[rows] - linear
-            length = np.maximum((change**2).sum(1), 1e-300)[:, None, None]
-            jac[rows] += miss[:, :, None] * change[:, None] / length
-        better = new_cost < cost[rows]
-        won = rows[better]
-        u[won], cost[won], r[won] = new[better], new_cost[better], new_r[better]
-        if len(won) and not secant and i < iterations - 1:
-            _, jac[won] = rival.jacobian(u[won], whiten, step)
-        damping[rows] = damping[rows] * np.where(better, 0.15, 10.0)
-    return u, cost
-
-
-def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) -> Array:
-    """Return the steps of normal equations, (n, dim), along the bounds they stand at.
-
-    A coordinate that a step would take beyond its bound is held, and the others are
-    found again: clipped alone, it would leave them where they are right only with it.
-
-    Args:
-        system: Shape (n, dim, dim).
-        gradient: Shape (n, dim).
-        u: Shape (n, dim).
-        low: Lower bounds, shape (dim,).
-        high: Upper bounds.
-
-    References:
-        Bertsekas, SIAM Journal on Control and Optimization 20 (1982).
-    """
-    move = np.linalg.solve(system, gradient[..., None])[..., 0]
-    # Of a coordinate at its upper bound, signs turn around.
-    side = (u <= low).astype(float) - (u >= high)
-    for i in np.flatnonzero((side * move > 0).any(1)):
-        held = np.zeros(u.shape[1], dtype=bool)
-        for _ in range(HELD):
-            out = ~held & (side[i] * move[i] > 0)
-            # What is held, and would now be better off inside.
-            pull = side[i] * (gradient[i] - system[i] @ move[i])
-            back = held & (pull < 0) & (not out.any())
-            if not out.any() and not back.any():
-                break
-            if back.any():
-                back &= pull == pull[back].min()
-            held = (held | out) & ~back
-            move[i] = 0.0
-            open_ = np.ix_(~held, ~held)
-            move[i, ~held] = np.linalg.solve(system[i][open_], gradient[i, ~held])
-    return move

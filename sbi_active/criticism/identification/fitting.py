@@ -15,13 +15,13 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
-from sbi_active.criticism.evidence.least_squares import descend
 from sbi_active.criticism.identification.errors import Hypotheses, grams
 from sbi_active.criticism.identification.posterior import Draws, Unknowns, sample
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 

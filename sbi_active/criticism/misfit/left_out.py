@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.least_squares import within
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Errors
+from sbi_active.inference.sampling.least_squares import within
 
 Array = NDArray[Any]
 

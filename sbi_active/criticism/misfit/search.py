@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.least_squares import descend
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.left_out import LeftOut, leave_out
 from sbi_active.criticism.misfit.linear import LinearModel, enlarged, linearize
@@ -25,6 +24,7 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.combinations import log_prior
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]

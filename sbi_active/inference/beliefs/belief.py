@@ -131,6 +131,16 @@ class Belief(Distribution, ABC):
         """Variance over 20,000 draws, shape (theta_dim,)."""
         return self._moments[1]
 
+    def to_pyro(self) -> Any:
+        """Return a Pyro distribution, for a sample site of the next model.
+
+        Draws are those of this belief; ``log_prob`` may cost simulations, and has no
+        gradient where it does. Needs the extra ``pyro``.
+        """
+        from sbi_active.inference.beliefs.pyro_belief import PyroBelief
+
+        return PyroBelief(self)
+
     def __repr__(self) -> str:
         mean, sd = self.mean.tolist(), self.variance.sqrt().tolist()
         names = [f"{name} " for name in self.parameter_names or ()] or [""] * len(mean)

@@ -119,7 +119,7 @@ def refine_exactly(
     )
     num_simulations = table.num_simulations - before[0]
     num_missing = table.num_missing - before[1]
-    belief.diagnostics = _diagnose(likelihood, coordinates, pool, seed).extended(
+    belief.diagnostics = diagnose_exactly(likelihood, coordinates, pool, seed).extended(
         num_simulations=num_simulations, num_missing=num_missing
     )
     belief.histories = ExactRecord.of(histories, likelihood, coordinates, pool)
@@ -133,7 +133,7 @@ def refine_exactly(
     return belief
 
 
-def _diagnose(
+def diagnose_exactly(
     likelihood: SimulatedLikelihood,
     coordinates: PriorCoordinates,
     pool: WeightedPool,

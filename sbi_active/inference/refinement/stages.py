@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import require_support
+from sbi_active.inference.beliefs.belief import parameter_dim, require_support
 from sbi_active.inference.beliefs.comparison import compare_orders
+from sbi_active.inference.refinement.bridged import refine_many
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
 from sbi_active.inference.refinement.regression_error import SMALL, widened
@@ -86,11 +87,12 @@ def refine(
     Misfit that stays, as of a response that jumps, is no noise. Where the simulator is
     noise-free beside a declared noise, a simulation gives the likelihood itself, and
     the posterior is then sampled with that
-    (:func:`.importance_sample`), from the learned
-    posterior or from the draws of the earlier call.
+    (:func:`.importance_sample`), from the learned posterior or from the draws of the
+    earlier call; beyond six parameters at once, from Gauss-Newton modes.
 
     A trial without a measurement counts by the probability of having none, one that was
     partly observed by the numbers that were (:mod:`.outcomes`).
+
 
     Args:
         simulator: ``simulator(theta, action)``; not kept in the result.
@@ -133,7 +135,12 @@ def refine(
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
     task = _Task(simulator, prior, action, outcome, [*hints], settings)
     with single_thread():
+        many = {"past": past, "settings": settings, "seed": seed}
         belief = None
+        if parameter_dim(prior) > MANY:
+            belief = refine_many(simulator, prior, action, outcome, hints=hints, **many)
+        if belief is not None:
+            return belief
         if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
             past.table.workers = settings.workers
             belief = refine_exactly(

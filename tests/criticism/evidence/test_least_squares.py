@@ -13,8 +13,8 @@ from sbi_active.criticism.evidence.least_squares import (
     along_ridges,
     find_modes,
     local_proposal,
-    within,
 )
+from sbi_active.inference.sampling.least_squares import within
 from tests.criticism.evidence.linear import exact, linear_rival
 
 STEP = 1e-4

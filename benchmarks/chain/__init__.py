@@ -1,0 +1,1 @@
+"""Beliefs of many parameters, and robust ones."""

@@ -1,0 +1,212 @@
+"""Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
+
+    python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2100 2140
+    python -m benchmarks.chain.run --references 2   # first seeds with a reference
+    python -m benchmarks.chain.run --campaign      # CPU time of a round, chosen actions
+    python -m benchmarks.chain.run --summary
+
+Each seed has a truth drawn from the prior and six trials at random actions, refined
+with the defaults but for a defensive share of 1e-6, since one draw of the prior among
+20,000 dominates the moments of a sharp posterior. "kl" is the divergence between normal
+fits to the logarithms of draws, from the reference to the belief; "kl_error" the same
+between two seeds of the reference. "covered" counts parameters within their central
+90 % interval. CPU time is that of the refinement, and "simulator_s" what the same rows
+cost the simulator alone. Rows are added to results/, and those that are there are not
+run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from scipy.stats import binom
+from torch import Tensor
+
+from sbi_active import Campaign, RefinementOptions
+from sbi_active.inference import refine
+from sbi_active.plots import as_table
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.tasks import get_task  # pyright: ignore
+
+RESULTS = Path(__file__).with_name("results")
+NUM_TRIALS, NUM_DRAWS, LEVEL = 6, 20_000, 0.9
+
+
+def problem(parameters: int, seed: int) -> tuple[Any, Tensor, Tensor]:
+    """Return a task with a drawn truth, its actions and outcomes."""
+    task = get_task("chain", parameters=parameters)
+    with forked_generators(seed, "truth"):
+        task = task.with_truth(task.prior.sample())
+    action = task.actions.sample((NUM_TRIALS,), seed=derive_seed(seed, "actions"))
+    x = [task.real_system(a, seed=derive_seed(seed, i)) for i, a in enumerate(action)]
+    return task, action, torch.stack(x)
+
+
+def divergence(one: Tensor, other: Tensor) -> float:
+    """Return KL of normal fits to the logarithms of draws, both (n, d)."""
+    a, b = (draws.double().log().numpy() for draws in (one, other))
+    cov_a, cov_b = np.cov(a.T), np.cov(b.T)
+    apart = b.mean(0) - a.mean(0)
+    solved = np.linalg.solve(cov_b, np.column_stack([cov_a, apart]))
+    logs = np.linalg.slogdet(cov_b)[1] - np.linalg.slogdet(cov_a)[1]
+    trace = np.trace(solved[:, :-1])
+    return float(0.5 * (trace + apart @ solved[:, -1] - a.shape[1] + logs))
+
+
+def simulator_seconds(task: Any, num: int) -> float:
+    """Return CPU seconds that so many rows cost the simulator alone."""
+    theta = task.prior.sample((1_000,))
+    action = task.actions.sample((1_000,), seed=0)
+    start = time.process_time()
+    task.simulator.mean(theta, action)
+    return (time.process_time() - start) * num / 1_000
+
+
+def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any]:
+    task, action, x = problem(parameters, seed)
+    start = time.process_time()
+    settings = RefinementOptions(defensive=1e-6)
+    belief = refine(task.simulator, task.prior, action, x, settings=settings, seed=seed)
+    seconds = time.process_time() - start
+    with forked_generators(seed, "draws"):
+        draws = belief.sample(torch.Size([NUM_DRAWS]))
+    tail = (1 - LEVEL) / 2
+    low, high = draws.quantile(torch.tensor([tail, 1 - tail]), dim=0)
+    covered = int(((task.theta_true >= low) & (task.theta_true <= high)).sum())
+    d = belief.diagnostics
+    row: dict[str, Any] = {
+        "parameters": parameters,
+        "seed": seed,
+        "method": type(belief).__name__,
+        "covered": covered,
+        "log_prob_truth": float(belief.log_prob(task.theta_true)),
+        "trustworthy": bool(d.trustworthy),
+        "cpu_s": seconds,
+        "simulator_s": simulator_seconds(task, d.num_simulations),
+        "num_simulations": d.num_simulations,
+        "num_uninformed": d.figures.get("num_uninformed", 0),
+        "kl": np.nan,
+        "kl_error": np.nan,
+        "evidence_gap": np.nan,
+        "reference_cpu_s": np.nan,
+    }
+    if with_reference:
+        start = time.process_time()
+        one, other = (
+            task.reference(action, x, seed=derive_seed(seed, "reference", i))
+            for i in range(2)
+        )
+        row["reference_cpu_s"] = time.process_time() - start
+        both = torch.cat([one.draws, other.draws])
+        row["kl"] = divergence(both, draws)
+        row["kl_error"] = divergence(one.draws, other.draws)
+        evidence = 0.5 * (one.log_evidence + other.log_evidence)
+        row["evidence_gap"] = d.figures.get("log_evidence", np.nan) - evidence
+    return row
+
+
+def rounds(parameters: int, seed: int) -> list[dict[str, Any]]:
+    """Return CPU seconds of each round of a campaign with its defaults."""
+    task = problem(parameters, seed)[0]
+    campaign = Campaign(task.simulator, task.prior, task.actions, seed=seed)
+    rows = []
+    for i in range(NUM_TRIALS):
+        start = time.process_time()
+        trial = campaign.ask()
+        campaign.tell(task.real_system(trial.action, seed=derive_seed(seed, "real", i)))
+        campaign.update()
+        seconds = time.process_time() - start
+        parts = campaign.history[i].cpu_seconds
+        d = campaign.belief.diagnostics  # pyright: ignore
+        row = {"parameters": parameters, "seed": seed, "round": i + 1}
+        row |= {"cpu_s": seconds, "trustworthy": bool(d.trustworthy)}
+        row |= {f"{name}_s": value for name, value in sorted(parts.items())}
+        rows.append(row)
+    return rows
+
+
+def append(path: Path, rows: list[dict[str, Any]]) -> None:
+    is_new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, [*rows[0]], lineterminator="\n")
+        if is_new:
+            writer.writeheader()
+        writer.writerows(
+            {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
+            for row in rows
+        )
+
+
+def done(path: Path) -> set[tuple[int, int]]:
+    if not path.exists():
+        return set()
+    table = pd.read_csv(path)
+    return {*zip(table["parameters"], table["seed"], strict=True)}
+
+
+def summary(path: Path) -> str:
+    """Return a line for each number of parameters."""
+    lines = []
+    for dim, part in pd.read_csv(path).groupby("parameters"):
+        known = part.dropna(subset="kl")
+        num = len(part) * int(dim)  # pyright: ignore
+        low, high = binom.ppf([0.025, 0.975], num, LEVEL) / num
+        lines.append(
+            {
+                "parameters": dim,
+                "truths": len(part),
+                "median KL": f"{known['kl'].median():.3f}",
+                "largest KL": f"{known['kl'].max():.3f}",
+                "its error": f"{known['kl_error'].median():.3f}",
+                "references": len(known),
+                "coverage of 90 %": f"{part['covered'].sum() / num:.3f}",
+                "by chance": f"{low:.3f} to {high:.3f}",
+                "trustworthy": f"{part['trustworthy'].mean():.2f}",
+                "CPU s": f"{part['cpu_s'].median():.2f}",
+                "simulator's": f"{part['simulator_s'].median():.2f}",
+            }
+        )
+    rows = [[str(value) for value in line.values()] for line in lines]
+    return as_table(rows, [*lines[0]])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
+    parser.add_argument("--seeds", type=int, nargs=2, default=[2100, 2140])
+    parser.add_argument("--references", type=int, default=2)
+    parser.add_argument("--campaign", action="store_true")
+    parser.add_argument("--summary", action="store_true")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    options.out.mkdir(parents=True, exist_ok=True)
+    name = "rounds.csv" if options.campaign else "beliefs.csv"
+    path = options.out / name
+    if options.summary:
+        print(summary(path))
+        return
+    for seed in range(*options.seeds):
+        for dim in options.parameters:
+            if (dim, seed) in done(path):
+                continue
+            if options.campaign:
+                rows = rounds(dim, seed)
+            else:
+                want = seed < options.seeds[0] + options.references
+                rows = [judged(dim, seed, with_reference=want)]
+            append(path, rows)
+            print(rows[-1], flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""Sequential Monte Carlo from a normal guess, or a prior, to a density near it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.inference.sampling.tempering import largest_power
+from sbi_active.inference.sampling.weights import (
+    effective_sample_size,
+    log_sum_exp,
+    normalized,
+    systematic,
+)
+
+Array = NDArray[Any]
+
+SHARE = 0.5  # particles that a step leaves effective
+MAX_STEPS = 200
+ACCEPTED = 0.35  # share of moves that the step's length is adapted to
+FORGOTTEN = 0.5  # correlation with the start after the moves of a step
+SETTLED = 0.03  # the same after the last ones
+SHRUNK = 0.05  # share of the guess's covariance in that of the particles
+
+
+@dataclass(frozen=True)
+class NormalMixture(Proposal):
+    """Normal components.
+
+    Attributes:
+        weights: Sum to 1, shape (k,).
+        means: Shape (k, d).
+        factors: Lower Cholesky factors, shape (k, d, d).
+    """
+
+    weights: Array
+    means: Array
+    factors: Array
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
+        which = systematic(self.weights, num_samples, rng.random())
+        step = rng.standard_normal((num_samples, self.means.shape[1]))
+        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], step)
+
+    def log_prob(self, z: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        parts = [
+            np.log(w) + _log_normal(z, mean, factor)
+            for w, mean, factor in zip(
+                self.weights, self.means, self.factors, strict=True
+            )
+        ]
+        return log_sum_exp(np.stack(parts), axis=0)
+
+
+@dataclass(frozen=True)
+class Bridged:
+    """Particles of a density.
+
+    Attributes:
+        u: Equally weighted, shape (n, d).
+        log_likelihood: Of each, shape (n,).
+        log_evidence: Log of the integral of the density, nats.
+        standard_error: Of log_evidence.
+        effective_sample_size: Of the particles, by families and what moves forgot.
+        acceptance: Of the last moves.
+        memory: Correlation with where the last moves began.
+        num_steps: Between the two densities.
+    """
+
+    u: Array
+    log_likelihood: Array
+    log_evidence: float
+    standard_error: float
+    effective_sample_size: float
+    acceptance: float
+    memory: float
+    num_steps: int
+
+
+def bridge(
+    log_prior: Callable[[Array], Array],
+    log_likelihood: Callable[[Array], Array],
+    guess: Proposal,
+    rng: np.random.Generator,
+    *,
+    num_particles: int,
+    most: float = np.inf,
+    max_moves: int = 100,
+    forgotten: float = FORGOTTEN,
+    settled: float = SETTLED,
+) -> Bridged | None:
+    r"""Return particles of :math:`p(u) L(u)`, or None where it takes too many moves.
+
+    They go from the guess q along
+
+    .. math::
+        \pi_b(u) \propto q(u)^{1 - b}\, \bigl(p(u)\, L(u)\bigr)^b, \qquad
+        \log Z = \sum_k \log \frac1n \sum_i
+        \Bigl(\frac{p L}{q}\Bigr)^{b_{k+1} - b_k}(u_i),
+
+    and are moved at each step by proposals that a normal :math:`N(m, C)` of their own
+    moments is invariant to,
+
+    .. math::
+        u' = m + \sqrt{1 - s^2}\,(u - m) + s\, C^{1/2} e,
+
+    so that on a normal density each is accepted and none costs more in more dimensions.
+    Where q is close, one step suffices.
+
+    Args:
+        log_prior: Log p, (n, d) -> (n,).
+        log_likelihood: Log L, (n, d) -> (n,); -inf allowed.
+        guess: q.
+        rng: Source of randomness.
+        num_particles: n.
+        most: Evaluations of the likelihood at most.
+        max_moves: A step.
+        forgotten: Correlation with where they were that ends the moves of a step.
+        settled: That of the last step.
+
+    References:
+        Del Moral, Doucet & Jasra, J. R. Stat. Soc. B 68 (2006); Cotter, Roberts, Stuart
+        & White, Statistical Science 28 (2013); Rudolf & Sprungk, Found. Comput. Math.
+        18 (2018), for the proposal.
+    """
+
+    def densities(u: Array) -> tuple[Array, Array]:
+        own = log_prior(u)
+        inside = np.isfinite(own)
+        log_l = np.full(len(u), -np.inf)
+        if inside.any():
+            log_l[inside] = log_likelihood(u[inside])
+        return own + log_l, guess.log_prob(u)
+
+    n = num_particles
+    u = guess.sample(n, rng)
+    target, start = densities(u)
+    guessed = np.atleast_2d(np.cov(u.T))
+    log_z = variance = b = spent = 0.0
+    spent += n
+    length, acceptance = 1.0, 1.0
+    step = 0
+    while step < MAX_STEPS:
+        step += 1
+        ratio = target - start
+        with np.errstate(invalid="ignore"):
+            ratio = np.where(np.isfinite(target), ratio, -np.inf)
+        if not np.isfinite(ratio).any():
+            return None
+        power = _power(ratio, b, n)
+        log_w = (power - b) * np.where(np.isfinite(ratio), ratio, -np.inf)
+        log_z += float(log_sum_exp(log_w) - np.log(n))
+        weight = normalized(log_w)
+        variance += max(n * float((weight**2).sum()) - 1, 0.0) / n
+        mean = weight @ u
+        cov = (weight[:, None] * (u - mean)).T @ (u - mean)
+        cov = (1 - SHRUNK) * cov + SHRUNK * guessed * min(1.0, _size(cov, guessed))
+        which = systematic(weight, n, rng.random())
+        family = np.bincount(which, minlength=n)
+        u, target, start, b = u[which], target[which], start[which], power
+        factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
+        kept, goal = 1.0, settled if b == 1 else forgotten
+        for _ in range(max_moves):
+            new = mean + np.sqrt(1 - length**2) * (u - mean)
+            new = new + length * rng.standard_normal(u.shape) @ factor.T
+            new_target, new_start = densities(new)
+            spent += n
+            with np.errstate(invalid="ignore"):
+                gain = b * (new_target - target) + (1 - b) * (new_start - start)
+            gain = gain + _log_normal(u, mean, factor) - _log_normal(new, mean, factor)
+            accept = np.log(rng.random(n)) < np.where(np.isnan(gain), -np.inf, gain)
+            u = np.where(accept[:, None], new, u)
+            target = np.where(accept, new_target, target)
+            start = np.where(accept, new_start, start)
+            acceptance = float(accept.mean())
+            kept *= 1 - acceptance * (1 - np.sqrt(1 - length**2))
+            length = length * np.exp(acceptance - ACCEPTED)
+            length = float(np.clip(length, 0.02, 1.0))
+            if kept <= goal:
+                break
+            if spent > most:
+                break
+        if spent > most and b < 1:
+            return None
+        if b == 1:
+            break
+    else:
+        return None
+    shared = float((family.astype(float) ** 2).sum() / n - 1)
+    effective = n / (1 + kept**2 * shared)
+    log_l = target - log_prior(u)
+    error = float(np.sqrt(2 * variance + 1e-12))
+    return Bridged(u, log_l, log_z, error, effective, acceptance, kept, step)
+
+
+def _power(ratio: Array, b: float, num: int) -> float:
+    """Return the next b; rows without a likelihood go at the first step."""
+
+    def suffices(candidate: float) -> bool:
+        alive = min(SHARE, 0.5 * np.isfinite(ratio).mean())
+        return effective_sample_size((candidate - b) * ratio) >= alive * num
+
+    return largest_power(suffices, start=b, num_steps=30, least=1e-6)
+
+
+def _size(cov: Array, other: Array) -> float:
+    """Return the ratio of two covariances' volumes, a dimension."""
+    dim = len(cov)
+    logs = np.linalg.slogdet(cov + 1e-14 * np.eye(dim))[1] - np.linalg.slogdet(other)[1]
+    return float(np.exp(logs / dim))
+
+
+def _log_normal(z: Array, mean: Array, factor: Array) -> Array:
+    step = np.linalg.solve(factor, (z - mean).T)
+    volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
+    return -0.5 * (step**2).sum(0) - volume

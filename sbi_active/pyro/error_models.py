@@ -1,0 +1,109 @@
+r"""Error models :math:`p(x_o | x)` as short Pyro programs.
+
+All numbers are in deviations of the predictive, channel by channel. Indicators of
+misspecification are discrete and summed out, so that NUTS sees a smooth density; their
+probabilities are recovered from the draws. Nothing is relaxed.
+
+References:
+    Ward, Cannon, Beaumont, Fasiolo & Schmon, "Robust neural posterior estimation and
+    statistical model criticism", NeurIPS 2022.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SpikeAndSlab:
+    r"""Each channel is right, or off by anything.
+
+    .. math::
+        x_o - x \sim (1 - \rho)\, N(0, s^2) + \rho\, t_3(0, S^2)
+
+    Attributes:
+        probability: Of misspecification of a channel, :math:`\rho`.
+        spike: s; small beside the noise, which the predictive has already.
+        slab: S.
+    """
+
+    probability: float = 0.1
+    spike: float = 0.02
+    slab: float = 10.0
+
+    def __call__(self, x: Tensor, x_o: Tensor) -> None:
+        """Condition on an outcome; x of shape (..., q)."""
+        parts = self._parts(x, x_o)
+        pyro.factor("outcome", torch.logsumexp(parts, 0).sum(-1))
+
+    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
+        return self._parts(x, x_o).softmax(0)[1]
+
+    def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
+        rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
+        right = dist.Normal(x, self.spike).log_prob(x_o)
+        wrong = dist.StudentT(3.0, x, self.slab).log_prob(x_o)
+        return torch.stack([rho[0] + right, rho[1] + wrong])
+
+
+@dataclass(frozen=True)
+class StudentError:
+    r"""Every channel is off, some by much: :math:`x_o - x \sim t_\nu(0, s^2)`.
+
+    Attributes:
+        df: :math:`\nu`.
+        scale: s.
+        gross: Deviations s beyond which an error counts as misspecification.
+    """
+
+    df: float = 2.0
+    scale: float = 0.05
+    gross: float = 10.0
+
+    def __call__(self, x: Tensor, x_o: Tensor) -> None:
+        """Condition on an outcome; x of shape (..., q)."""
+        pyro.sample(
+            "outcome", dist.StudentT(self.df, x, self.scale).to_event(1), obs=x_o
+        )
+
+    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return whether errors are gross at denoised outcomes (n, q), shape (n, q)."""
+        return ((x_o - x).abs() > self.gross * self.scale).to(x)
+
+
+@dataclass(frozen=True)
+class ChannelBias:
+    r"""Each channel is right or has a bias: :math:`x_o = x + m b`, b summed out.
+
+    As :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
+    :math:`m \sim \mathrm{Bernoulli}(\rho)`, :math:`b \sim N(0, B^2)`.
+
+    Attributes:
+        probability: :math:`\rho`.
+        bias: B.
+        spike: What is left without a bias.
+    """
+
+    probability: float = 0.1
+    bias: float = 5.0
+    spike: float = 0.02
+
+    def __call__(self, x: Tensor, x_o: Tensor) -> None:
+        """Condition on an outcome; x of shape (..., q)."""
+        pyro.factor("outcome", torch.logsumexp(self._parts(x, x_o), 0).sum(-1))
+
+    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
+        return self._parts(x, x_o).softmax(0)[1]
+
+    def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
+        rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
+        wide = (self.spike**2 + self.bias**2) ** 0.5
+        parts = [dist.Normal(x, sd).log_prob(x_o) for sd in (self.spike, wide)]
+        return torch.stack([rho[0] + parts[0], rho[1] + parts[1]])

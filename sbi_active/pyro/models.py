@@ -1,0 +1,244 @@
+"""Pyro models as simulators."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal, StudentT, constraints
+
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import GaussianNoise, SimulatorModel, StudentTNoise
+
+NUM_TRIED = 4  # prior draws at which the model is looked at
+
+
+class SitesPrior(Distribution):
+    """The joint prior of a Pyro model's latent sites, end to end.
+
+    Args:
+        sites: Distribution of each, by name; independent of one another.
+    """
+
+    arg_constraints = {}  # pyright: ignore
+
+    def __init__(self, sites: dict[str, Distribution]) -> None:
+        self.sites = sites
+        self.sizes = [int(np.prod(_shape(d))) for d in sites.values()]
+        super().__init__(
+            torch.Size(), torch.Size([sum(self.sizes)]), validate_args=False
+        )
+
+    @property
+    def support(self) -> Any:
+        """Bounds of every entry, those of its site."""
+        parts = [_base(d.support) for d in self.sites.values()]
+        whole = constraints.cat(parts, dim=-1, lengths=self.sizes)
+        return constraints.independent(whole, 1)
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Return draws, shape (*sample_shape, d), float32."""
+        shape = torch.Size(sample_shape)
+        pairs = zip(self.sites.values(), self.sizes, strict=True)
+        parts = [d.sample(shape).reshape(*shape, size) for d, size in pairs]
+        return torch.cat(parts, -1).float()
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log density, (..., d) -> (...)."""
+        inside = self.support.check(value)
+        total = torch.zeros(value.shape[:-1], dtype=value.dtype)
+        safe = torch.where(inside[..., None], value, self.sample().to(value))
+        for d, part in zip(
+            self.sites.values(), safe.split(self.sizes, -1), strict=True
+        ):
+            log_p = d.log_prob(part.reshape(*value.shape[:-1], *_shape(d)))
+            total = total + log_p.reshape(*value.shape[:-1], -1).sum(-1)
+        return torch.where(inside, total, -torch.inf)
+
+
+@dataclass(frozen=True)
+class PyroProblem:
+    """What a Pyro model gives a campaign.
+
+    Attributes:
+        simulator: With a noise where the outcome is a known likelihood.
+        prior: Over all latent sites.
+        parameter_names: Of its entries.
+    """
+
+    simulator: SimulatorModel
+    prior: SitesPrior
+    parameter_names: list[str]
+
+
+def from_pyro(
+    model: Callable[[Tensor], Any], action: Tensor, *, outcome: str = "x"
+) -> PyroProblem:
+    """Return simulator, prior, noise and names of a Pyro model.
+
+    The model takes one action, shape (action_dim,), and has a sample site for each
+    parameter and one for the outcome. An outcome that is normal, or Student t with more
+    than two degrees of freedom, of constant scale becomes a noise-free simulator with
+    that noise; any other is drawn.
+
+    Args:
+        model: ``model(action)``.
+        action: One to try it at, shape (action_dim,).
+        outcome: Name of the outcome's site.
+
+    Raises:
+        ValueError: If there is no such site, no parameter, a discrete one, or one whose
+            prior depends on another or on the action.
+
+    Example:
+        >>> import pyro.distributions as dist
+        >>> def model(action):
+        ...     slope = pyro.sample("slope", dist.LogNormal(0.0, 0.5))
+        ...     return pyro.sample("x", dist.Normal(slope * action, 0.1).to_event(1))
+        >>> problem = from_pyro(model, torch.ones(1))
+        >>> problem.parameter_names, problem.simulator.noise
+        (['slope'], GaussianNoise(sd=[0.1...]))
+    """
+    action = torch.as_tensor(action, dtype=torch.float32).reshape(-1)
+    with forked_generators(0, "pyro"):
+        traces = [
+            poutine.trace(model).get_trace(action * scale)
+            for scale in torch.linspace(1, 0.5, NUM_TRIED)
+        ]
+    sites = [_latent(trace, outcome) for trace in traces]
+    first = sites[0]
+    if outcome not in traces[0].nodes or not first:
+        raise ValueError(
+            f"expected a sample site {outcome!r} and others for the parameters; got "
+            f"{[*traces[0].stochastic_nodes]}; name the outcome with outcome=..."
+        )
+    for name, d in first.items():
+        if _base(d.support).is_discrete:
+            raise ValueError(
+                f"expected continuous parameters; got {name!r}, which is discrete; sum "
+                "it out in the model"
+            )
+        if _base(d.support).event_dim:
+            raise ValueError(
+                f"expected parameters with bounds of their own; got {name!r} on "
+                f"{d.support}; write it as a function of free ones"
+            )
+        if any(name not in other or not _same(d, other[name]) for other in sites):
+            raise ValueError(
+                f"expected priors that depend on nothing; got {name!r}, whose prior "
+                "changes from run to run; write it as a location and a scale times a "
+                "site of its own"
+            )
+    prior = SitesPrior(first)
+    names = [
+        name if size == 1 else f"{name}_{i + 1}"
+        for name, size in zip(first, prior.sizes, strict=True)
+        for i in range(size)
+    ]
+    noise = _noise([trace.nodes[outcome]["fn"] for trace in traces])
+    function = _Row(model, first, prior.sizes, outcome, noise is not None)
+    simulator = SimulatorModel(
+        function, noise=noise, batched=False, parameter_names=names
+    )
+    return PyroProblem(simulator, prior, names)
+
+
+class _Row:
+    """A row of the simulator: the model, conditioned on parameters."""
+
+    def __init__(
+        self,
+        model: Callable[[Tensor], Any],
+        sites: dict[str, Distribution],
+        sizes: list[int],
+        outcome: str,
+        is_mean: bool,
+    ) -> None:
+        self.model, self.outcome, self.is_mean = model, outcome, is_mean
+        self.sites, self.sizes = sites, sizes
+
+    def __call__(self, theta: Any, action: Any, rng: np.random.Generator) -> Any:
+        parts = torch.as_tensor(theta).split(self.sizes)
+        data = {
+            name: part.reshape(_shape(d))
+            for (name, d), part in zip(self.sites.items(), parts, strict=True)
+        }
+        with forked_generators(int(rng.integers(2**62))), torch.no_grad():
+            model = pyro.condition(self.model, data=data)
+            trace = poutine.trace(model).get_trace(torch.as_tensor(action).float())
+        node = trace.nodes[self.outcome]
+        return (node["fn"].mean if self.is_mean else node["value"]).reshape(-1).numpy()
+
+
+def _latent(trace: Any, outcome: str) -> dict[str, Distribution]:
+    return {
+        name: node["fn"]
+        for name, node in trace.nodes.items()
+        if node["type"] == "sample"
+        and not node["is_observed"]
+        and name != outcome
+        and not isinstance(node["fn"], poutine.subsample_messenger._Subsample)
+    }
+
+
+def _noise(found: list[Any]) -> GaussianNoise | StudentTNoise | None:
+    """Return the noise of an outcome of constant scale; None for any other."""
+    bases = [_inner(d) for d in found]
+    kind = type(bases[0])
+    constant = all(
+        type(d) is kind
+        and d.batch_shape == bases[0].batch_shape
+        and torch.equal(getattr(d, "scale", torch.nan * torch.ones(1)), bases[0].scale)
+        for d in bases
+        if hasattr(bases[0], "scale")
+    )
+    if not constant or not isinstance(bases[0], (Normal, StudentT)):
+        return None
+    sd = bases[0].scale.reshape(-1)
+    sd = sd[:1] if bool((sd == sd[0]).all()) and len(sd) > 1 else sd
+    sd = sd[0] if len(sd) == 1 and bases[0].scale.numel() > 1 else sd
+    if isinstance(bases[0], Normal):
+        return GaussianNoise(sd)
+    df = bases[0].df.reshape(-1)
+    if not all(torch.equal(d.df, bases[0].df) for d in bases):
+        return None
+    if not bool((df == df[0]).all()) or df[0] <= 2:
+        return None
+    return StudentTNoise(sd * (df[0] / (df[0] - 2)).sqrt(), df[0])
+
+
+def _inner(d: Any) -> Any:
+    while (
+        isinstance(d, Independent)
+        or hasattr(d, "base_dist")
+        and not hasattr(d, "transforms")
+    ):
+        d = d.base_dist
+    return d
+
+
+def _shape(d: Distribution) -> torch.Size:
+    return d.batch_shape + d.event_shape
+
+
+def _base(support: Any) -> Any:
+    while hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    return support
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two distributions have the same density."""
+    if type(one) is not type(other) or _shape(one) != _shape(other):
+        return False
+    draws = torch.stack([one.sample() for _ in range(3)])
+    try:
+        return bool(torch.equal(one.log_prob(draws), other.log_prob(draws)))
+    except ValueError:  # a support that moves
+        return False

@@ -1,0 +1,167 @@
+"""ASBI whose updates average over denoised outcomes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import torch
+from sbi.utils.sbiutils import within_support
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.beliefs.belief import Belief, named, require_support
+from sbi_active.inference.rounds.condition import pack
+from sbi_active.inference.trainers.asbi import ASBI
+from sbi_active.pyro.denoising import Denoised, denoise
+from sbi_active.pyro.error_models import SpikeAndSlab
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
+
+NUM_PREDICTIVE = 1_000  # simulations under the belief before the trial
+NUM_AVERAGED = 100  # denoised outcomes
+
+
+class RobustBelief(Belief):
+    r"""The network's posterior, averaged over denoised outcomes.
+
+    .. math::
+        b(\theta) = \frac1n \sum_i q(\theta | x_i, \xi)\,
+        1[\theta \in \mathrm{supp}\, p] / Z, \qquad x_i \sim p(x | x_o)
+
+    Args:
+        estimator: q over packed conditions.
+        condition: (x_i, action), shape (n, condition_dim).
+        prior: The original prior.
+        denoised: What the outcomes were drawn with.
+    """
+
+    label = "robust, chained approximation"
+
+    def __init__(
+        self, estimator: Any, condition: Tensor, prior: Distribution, denoised: Denoised
+    ) -> None:
+        super().__init__(prior)
+        self._estimator, self._condition = estimator.eval(), condition
+        self.denoised = denoised
+        with torch.no_grad(), forked_generators(0, "robust"):
+            inside = within_support(prior, self._raw(20_000))
+        self._acceptance = float(inside.double().mean())
+        if self._acceptance < 1e-3:
+            raise ValueError(
+                f"expected a posterior within the prior's support; got "
+                f"{self._acceptance:.2%} of it there; check the outcome, or widen the "
+                "prior"
+            )
+        self.diagnostics = self.diagnostics.extended(
+            mass_inside_prior=self._acceptance,
+            misspecification=denoised.probability.tolist(),
+            nuts_r_hat=denoised.r_hat,
+            nuts_effective_draws=denoised.effective_sample_size,
+            nuts_divergences=denoised.num_divergences,
+        )
+
+    def _raw(self, num: int) -> Tensor:
+        each = -(-num // len(self._condition))
+        draws = self._estimator.sample(torch.Size([each]), self._condition)
+        draws = draws.flatten(0, 1)
+        return draws[torch.randperm(len(draws))[:num]]
+
+    def _sample(self, num_samples: int) -> Tensor:
+        kept, missing = [], num_samples
+        while missing > 0:
+            draws = self._raw(int(1.1 * missing / self._acceptance) + 100)
+            draws = draws[within_support(self.prior, draws)][:missing]
+            kept.append(draws)
+            missing -= len(draws)
+        return torch.cat(kept) if kept else self._condition.new_zeros(0)
+
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        num, found = len(self._condition), []
+        with torch.no_grad():
+            for rows in theta.split(2_000):
+                each = rows[:, None].expand(-1, num, -1)
+                log_q = self._estimator.log_prob(each, self._condition)
+                found.append(log_q.double().logsumexp(1))
+        total = torch.cat(found) if found else theta.new_zeros(0)
+        return total - torch.tensor(num * self._acceptance).double().log()
+
+
+class RobustASBI(ASBI):
+    r"""ASBI that does not take an outcome at its word.
+
+    A trial's outcome is denoised with the error model and the predictive under the
+    belief before it, and the belief becomes the network's posterior averaged over
+    denoised outcomes. The simulator serves the predictive alone, and nothing is
+    refined: the result is a chained approximation as that of :class:`ASBI` without one.
+
+    Args:
+        prior: As of :class:`ASBI`, with all that follows.
+        error_model: p(x_o | x); None is :class:`SpikeAndSlab`.
+
+    Attributes:
+        denoised: Of each update.
+    """
+
+    def __init__(
+        self, prior: Any = None, *args: Any, error_model: Any = None, **kwargs: Any
+    ) -> None:
+        super().__init__(prior, *args, **kwargs)
+        self.error_model = SpikeAndSlab() if error_model is None else error_model
+        self.denoised: list[Denoised] = []
+
+    def update(
+        self,
+        x_o: Tensor,
+        *,
+        action: Tensor,
+        simulator: Callable[..., Any] | None = None,
+        refinement: Any = None,
+        seed: int | None = None,
+    ) -> Belief:
+        """Return the belief after a real trial, and make it the current one.
+
+        Args:
+            x_o: The outcome, without NaN.
+            action: The executed action.
+            simulator: For the predictive; required.
+            refinement: Not used; anything but None is an error.
+            seed: Of everything random; None draws one from torch's global generator.
+
+        Raises:
+            ValueError: If there is no simulator, or a refinement is asked for.
+            RuntimeError: If nothing was trained in this round.
+        """
+        if simulator is None or refinement is not None:
+            raise ValueError(
+                "expected a simulator, whose predictive tells what an outcome may be, "
+                "and no refinement; got "
+                f"simulator={simulator}, refinement={refinement}; pass the simulator "
+                "alone"
+            )
+        trial = self._observation(x_o, action)
+        self._require_belief_network()
+        network, previous = self._neural_net, self.belief
+        assert network is not None
+        assert previous is not None
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        with forked_generators(seed, "predictive"):
+            theta = previous.sample(torch.Size([NUM_PREDICTIVE]))
+        actions = trial.action.expand(NUM_PREDICTIVE, -1)
+        rows = simulate(simulator, theta, actions, seed=derive_seed(seed, "rows"))
+        flat = rows.x.reshape(len(rows.x), -1)
+        flat = flat[flat.isfinite().all(1)]
+        denoised = denoise(
+            trial.x.reshape(-1), flat, self.error_model, seed=derive_seed(seed, "nuts")
+        )
+        pick = torch.linspace(0, len(denoised.x) - 1, NUM_AVERAGED).long()
+        x = denoised.x[pick].float().reshape(NUM_AVERAGED, *trial.x.shape)
+        condition = pack(x, trial.action.expand(NUM_AVERAGED, -1)).to(self._device)
+        prior = require_support(self._prior)
+        belief = RobustBelief(deepcopy(network), condition, prior, denoised)
+        named(belief, simulator)
+        self._belief, self.trials = belief, [*self.trials, trial]
+        self.denoised.append(denoised)
+        self._forget_round()
+        return belief

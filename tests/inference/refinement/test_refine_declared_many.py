@@ -1,0 +1,136 @@
+"""Many parameters under declared noise against closed forms."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, LogNormal, MultivariateNormal, Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.inference import refine
+from sbi_active.inference.refinement.bridged import BridgedBelief
+from sbi_active.seeding import forked_generators
+from sbi_active.tasks import get_task
+
+
+def linear(dim: int, num: int, seed: int = 0):
+    """Return simulator, actions, outcomes and the exact posterior under N(0, I)."""
+    with forked_generators(seed):
+        weight = torch.randn(num, dim)
+        x = torch.randn(1, dim) @ weight.T + 0.1 * torch.randn(1, num)
+
+    def mean(theta, action):
+        return theta @ weight.T
+
+    model = SimulatorModel(mean, noise=GaussianNoise(0.1))
+    design = weight.double()
+    precision = torch.eye(dim).double() + design.T @ design / 0.01
+    center = torch.linalg.solve(precision, design.T @ x[0].double() / 0.01)
+    exact = MultivariateNormal(center, precision_matrix=precision)
+    return model, torch.zeros(1, 1), x, exact
+
+
+@pytest.mark.parametrize("num", [30, 3])
+def test_linear_models_have_their_exact_density(num):
+    dim = 12
+    model, action, x, exact = linear(dim, num)
+    prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
+    belief = refine(model, prior, action, x, seed=1)
+    assert isinstance(belief, BridgedBelief)
+    with forked_generators(0):
+        theta = exact.sample(torch.Size([200]))
+        draws = belief.sample((5_000,)).double()
+    gap = exact.log_prob(theta) - belief.log_prob(theta.float()).double()
+    assert float(gap.abs().max()) < 0.25
+    spread = (draws - exact.mean) @ torch.linalg.inv(exact.scale_tril).T
+    assert float(spread.median(0).values.abs().max()) < 0.25
+    assert float((spread.abs() < 1.645).double().mean()) == pytest.approx(0.9, abs=0.02)
+    assert belief.diagnostics.assumptions["enough_draws"].holds
+
+
+def test_uninformed_parameters_keep_their_prior():
+    dim, known = 10, 4
+    model, action, x, _ = linear(known, 8)
+
+    def mean(theta, action):
+        return model.mean(theta[:, :known], action)
+
+    prior = Independent(LogNormal(torch.zeros(dim), 0.4 * torch.ones(dim)), 1)
+    simulator = SimulatorModel(mean, noise=GaussianNoise(0.5))
+    x = mean(torch.ones(1, dim), action)
+    belief = refine(simulator, prior, action, x, seed=0)
+    assert isinstance(belief, BridgedBelief)
+    assert belief.free.tolist() == [False] * known + [True] * (dim - known)
+    with forked_generators(3):
+        draws = belief.sample((4_000,))[:, known:].log() / 0.4
+    assert len(draws.unique(dim=0)) == 4_000  # fresh, not resampled
+    assert float(draws.mean(0).abs().max()) < 0.06
+    assert float((draws.std(0) - 1).abs().max()) < 0.05
+    theta = torch.ones(2, dim)
+    theta[1, known:] = 2.0
+    before = prior.log_prob(theta)
+    after = belief.log_prob(theta)
+    assert float(after[1] - after[0]) == pytest.approx(
+        float(before[1] - before[0]), abs=1e-3
+    )
+
+
+def test_correlated_priors_are_not_split():
+    dim = 8
+    cov = 0.5 * torch.eye(dim) + 0.5
+    prior = MultivariateNormal(torch.zeros(dim), cov)
+
+    def mean(theta, action):
+        return theta[:, :1]
+
+    simulator = SimulatorModel(mean, noise=GaussianNoise(0.1))
+    belief = refine(
+        simulator, prior, torch.zeros(1, 1), torch.full((1, 1), 2.0), seed=0
+    )
+    assert isinstance(belief, BridgedBelief)
+    assert not belief.free.any()
+    with forked_generators(0):
+        draws = belief.sample((4_000,))
+    assert float(draws[:, 5].mean()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_boxes_keep_their_support_and_the_next_trial_goes_on():
+    dim = 8
+    prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
+
+    def mean(theta, action):
+        return theta * action
+
+    simulator = SimulatorModel(mean, noise=GaussianNoise(0.05))
+    action = torch.tensor([[1.0], [2.0]])
+    x = torch.cat([torch.full((1, dim), 0.02), torch.full((1, dim), 0.04)])
+    first = refine(simulator, prior, action[:1], x[:1], seed=0)
+    second = refine(simulator, prior, action, x, past=first.histories, seed=1)
+    with forked_generators(0):
+        draws = second.sample((2_000,))
+    assert bool(prior.support.check(draws).all())
+    # A normal at .02 of deviation .05 / sqrt(5), cut at 0.
+    assert float(draws.mean()) == pytest.approx(0.0266, abs=0.003)
+    theta = torch.full((1, dim), 0.02)
+    smooth = second.smooth_log_prob(theta) - second.log_prob(theta)
+    assert abs(float(smooth)) < 3.0
+
+
+def test_other_simulators_are_regressed():
+    def simulator(theta, action):
+        return theta + 0.5 * torch.randn_like(theta)
+
+    prior = Independent(Normal(torch.zeros(7), torch.ones(7)), 1)
+    belief = refine(simulator, prior, torch.zeros(1, 1), torch.zeros(1, 7), seed=0)
+    assert not isinstance(belief, BridgedBelief)
+
+
+def test_a_chain_is_trustworthy():
+    task = get_task("chain", parameters=8)
+    action = task.actions.sample((4,), seed=0)
+    x = torch.stack([task.real_system(a, seed=i) for i, a in enumerate(action)])
+    belief = refine(task.simulator, task.prior, action, x, seed=0)
+    assert belief.diagnostics.trustworthy
+    low, high = belief.sample((4_000,)).quantile(torch.tensor([0.001, 0.999]), dim=0)
+    assert int(((task.theta_true > low) & (task.theta_true < high)).sum()) >= 7
+    assert np.isfinite(belief.diagnostics.log_evidence)

@@ -1,0 +1,72 @@
+"""The chain against an ODE solver, and its options."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from sbi_active.tasks import get_task
+from sbi_active.tasks.chain import model
+
+
+@pytest.mark.parametrize(("parameters", "moving"), [(5, 3), (6, 2)])
+def test_the_closed_form_solves_the_equations(parameters, moving):
+    task = get_task("chain", parameters=parameters)
+    theta, count = task.theta_true.double(), model.num_masses(parameters)
+    k = theta[:count].numpy()
+    m = np.append(theta[count:].numpy(), [1.0] * (2 * count - parameters))[:moving]
+    right = np.append(k[1:], 0.0)[:moving]
+    stiffness = np.diag(k[:moving] + right)
+    off = k[1:moving]
+    stiffness -= np.diag(off, 1) + np.diag(off, -1)
+    root = np.diag(m**-0.5)
+    square, mode = np.linalg.eigh(root @ stiffness @ root)
+    damping = mode @ np.diag(2 * model.DAMPING * np.sqrt(square)) @ mode.T
+    damping = np.diag(m**0.5) @ damping @ np.diag(m**0.5)
+
+    def rate(t, state):
+        y, v = np.split(state, 2)
+        force = np.zeros(moving)
+        force[0] = model.FORCE * np.sin(13.0 * t)
+        return np.concatenate([v, (force - stiffness @ y - damping @ v) / m])
+
+    times = model.SAMPLE_TIMES.numpy()
+    solved = solve_ivp(
+        rate, (0, 2.0), np.zeros(2 * moving), t_eval=times, rtol=1e-9, atol=1e-12
+    )
+    action = torch.tensor([[13.0, float(moving)]])
+    found = model.mean(theta[None], action)[0].numpy()
+    assert found[:moving] == pytest.approx(solved.y[:moving], abs=1e-7)
+    assert (found[moving:] == 0).all()
+
+
+def test_what_lies_beyond_the_clamp_changes_nothing():
+    task = get_task("chain", parameters=8)
+    theta = task.theta_true.repeat(2, 1)
+    theta[1, [3, 6, 7]] *= 2  # the last spring and the clamped masses
+    x = task.simulator.mean(theta, torch.tensor([[10.0, 2.0]]).expand(2, -1))
+    assert torch.equal(x[0], x[1])
+
+
+@pytest.mark.parametrize("parameters", [3, 21, 4.5])
+def test_impossible_numbers_of_parameters(parameters):
+    with pytest.raises(ValueError, match="from 4 to 20"):
+        get_task("chain", parameters=parameters)
+
+
+def test_impossible_truths():
+    with pytest.raises(ValueError, match="positive"):
+        get_task("chain", parameters=4, theta_true=[1.0, 1.0, -1.0, 1.0])
+    with pytest.raises(ValueError, match="4 positive"):
+        get_task("chain", parameters=4, theta_true=[1.0])
+
+
+def test_the_reference_s_evidence_agrees_between_seeds():
+    task = get_task("chain", parameters=4)
+    action = torch.tensor([[10.0, 2.0]])
+    x = task.real_system(action[0], seed=0)[None]
+    one, other = (task.reference(action, x, seed=s, num_particles=300) for s in (0, 1))
+    error = np.hypot(one.standard_error, other.standard_error)
+    assert abs(one.log_evidence - other.log_evidence) < 5 * error
+    theta = one.sample(200, seed=0).float()
+    assert torch.allclose(one.log_prob(theta), other.log_prob(theta), atol=0.2)
