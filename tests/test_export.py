@@ -47,22 +47,22 @@ def test_a_campaign_has_the_groups_and_coordinates(campaign):
     data = to_inference_data(campaign, num_samples=100)
     expected = {
         *("posterior", "prior", "posterior_predictive", "observed_data"),
-        *("constant_data", "sample_stats", "log_likelihood"),
+        *("constant_data", "sample_stats", "log_likelihood", "prior_predictive"),
     }
     assert {*data.groups()} == expected
     assert data.posterior.theta.dims == ("chain", "draw", "parameter")
     assert [*data.posterior.parameter.values] == ["mass", "friction"]
-    assert data.posterior_predictive.x.shape == (1, 100, 3, 2)
+    assert data.posterior_predictive.x.shape == (4, 25, 3, 2)
     assert data.posterior_predictive.x.dims[2:] == ("round", "channel")
     assert data.observed_data.x.shape == (3, 2)
     assert [*data.observed_data["round"].values] == [1, 2, 3]
     assert data.constant_data.action.dims == ("round", "action_entry")
     assert [*data.constant_data.action_entry.values] == ["push"]
-    assert data.log_likelihood.x.shape == (1, 100, 3)
+    assert data.log_likelihood.x.shape == (4, 25, 3)
 
 
 def test_the_log_likelihood_belongs_to_the_draws(campaign):
-    data = to_inference_data(campaign, num_samples=10)
+    data = to_inference_data(campaign, num_samples=10, num_chains=1)
     theta = torch.tensor(data.posterior.theta.values[0])
     action = torch.tensor(data.constant_data.action.values)
     x = torch.tensor(data.observed_data.x.values)
@@ -86,7 +86,7 @@ def test_arviz_reads_it(campaign, tmp_path):
     assert np.isfinite(az.loo(data, var_name="x").elpd_loo)
     path = str(tmp_path / "data.nc")
     data.to_netcdf(path)
-    assert az.from_netcdf(path).posterior.theta.shape == (1, 200, 2)
+    assert az.from_netcdf(path).posterior.theta.shape == (4, 50, 2)
 
 
 def test_a_belief_and_a_prior_alone():
@@ -115,10 +115,10 @@ def test_a_plain_function_has_no_log_likelihood():
     c.update()
     data = to_inference_data(c, num_samples=20)
     assert "log_likelihood" not in data.groups()
-    assert data.posterior_predictive.x.shape == (1, 20, 1, 2)
+    assert data.posterior_predictive.x.shape == (4, 5, 1, 2)
     assert [*data.posterior.parameter.values] == ["theta_1", "theta_2"]
 
 
 def test_same_seed_same_draws(campaign):
-    a, b = (to_inference_data(campaign, num_samples=5, seed=1) for _ in range(2))
+    a, b = (to_inference_data(campaign, num_samples=8, seed=1) for _ in range(2))
     assert (a.posterior.theta.values == b.posterior.theta.values).all()
