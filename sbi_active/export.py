@@ -226,12 +226,50 @@ def _add_report(
     made.add_data("observed_data", "x", x, ["round", *dims])
     pair = ["round", "action_entry"]
     made.add_data("constant_data", "action", residuals.action, pair)
+    log_prob = _rival_log_likelihood(report, found, np.asarray(found.draws)[row])
+    if log_prob is not None:
+        made.add("log_likelihood", "x", log_prob, ["round"])
     probabilities = report.probabilities
     made.coords["model"] = [*probabilities]
     values = np.array([*probabilities.values()])
     made.add_data("constant_data", "probability", values, ["model"])
     made.attrs.update(model=name, verdict=report.verdict)
     made.attrs["log_evidence"] = float(found.log_evidence)
+
+
+def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
+    """Return the log likelihood of each trial under a rival, shape (n, t).
+
+    None where it is more than the simulator, effects and declared noise: a residual
+    process, an unknown size of noise, nuisances of single trials.
+    """
+    simulator, key = report.simulator, found.key
+    effects = {e.name: e for e in getattr(simulator, "effects", ())}
+    used = [effects.get(name) for name in key.effects]
+    plain = all(e and e.scope == "campaign" and e.hook != "noise" for e in used)
+    own = len(getattr(simulator, "base", simulator).parameter_names or ())
+    size = own + sum(e.phi_dim for e in used if e)
+    known = simulator.noise is not None and report.residuals.noise == "declared"
+    is_whole = key.error is None and report.tracing.misfit is None
+    if not (plain and known and is_whole and draws.shape[1] == size):
+        return None
+    theta = torch.as_tensor(draws, dtype=torch.float32)
+    x = torch.as_tensor(np.asarray(report.residuals.x)).double()
+    action = torch.as_tensor(report.residuals.action).float()
+    phi, first = {}, own
+    for effect in used:
+        phi[effect.name] = theta[:, first : first + effect.phi_dim]
+        first += effect.phi_dim
+    terms = []
+    for k in range(len(x)):
+        given = theta[:, :own], action[k].expand(len(theta), -1)
+        if effects:
+            place = torch.full((len(theta),), float(report.residuals.index[k]))
+            mean = simulator.evaluate(given[0], phi, given[1], index=place)
+        else:
+            mean = simulator.mean(*given)
+        terms.append(simulator.noise.log_prob(x[k].expand(mean.shape), mean.double()))
+    return torch.stack(terms, 1)
 
 
 def _add_rows(made: Groups, rows: Mapping[str, Any]) -> None:
@@ -249,4 +287,3 @@ def _add_rows(made: Groups, rows: Mapping[str, Any]) -> None:
         made.add("posterior", str(name), array.astype(float), dims)
     if not made.variables:
         raise ValueError("expected columns of numbers; got none; pass arrays of rows")
-

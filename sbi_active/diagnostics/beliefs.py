@@ -270,15 +270,19 @@ def _judge(
     if refits:
         nearest = min(range(len(refits)), key=lambda r: max(refits[r]))
         a, b = refits[nearest]
-        text = f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
+        text = (
+            f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
+        )
         if a > EXCLUDED * dim:
             found.append(("stop", f"{text}; it is too narrow or lost a mode"))
         elif max(a, b) > DIFFERENT * dim:
             found.append(("refine", f"{text}; raise num_histories"))
         elif max(max(pair) for pair in refits) > 2 * DIFFERENT * dim:
             found.append(
-                ("refine", "two inferences of the same trials differ; raise "
-                "num_histories")
+                (
+                    "refine",
+                    "two inferences of the same trials differ; raise num_histories",
+                )
             )
     n, is_other = len(scores), bool(found)
     spread, shift, p_value, ends = [], [], [], []

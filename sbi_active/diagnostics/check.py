@@ -341,9 +341,7 @@ def replace_rows(rows: Simulations, kept: Tensor) -> Simulations:
     return replace(rows, **parts)
 
 
-def _tarp(
-    rounds: Sequence[_Round], num_draws: int, seed: int
-) -> tuple[Tensor, Tensor]:
+def _tarp(rounds: Sequence[_Round], num_draws: int, seed: int) -> tuple[Tensor, Tensor]:
     """Return expected coverage and credibility of the last round."""
     one = rounds[-1]
     index = torch.arange(float(len(one.rows)))[:, None]

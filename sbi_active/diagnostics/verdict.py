@@ -82,13 +82,19 @@ def judge(
     reasons: list[tuple[Verdict, str]] = []
     low, high = intervals[0.9]
     if high < 0.9 - tolerance.excluded:
-        text = f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
+        text = (
+            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
+        )
         reasons.append(("stop", f"{text}: it excludes the truth too often"))
     elif high < 0.9 - tolerance.coverage:
-        text = f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
+        text = (
+            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
+        )
         reasons.append(("refine", f"{text}: it is too sure"))
     elif low > 0.9 + tolerance.coverage:
-        text = f"90 % regions hold {coverage[0.9]:.0%} of the truths, at least {low:.0%}"
+        text = (
+            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at least {low:.0%}"
+        )
         reasons.append(("refine", f"{text}: it is too wide"))
     for k, (least, _) in enumerate(ranged):
         if least > tolerance.rank_distance:
