@@ -189,7 +189,9 @@ def _add_trials(
     made.add_data("observed_data", "x", x, ["round", *dims])
     units = {
         f"unit_{name}": unit
-        for name, unit in zip(campaign.actions.names, campaign.actions.units)
+        for name, unit in zip(
+            campaign.actions.names, campaign.actions.units, strict=True
+        )
         if unit
     }
     made.add_data("constant_data", "action", action, ["round", "action_entry"], units)
@@ -245,13 +247,14 @@ def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
     """
     simulator, key = report.simulator, found.key
     effects = {e.name: e for e in getattr(simulator, "effects", ())}
-    used = [effects.get(name) for name in key.effects]
-    plain = all(e and e.scope == "campaign" and e.hook != "noise" for e in used)
+    used = [effects[name] for name in key.effects if name in effects]
+    plain = len(used) == len(key.effects)
+    plain &= all(e.scope == "campaign" and e.hook != "noise" for e in used)
     own = len(getattr(simulator, "base", simulator).parameter_names or ())
-    size = own + sum(e.phi_dim for e in used if e)
-    known = simulator.noise is not None and report.residuals.noise == "declared"
+    size = own + sum(e.phi_dim for e in used)
+    noise = simulator.noise if report.residuals.noise == "declared" else None
     is_whole = key.error is None and report.tracing.misfit is None
-    if not (plain and known and is_whole and draws.shape[1] == size):
+    if noise is None or not (plain and is_whole and draws.shape[1] == size):
         return None
     theta = torch.as_tensor(draws, dtype=torch.float32)
     x = torch.as_tensor(np.asarray(report.residuals.x)).double()
@@ -268,7 +271,7 @@ def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
             mean = simulator.evaluate(given[0], phi, given[1], index=place)
         else:
             mean = simulator.mean(*given)
-        terms.append(simulator.noise.log_prob(x[k].expand(mean.shape), mean.double()))
+        terms.append(noise.log_prob(x[k].expand(mean.shape), mean.double()))
     return torch.stack(terms, 1)
 
 

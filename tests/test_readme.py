@@ -199,4 +199,13 @@ def test_no_page_is_forgotten():
         "failed_trial.md",
         "which_parameters.md",
         "two_models.md",
+        "trust.md",
     }
+
+
+def test_trust(run, capsys):
+    network, belief, export = run("docs/trust.md")
+    assert network.calibration.overall.num_rows == 300
+    assert len(belief.check.spread) == 2
+    assert "friction" in capsys.readouterr().out
+    assert export.tree.groups

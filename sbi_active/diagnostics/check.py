@@ -28,7 +28,7 @@ from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.refinement.simulated_likelihood import declares_noise
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Simulations, simulate
+from sbi_active.simulation import Simulations, SimulatorModel, simulate
 from sbi_active.threads import single_thread
 
 FEWEST = 100  # rows, as sbi asks for
@@ -257,6 +257,13 @@ def _check_round(
     action, label, names = stratified_actions(space, num, max_strata, seed=seed)
     with forked_generators(derive_seed(seed, "theta")):
         theta = belief.sample(torch.Size([num])).float()
+    few = theta[:8], action[:8]
+    by_likelihood = gap != "classifier" and declares_noise(simulator, *few)
+    if gap == "likelihood" and not by_likelihood:
+        raise ValueError(
+            "expected a simulator that declares its noise for gap='likelihood'; got "
+            "none; pass a SimulatorModel(noise=) or gap='classifier'"
+        )
     rows = simulate(simulator, theta, action, seed=derive_seed(seed, "x"))
     condition = pack(outcome_rows(rows.x, posterior.x_shape), rows.action.float())
     direct = posterior.packed()
@@ -295,15 +302,8 @@ def _check_round(
     with torch.no_grad():
         own = log_q(rows.theta[None])[0].double() - correction
     gained = own - smooth(belief, rows.theta)
-    few = rows.theta[:8], rows.action[:8]
-    is_known = declares_noise(simulator, *few)
-    if gap == "likelihood" and not is_known:
-        raise ValueError(
-            "expected a simulator that declares its noise for gap='likelihood'; got "
-            "none; pass a SimulatorModel(noise=) or gap='classifier'"
-        )
-    by_likelihood = is_known and gap != "classifier"
     if by_likelihood:
+        assert isinstance(simulator, SimulatorModel)
         terms = gap_by_likelihood(
             *(simulator, belief, rows.theta, rows.action, rows.x),
             *(log_q, raw),

@@ -7,7 +7,7 @@ r"""The log-score gap: what a posterior loses against the right one, in nats.
 Ranks and coverage are uniform for the prior itself, whatever x says; G is not zero for
 it. It is also the expected information gain less the network's own bound on it.
 
-With declared noise, :math:`p(\theta | x) = b(\theta) p(x | \theta) / Z` and Z comes from
+With declared noise, :math:`p(\theta | x) = b(\theta) p(x | \theta) / Z`. Z comes from
 importance sampling with the truth among the draws, which makes Z too large on average
 and G a lower bound. Otherwise a classifier tells truths from draws of q, and bounds the
 same divergence from below on rows that it was not trained on.
@@ -57,7 +57,7 @@ def gap_by_likelihood(
     num_contrastive: int,
     seed: int,
 ) -> Tensor:
-    r"""Return :math:`\log p(\theta|x,\xi) - \log q`, of which the mean is a lower bound.
+    r"""Return :math:`\log p(\theta|x,\xi) - \log q`, on average a lower bound.
 
     Args:
         simulator: With declared noise.

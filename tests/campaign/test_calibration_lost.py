@@ -2,8 +2,16 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, CampaignOptions, DiscreteActions, GaussianNoise
-from sbi_active import MixtureDensity, RefinementOptions, SimulatorModel, StopRules
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    RefinementOptions,
+    SimulatorModel,
+    StopRules,
+)
 from sbi_active.campaign.checks import calibration
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

@@ -6,8 +6,14 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import ASBI, DiscreteActions, GaussianNoise, MixtureDensity
-from sbi_active import SimulatorModel
+from sbi_active import (
+    ASBI,
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    SimulatorModel,
+)
 from sbi_active.diagnostics import check_belief, check_calibration
 from sbi_active.diagnostics.verdict import clopper_pearson, ks_distance
 from sbi_active.inference import ActionPosterior
@@ -126,8 +132,11 @@ def test_bad_input_is_an_error(trained):
         check_calibration(trained, MODEL, actions=ACTIONS, num_simulations=50)
     with pytest.raises(TypeError, match="got str"):
         check_calibration("network", MODEL, actions=ACTIONS)
+
+    def noisy(theta, action):
+        return theta * action + torch.randn_like(theta)
+
     with pytest.raises(ValueError, match="declares its noise"):
-        noisy = lambda t, a: t * a + torch.randn_like(t)  # noqa: E731
         check_calibration(trained, noisy, actions=ACTIONS, gap="likelihood")
 
 
@@ -169,3 +178,34 @@ def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
     assert found.verdict in verdicts, found
     assert json.dumps(found.to_dict())
     assert str(found).startswith(found.verdict)
+
+
+def test_rounds_a_continuum_of_actions_and_invalid_rows(trained):
+    space = BoxActions([0.5], [2.0], names=["gain"])
+
+    def fails(theta, action):
+        x = theta * action
+        return torch.where(action > 1.8, torch.nan, x)
+
+    model = SimulatorModel(fails, noise=GaussianNoise(0.2))
+    posterior = with_network(trained, Exact())
+    found = check_calibration(
+        [posterior, posterior], model, actions=space, num_simulations=200, max_strata=3
+    )
+    assert [s.round for s in found.strata] == [1, 1, 1, 2, 2, 2]
+    assert found.strata[-1].name.startswith("round 2, near gain")
+    assert found.num_invalid > 10
+    assert len(found.ranks) + found.num_invalid == 400
+    assert found.verdict == "trust"
+
+
+def test_a_check_leaves_the_generators_and_the_rows_alone(trained):
+    before = torch.random.get_rng_state()
+    posterior = trained.build_posterior()
+    found = [
+        check_calibration(posterior, MODEL, actions=ACTIONS, num_simulations=150)
+        for _ in range(2)
+    ]
+    assert (found[0].ranks == found[1].ranks).all()
+    assert (torch.random.get_rng_state() == before).all()
+    assert found[0].verdict != "trust" or found[0].overall.lost < 0.4
