@@ -24,7 +24,7 @@ PROBLEMS: dict[str, dict[str, Any]] = {
     "square": {"variant": "square"},
 }
 KINDS = (
-    *("right", "wide", "narrow", "lost mode"),
+    *("right", "right, refits", "wide", "narrow", "lost mode"),
     *("always wide", "always narrow", "always one mode"),
 )
 NUM_TRIALS = 3

@@ -27,7 +27,7 @@ from sbi_active.diagnostics.verdict import Tolerance, judge
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.refinement.simulated_likelihood import declares_noise
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed, forked_generators, kept_generators
 from sbi_active.simulation import Simulations, SimulatorModel, simulate
 from sbi_active.threads import single_thread
 
@@ -140,7 +140,7 @@ def check_calibration(
     posteriors = [amortized(one) for one in given]
     tolerance = Tolerance() if tolerance is None else tolerance
     space = action_space(actions)
-    with single_thread(), warnings.catch_warnings():
+    with single_thread(), kept_generators(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Number of .* samples should be")
         rounds = [
             _check_round(
