@@ -193,13 +193,13 @@ def test_no_page_is_forgotten():
         "closing_the_loop.md",
         "identifiability.md",
         "robots.md",
+        "trust.md",
         "start.md",
         "overview.md",
         "how_many_simulations.md",
         "failed_trial.md",
         "which_parameters.md",
         "two_models.md",
-        "trust.md",
     }
 
 
