@@ -15,8 +15,8 @@ from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.frame import to_dataframe
 from sbi_active.campaign.display.html import campaign_html
-from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
@@ -173,7 +173,7 @@ class CampaignView:
         belief would stop first.
         """
         spent = used_up(self.state)
-        if spent is not None or self.health != "ok":
+        if spent is not None:
             return spent
         if self.state.options.stop.calibration_lost:
             key = (*self.state.processed, self.state.version.number)
