@@ -5,8 +5,8 @@ neural posterior with the measurement, and go on. An extension of sbi.
 
 Here stand the names that most programs need; each is imported when it is first used.
 All others are in the packages: ``actions``, ``simulation``, ``inference``,
-``information_gain``, ``search``, ``design``, ``campaign``, ``criticism`` and
-``mujoco``.
+``information_gain``, ``search``, ``design``, ``diagnostics``, ``campaign``,
+``criticism`` and ``mujoco``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sbi_active.actions import BoxActions, DiscreteActions, MixedActions
     from sbi_active.campaign import Campaign, CampaignOptions, StopRules
     from sbi_active.design import InformationGainDesigner, RandomDesigner
-    from sbi_active.export import to_inference_data
+    from sbi_active.export import to_datatree, to_inference_data
     from sbi_active.inference import (
         ALHI,
         ASBI,
@@ -65,6 +65,7 @@ __all__ = [
     "StudentTNoise",
     "estimate_noise",
     "simulate",
+    "to_datatree",
     "to_inference_data",
 ]
 
@@ -74,7 +75,8 @@ _HOMES = {
     "campaign": "Campaign CampaignOptions StopRules",
     "criticism": "",
     "design": "InformationGainDesigner RandomDesigner",
-    "export": "to_inference_data",
+    "diagnostics": "",
+    "export": "to_datatree to_inference_data",
     "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B",
     "information_gain": "",
     "mujoco": "",

@@ -3,38 +3,81 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 with warnings.catch_warnings():  # ArviZ 0.23 announces 1.0 at every import
     warnings.simplefilter("ignore", FutureWarning)
     import arviz as az
 
 
-def inference_data(
-    groups: dict[str, dict[str, np.ndarray]],
-    coords: dict[str, Any],
-    dims: dict[str, list[str]],
-) -> Any:
-    """Return InferenceData, or from 1.0 on a DataTree, of one chain.
+@dataclass
+class Groups:
+    """Draws and data by group, before they take a library's form.
 
-    Args:
-        groups: Variables by group, each of shape (1, draws, ...).
+    Attributes:
+        num_chains: Over which independent draws are split.
         coords: Labels by dimension.
-        dims: Dimensions by variable, after chain and draw.
+        attrs: Of the whole.
+        variables: Array, dimensions and attributes by group and name.
     """
+
+    num_chains: int
+    coords: dict[str, Any] = field(default_factory=dict)
+    attrs: dict[str, Any] = field(default_factory=dict)
+    variables: dict[tuple[str, str], tuple[Any, list[str], dict[str, str]]] = field(
+        default_factory=dict
+    )
+
+    def add(self, group: str, name: str, draws: Any, dims: list[str]) -> None:
+        """Add draws (n, ...), as (chain, draw, ...); those left over are dropped."""
+        values = np.array(draws, dtype=float)
+        size = len(values) // self.num_chains
+        values = values[: size * self.num_chains]
+        values = values.reshape(self.num_chains, size, *values.shape[1:])
+        self.variables[group, name] = values, ["chain", "draw", *dims], {}
+
+    def add_data(
+        self,
+        group: str,
+        name: str,
+        values: Any,
+        dims: list[str],
+        attrs: dict[str, str] | None = None,
+    ) -> None:
+        """Add what has no draws."""
+        self.variables[group, name] = np.array(values, dtype=float), dims, attrs or {}
+
+    def datasets(self) -> dict[str, xr.Dataset]:
+        """Return one dataset a group."""
+        found: dict[str, dict[str, xr.DataArray]] = {}
+        for (group, name), (values, dims, attrs) in self.variables.items():
+            coords = {
+                d: self.coords.get(d, np.arange(n))
+                for d, n in zip(dims, values.shape, strict=True)
+            }
+            array = xr.DataArray(values, coords, dims, attrs=attrs)
+            found.setdefault(group, {})[name] = array
+        attrs = {"inference_library": "sbi-active", **self.attrs}
+        return {group: xr.Dataset(v, attrs=attrs) for group, v in found.items()}
+
+
+def data_tree(groups: Groups) -> xr.DataTree:
+    """Return a DataTree, which ArviZ 1.x takes."""
+    datasets: Any = {f"/{name}": d for name, d in groups.datasets().items()}
+    tree = xr.DataTree.from_dict(datasets)
+    tree.attrs.update(groups.attrs)
+    return tree
+
+
+def inference_data(groups: Groups) -> Any:
+    """Return InferenceData, or from ArviZ 1.0 on a DataTree."""
     if int(az.__version__.split(".")[0]) >= 1:
-        return az.from_dict(groups, coords=coords, dims=dims)  # type: ignore[arg-type]
-    # ArviZ 0.x takes one log-likelihood value a trial under the name of its variable,
-    # whose other dimensions do not exist there: dimensions are given group by group.
-    data = az.InferenceData()
-    for name, variables in groups.items():
-        own = {key: value for key, value in dims.items() if key in variables}
-        if name == "log_likelihood":
-            own["x"] = ["round"]
-        data.extend(az.from_dict(**{name: variables}, coords=coords, dims=own))  # pyright: ignore
-    return data
+        return data_tree(groups)
+    return az.InferenceData(**groups.datasets())
 
 
 def pareto_smoothed(

@@ -1,8 +1,8 @@
-"""Export to ArviZ."""
+"""Export to ArviZ, of both generations."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,39 +10,55 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.arviz_versions import inference_data
+from sbi_active.arviz_versions import Groups, data_tree, inference_data
 from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
 if TYPE_CHECKING:
     from sbi_active.campaign import Campaign
+    from sbi_active.criticism import Report
+
+NUM_CHAINS = 4
 
 
 def to_inference_data(
-    source: Distribution | Campaign,
+    source: Distribution | Campaign | Report | Mapping[str, Any],
     *,
     parameter_names: Sequence[str] | None = None,
     num_samples: int = 2_000,
+    num_chains: int = NUM_CHAINS,
+    model: str | None = None,
     seed: int = 0,
 ) -> Any:
     """Return draws and data in ArviZ's format.
 
-    Groups of a belief: posterior, and prior where the belief knows it. A campaign adds
-    posterior_predictive and observed_data (one outcome a trial), constant_data (the
-    actions), log_likelihood (where the simulator's noise has a density) and
-    sample_stats (the belief's log density at each draw). Coordinates name parameters,
-    rounds and entries of the action.
+    Groups of a belief: posterior, sample_stats (the log density ``lp`` of each draw),
+    and prior where the belief knows it. A campaign adds posterior_predictive,
+    prior_predictive and observed_data (one outcome a trial), constant_data (actions)
+    and log_likelihood (where the simulator's noise has a density). A report has the
+    posterior of its verdict's model, or of ``model``. A benchmark run is a dict of
+    variables, each of shape (draws,) or (draws, parameters): its rows as draws.
+
+    Draws are independent; they are split over chains, so that r_hat and ess are
+    defined. Coordinates name parameters, rounds, channels and entries of the action,
+    which carry their units as attributes.
 
     Args:
-        source: A belief or a campaign.
+        source: A belief, a campaign, a report, or a dict of arrays.
         parameter_names: One a parameter; None takes the simulator's, which beliefs
             remember, else theta_1, ...
-        num_samples: Draws.
+        num_samples: Draws of all chains together.
+        num_chains: Chains; draws that do not fill all are left out.
+        model: Of a report: a name among ``report.tracing.evidences``.
         seed: Of the draws.
 
     Returns:
         ArviZ 0.x: ``InferenceData``; 1.x: ``DataTree``.
+
+    Raises:
+        ValueError: If names do not fit, chains are more than half of the draws, or a
+            report has no such model.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -50,69 +66,227 @@ def to_inference_data(
         >>> data["posterior"]["theta"].dims
         ('chain', 'draw', 'parameter')
     """
-    campaign = None if isinstance(source, Distribution) else source
-    belief = source if isinstance(source, Distribution) else source.belief
-    prior = getattr(belief, "prior", None) if campaign is None else campaign.prior
-    with forked_generators(seed, "posterior"):
-        theta = belief.sample((num_samples,))
-    if parameter_names is None and campaign is not None:
-        parameter_names = getattr(campaign.simulator, "parameter_names", None)
-    if parameter_names is None:
-        parameter_names = names_of(belief, theta.shape[1])
-    if len(parameter_names) != theta.shape[1]:
+    return inference_data(
+        _groups(source, parameter_names, num_samples, num_chains, model, seed)
+    )
+
+
+def to_datatree(
+    source: Distribution | Campaign | Report | Mapping[str, Any],
+    *,
+    parameter_names: Sequence[str] | None = None,
+    num_samples: int = 2_000,
+    num_chains: int = NUM_CHAINS,
+    model: str | None = None,
+    seed: int = 0,
+) -> Any:
+    """Return the same as an xarray ``DataTree``, which ArviZ 1.x takes.
+
+    It needs xarray alone, so that one Python may write what another one reads: by
+    ``to_netcdf``, or ``to_zarr``.
+
+    Args:
+        source: As in :func:`to_inference_data`, with what follows.
+        parameter_names: One a parameter.
+        num_samples: Draws of all chains together.
+        num_chains: Chains.
+        model: Of a report.
+        seed: Of the draws.
+    """
+    return data_tree(
+        _groups(source, parameter_names, num_samples, num_chains, model, seed)
+    )
+
+
+def _groups(
+    source: Any,
+    names: Sequence[str] | None,
+    num_samples: int,
+    num_chains: int,
+    model: str | None,
+    seed: int,
+) -> Groups:
+    if not 1 <= num_chains <= num_samples // 2:
         raise ValueError(
-            f"expected {theta.shape[1]} parameter names; got {[*parameter_names]}; "
+            "expected at least two draws a chain; got "
+            f"{num_samples} draws in {num_chains} chains; raise num_samples"
+        )
+    made = Groups(num_chains)
+    num_samples -= num_samples % num_chains
+    if isinstance(source, Mapping):
+        _add_rows(made, source)
+    elif hasattr(source, "tracing"):
+        _add_report(made, source, num_samples, model, seed)
+    elif isinstance(source, Distribution):
+        prior = getattr(source, "prior", None)
+        _add_belief(made, source, prior, names, num_samples, seed)
+    elif hasattr(source, "history"):
+        if names is None:
+            names = getattr(source.simulator, "parameter_names", None)
+        pair = source.belief, source.prior
+        theta, before = _add_belief(made, *pair, names, num_samples, seed)
+        assert before is not None
+        _add_trials(made, source, theta, before, seed)
+    else:
+        raise TypeError(
+            "expected a belief, a campaign, a report or a dict of arrays; got "
+            f"{type(source).__name__}; pass one of these"
+        )
+    return made
+
+
+def _add_belief(
+    made: Groups,
+    belief: Distribution,
+    prior: Distribution | None,
+    names: Sequence[str] | None,
+    num_samples: int,
+    seed: int,
+) -> tuple[Tensor, Tensor | None]:
+    """Add posterior, its log density and the prior; return the draws of both."""
+    with forked_generators(seed, "posterior"):
+        theta = belief.sample(torch.Size([num_samples]))
+    names = names_of(belief, theta.shape[1]) if names is None else names
+    if len(names) != theta.shape[1]:
+        raise ValueError(
+            f"expected {theta.shape[1]} parameter names; got {[*names]}; "
             "give one a parameter"
         )
-    groups: dict[str, dict[str, np.ndarray]] = {"posterior": {"theta": _draws(theta)}}
-    coords: dict[str, Any] = {"parameter": [*parameter_names]}
-    dims = {"theta": ["parameter"]}
-    groups["sample_stats"] = {"lp": _draws(belief.log_prob(theta))}
-    if prior is not None:
-        with forked_generators(seed, "prior"):
-            groups["prior"] = {"theta": _draws(prior.sample((num_samples,)))}
-    if campaign is not None:
-        _add_trials(campaign, theta, groups, coords, dims, seed)
-    return inference_data(groups, coords, dims)
+    made.coords["parameter"] = [*names]
+    made.add("posterior", "theta", theta, ["parameter"])
+    made.add("sample_stats", "lp", belief.log_prob(theta), [])
+    if prior is None:
+        return theta, None
+    with forked_generators(seed, "prior"):
+        before = prior.sample(torch.Size([num_samples]))
+    made.add("prior", "theta", before, ["parameter"])
+    return theta, before
 
 
 def _add_trials(
-    campaign: Campaign,
-    theta: Tensor,
-    groups: dict[str, dict[str, np.ndarray]],
-    coords: dict[str, Any],
-    dims: dict[str, list[str]],
-    seed: int,
+    made: Groups, campaign: Campaign, theta: Tensor, before: Tensor, seed: int
 ) -> None:
     trials = [t for t in campaign.history if t.is_measured]
     if not trials:
         return
     action = torch.stack([t.action for t in trials])
     x = torch.stack([t.x for t in trials if t.x is not None])
-    x_dims = [f"x_dim_{i}" for i in range(x.ndim - 1)]
-    names = getattr(campaign.simulator, "channel_names", None)
-    if names is not None and x.ndim > 1 and len(names) == x.shape[-1]:
-        x_dims[-1] = "channel"
-        coords["channel"] = names
-    # The same draws of the posterior stand behind predictive and likelihood.
-    pairs = theta.repeat_interleave(len(trials), 0), action.repeat(len(theta), 1)
-    rows = simulate(campaign.simulator, *pairs, seed=derive_seed(seed, "predictive"))
+    dims = [f"x_dim_{i}" for i in range(x.ndim - 1)]
+    channels = getattr(campaign.simulator, "channel_names", None)
+    if channels is not None and x.ndim > 1 and len(channels) == x.shape[-1]:
+        dims[-1] = "channel"
+        made.coords["channel"] = [*channels]
+    made.coords["round"] = [t.index + 1 for t in trials]
+    made.coords["action_entry"] = [*campaign.actions.names]
     shape = (len(theta), len(trials))
-    groups["posterior_predictive"] = {"x": _draws(rows.x.reshape(*shape, *x.shape[1:]))}
-    groups["observed_data"] = {"x": x.numpy()}
-    groups["constant_data"] = {"action": action.numpy()}
+    # The same draws of the posterior stand behind predictive and likelihood.
+    for group, draws in (("posterior", theta), ("prior", before)):
+        pairs = draws.repeat_interleave(len(trials), 0), action.repeat(len(draws), 1)
+        key = "predictive" if group == "posterior" else "prior predictive"
+        rows = simulate(campaign.simulator, *pairs, seed=derive_seed(seed, key))
+        values = rows.x.reshape(*shape, *x.shape[1:])
+        made.add(f"{group}_predictive", "x", values, ["round", *dims])
+    made.add_data("observed_data", "x", x, ["round", *dims])
+    units = {
+        f"unit_{name}": unit
+        for name, unit in zip(
+            campaign.actions.names, campaign.actions.units, strict=True
+        )
+        if unit
+    }
+    made.add_data("constant_data", "action", action, ["round", "action_entry"], units)
     noise = getattr(campaign.simulator, "noise", None)
     if noise is not None:
-        observed = x.repeat(len(theta), *[1] * (x.ndim - 1))
         simulator: Any = campaign.simulator
-        values = noise.log_prob(observed, simulator.mean(*pairs)).reshape(shape)
-        groups["log_likelihood"] = {"x": _draws(values)}
-    coords["round"] = [t.index + 1 for t in trials]
-    coords["action_entry"] = campaign.actions.names
-    dims["x"] = ["round", *x_dims]
-    dims["action"] = ["round", "action_entry"]
+        pairs = theta.repeat_interleave(len(trials), 0), action.repeat(len(theta), 1)
+        observed = x.repeat(len(theta), *[1] * (x.ndim - 1))
+        log_prob = noise.log_prob(observed, simulator.mean(*pairs)).reshape(shape)
+        made.add("log_likelihood", "x", log_prob, ["round"])
 
 
-def _draws(values: Tensor) -> np.ndarray:
-    """Return draws as one chain, shape (1, n, ...)."""
-    return values.detach().numpy()[None]
+def _add_report(
+    made: Groups, report: Any, num_samples: int, model: str | None, seed: int
+) -> None:
+    """Add the posterior of one of a report's models, and what the trials were."""
+    evidences = report.tracing.evidences
+    name = str(report.tracing.key) if model is None else model
+    if name not in evidences:
+        raise ValueError(
+            f"expected a model among {', '.join(map(repr, evidences))}; got {name!r}; "
+            "pass model="
+        )
+    found = evidences[name]
+    rng = np.random.default_rng(derive_seed(seed, "report"))
+    row = rng.integers(len(found.draws), size=num_samples)
+    made.coords["parameter"] = [*found.names]
+    made.add("posterior", "theta", np.asarray(found.draws)[row], ["parameter"])
+    residuals = report.residuals
+    made.coords["round"] = [int(i) + 1 for i in residuals.index]
+    made.coords["action_entry"] = [*report.action_labels]
+    x = np.asarray(residuals.x)
+    dims = [f"x_dim_{i}" for i in range(x.ndim - 1)]
+    made.add_data("observed_data", "x", x, ["round", *dims])
+    pair = ["round", "action_entry"]
+    made.add_data("constant_data", "action", residuals.action, pair)
+    log_prob = _rival_log_likelihood(report, found, np.asarray(found.draws)[row])
+    if log_prob is not None:
+        made.add("log_likelihood", "x", log_prob, ["round"])
+    probabilities = report.probabilities
+    made.coords["model"] = [*probabilities]
+    values = np.array([*probabilities.values()])
+    made.add_data("constant_data", "probability", values, ["model"])
+    made.attrs.update(model=name, verdict=report.verdict)
+    made.attrs["log_evidence"] = float(found.log_evidence)
+
+
+def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
+    """Return the log likelihood of each trial under a rival, shape (n, t).
+
+    None where it is more than the simulator, effects and declared noise: a residual
+    process, an unknown size of noise, nuisances of single trials.
+    """
+    simulator, key = report.simulator, found.key
+    effects = {e.name: e for e in getattr(simulator, "effects", ())}
+    used = [effects[name] for name in key.effects if name in effects]
+    plain = len(used) == len(key.effects)
+    plain &= all(e.scope == "campaign" and e.hook != "noise" for e in used)
+    own = len(getattr(simulator, "base", simulator).parameter_names or ())
+    size = own + sum(e.phi_dim for e in used)
+    noise = simulator.noise if report.residuals.noise == "declared" else None
+    is_whole = key.error is None and report.tracing.misfit is None
+    if noise is None or not (plain and is_whole and draws.shape[1] == size):
+        return None
+    theta = torch.as_tensor(draws, dtype=torch.float32)
+    x = torch.as_tensor(np.asarray(report.residuals.x)).double()
+    action = torch.as_tensor(report.residuals.action).float()
+    phi, first = {}, own
+    for effect in used:
+        phi[effect.name] = theta[:, first : first + effect.phi_dim]
+        first += effect.phi_dim
+    terms = []
+    for k in range(len(x)):
+        given = theta[:, :own], action[k].expand(len(theta), -1)
+        if effects:
+            place = torch.full((len(theta),), float(report.residuals.index[k]))
+            mean = simulator.evaluate(given[0], phi, given[1], index=place)
+        else:
+            mean = simulator.mean(*given)
+        terms.append(noise.log_prob(x[k].expand(mean.shape), mean.double()))
+    return torch.stack(terms, 1)
+
+
+def _add_rows(made: Groups, rows: Mapping[str, Any]) -> None:
+    """Add a benchmark's rows as draws; texts are left out."""
+    for name, values in rows.items():
+        array = np.asarray(values)
+        if array.dtype.kind not in "biuf" or array.ndim == 0:
+            continue
+        if len(array) < 2 * made.num_chains:
+            raise ValueError(
+                f"expected at least {2 * made.num_chains} rows; got {len(array)}; lower"
+                " num_chains"
+            )
+        dims = [f"{name}_dim_{i}" for i in range(array.ndim - 1)]
+        made.add("posterior", str(name), array.astype(float), dims)
+    if not made.variables:
+        raise ValueError("expected columns of numbers; got none; pass arrays of rows")

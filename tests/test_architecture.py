@@ -48,6 +48,7 @@ FLOORS = (
     "information_gain.estimators",
     "search",
     "design",
+    "diagnostics",
     "criticism.under_misfit",
     "criticism.results",
     "criticism.data",

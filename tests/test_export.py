@@ -1,19 +1,25 @@
+import warnings
+
 import arviz as az
 import matplotlib
 import numpy as np
 import pytest
 import torch
+import xarray as xr
 from sbi.utils import BoxUniform
 
 from sbi_active import (
+    BoxActions,
     Campaign,
     CampaignOptions,
     DiscreteActions,
     GaussianNoise,
     MixtureDensity,
     SimulatorModel,
+    to_datatree,
     to_inference_data,
 )
+from sbi_active.criticism import Trials, close_loop, generic_effects
 
 matplotlib.use("Agg")
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
@@ -47,22 +53,22 @@ def test_a_campaign_has_the_groups_and_coordinates(campaign):
     data = to_inference_data(campaign, num_samples=100)
     expected = {
         *("posterior", "prior", "posterior_predictive", "observed_data"),
-        *("constant_data", "sample_stats", "log_likelihood"),
+        *("constant_data", "sample_stats", "log_likelihood", "prior_predictive"),
     }
     assert {*data.groups()} == expected
     assert data.posterior.theta.dims == ("chain", "draw", "parameter")
     assert [*data.posterior.parameter.values] == ["mass", "friction"]
-    assert data.posterior_predictive.x.shape == (1, 100, 3, 2)
+    assert data.posterior_predictive.x.shape == (4, 25, 3, 2)
     assert data.posterior_predictive.x.dims[2:] == ("round", "channel")
     assert data.observed_data.x.shape == (3, 2)
     assert [*data.observed_data["round"].values] == [1, 2, 3]
     assert data.constant_data.action.dims == ("round", "action_entry")
     assert [*data.constant_data.action_entry.values] == ["push"]
-    assert data.log_likelihood.x.shape == (1, 100, 3)
+    assert data.log_likelihood.x.shape == (4, 25, 3)
 
 
 def test_the_log_likelihood_belongs_to_the_draws(campaign):
-    data = to_inference_data(campaign, num_samples=10)
+    data = to_inference_data(campaign, num_samples=10, num_chains=1)
     theta = torch.tensor(data.posterior.theta.values[0])
     action = torch.tensor(data.constant_data.action.values)
     x = torch.tensor(data.observed_data.x.values)
@@ -86,7 +92,7 @@ def test_arviz_reads_it(campaign, tmp_path):
     assert np.isfinite(az.loo(data, var_name="x").elpd_loo)
     path = str(tmp_path / "data.nc")
     data.to_netcdf(path)
-    assert az.from_netcdf(path).posterior.theta.shape == (1, 200, 2)
+    assert az.from_netcdf(path).posterior.theta.shape == (4, 50, 2)
 
 
 def test_a_belief_and_a_prior_alone():
@@ -115,10 +121,81 @@ def test_a_plain_function_has_no_log_likelihood():
     c.update()
     data = to_inference_data(c, num_samples=20)
     assert "log_likelihood" not in data.groups()
-    assert data.posterior_predictive.x.shape == (1, 20, 1, 2)
+    assert data.posterior_predictive.x.shape == (4, 5, 1, 2)
     assert [*data.posterior.parameter.values] == ["theta_1", "theta_2"]
 
 
 def test_same_seed_same_draws(campaign):
-    a, b = (to_inference_data(campaign, num_samples=5, seed=1) for _ in range(2))
+    a, b = (to_inference_data(campaign, num_samples=8, seed=1) for _ in range(2))
     assert (a.posterior.theta.values == b.posterior.theta.values).all()
+
+
+@pytest.fixture(scope="module")
+def report():
+    model = SimulatorModel(
+        lambda theta, action: theta * action,
+        noise=GaussianNoise(0.1),
+        parameter_names=["gain"],
+    )
+    prior = BoxUniform(torch.zeros(1), 2 * torch.ones(1))
+    action = torch.linspace(0.5, 2.0, 6)[:, None]
+    x = 0.8 * action + 0.7
+    actions = BoxActions([0.5], [2.0], names=["push"], units=["N"])
+    effects = generic_effects(model, actions)
+    return close_loop(
+        model,
+        prior,
+        Trials(action, x),
+        effects=[e for e in effects if "offset" in e.name or "bias" in e.name],
+        actions=actions,
+        seed=0,
+        evaluate=False,
+    )
+
+
+def test_rivals_of_a_report_are_compared(report):
+    name = str(report.tracing.key)
+    assert name != "none"
+    rivals = {m: to_inference_data(report, model=m) for m in ("none", name)}
+    assert rivals[name].posterior.theta.shape[0] == 4
+    assert rivals[name].posterior.attrs["verdict"] == report.verdict
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the Pareto shapes of a wrong model
+        ranked = az.compare(rivals)
+    assert ranked.index[0] == name
+    with pytest.raises(ValueError, match="expected a model among"):
+        to_inference_data(report, model="gremlins")
+
+
+def test_rows_of_a_benchmark_and_a_tree(campaign, tmp_path):
+    data = to_inference_data({"gap": np.arange(40.0), "task": ["a"] * 40})
+    assert data.posterior.gap.shape == (4, 10)
+    assert [*data.posterior.data_vars] == ["gap"]
+    with pytest.raises(ValueError, match="at least 8 rows"):
+        to_inference_data({"gap": np.arange(5.0)})
+    with pytest.raises(TypeError, match="got float"):
+        to_inference_data(1.0)
+    tree = to_datatree(campaign, num_samples=40)
+    tree.to_netcdf(tmp_path / "tree.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as again:
+        assert again["posterior"]["theta"].dims == ("chain", "draw", "parameter")
+        assert again["constant_data"]["action"].attrs == {}
+        assert (again["observed_data"]["x"] == tree["observed_data"]["x"]).all()
+
+
+def test_summary_has_diagnostics_and_no_warning(campaign):
+    data = to_inference_data(campaign, num_samples=400)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        summary = az.summary(data)
+    assert summary["r_hat"].between(0.98, 1.05).all()
+    assert (summary["ess_bulk"] > 100).all()
+
+
+def test_what_is_returned_is_a_copy(campaign):
+    data = to_inference_data(campaign, num_samples=40)
+    data.observed_data.x.values[:] = 7.0
+    data.constant_data.action.values[:] = 7.0
+    assert campaign.history[0].x is not None
+    assert not bool((campaign.history[0].x == 7.0).any())
+    assert not bool((campaign.history[0].action == 7.0).any())

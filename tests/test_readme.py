@@ -200,6 +200,7 @@ def test_no_page_is_forgotten():
         "closing_the_loop.md",
         "identifiability.md",
         "robots.md",
+        "trust.md",
         "start.md",
         "overview.md",
         "how_many_simulations.md",
@@ -214,3 +215,11 @@ def test_no_page_is_forgotten():
 def test_robust_updates(run):
     (snippet,) = run("docs/robust.md")
     assert snippet.model.misspecified(snippet.x, torch.tensor([0.0, 30.0]))[0, 1] > 0.99
+
+
+def test_trust(run, capsys):
+    network, belief, export = run("docs/trust.md")
+    assert network.calibration.overall.num_rows == 300
+    assert len(belief.check.spread) == 2
+    assert "friction" in capsys.readouterr().out
+    assert export.tree.groups

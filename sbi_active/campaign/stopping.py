@@ -18,22 +18,28 @@ NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
 class StopRules:
     """Rules by which :meth:`.Campaign.run` ends before its last round.
 
-    Any one ends it, but none while the campaign's health is not "ok": a simulator that
-    lacks something makes a belief narrow at a wrong place, which is what both rules
-    wait for.
+    Any one ends it, but the first two not while the campaign's health is not "ok": a
+    simulator that lacks something makes a belief narrow at a wrong place, which is what
+    both wait for.
 
     Attributes:
         min_information_gain: The next trial is expected to tell less than this, nats.
         max_sd: All parameters' standard deviations under the belief are below this:
             one number, or one a parameter, in the parameters' units.
+        calibration_lost: The verdict of :mod:`sbi_active.diagnostics` is "stop":
+            inferred twice again, the refined belief excludes what these hold; or, where
+            beliefs are the network's word, the network excludes the truth too often at
+            some action. It ends a campaign whatever its health, at the cost of two
+            inferences, or of 1,000 simulations, a trial.
 
     Example:
         >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])
-        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2))
+        StopRules(min_information_gain=0.1, max_sd=(0.05, 0.2), calibration_lost=False)
     """
 
     min_information_gain: float | None = None
     max_sd: float | Sequence[float] | None = None
+    calibration_lost: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.max_sd, Sequence):

@@ -10,10 +10,12 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.checks.calibration import calibration_lost
 from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.frame import to_dataframe
 from sbi_active.campaign.display.html import campaign_html
+from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
@@ -167,11 +169,21 @@ class CampaignView:
     def stop_reason(self) -> str | None:
         """Why ``options.stop`` says to stop, after the trials the belief contains.
 
-        None while the health is not "ok": a confident wrong belief would stop first.
+        None while the health is not "ok", but for a lost calibration: a confident wrong
+        belief would stop first.
         """
         spent = used_up(self.state)
-        if spent is not None or self.health != "ok":
+        if spent is not None:
             return spent
+        if self.state.options.stop.calibration_lost:
+            key = (*self.state.processed, self.state.version.number)
+            known = self.__dict__.setdefault("_calibrations", {})
+            if key not in known:
+                known[key] = isolated(calibration_lost)(self)
+            if known[key] is not None:
+                return known[key]
+        if self.health != "ok":
+            return None
         design = None if self.pending is None else self.pending.design
         return self.state.options.stop.reason(
             self.belief, design, seed=derive_seed(self.state.seed, len(self.history))

@@ -207,14 +207,7 @@ class ActionPosterior:
                 "trained on lacks these numbers, so what it says is arbitrary",
                 stacklevel=3,
             )
-        posterior = DirectPosterior(
-            _AtConditions(network, condition),
-            direct.prior,
-            max_sampling_batch_size=direct.max_sampling_batch_size,
-            device=direct.device,
-            enable_transform=direct.enable_transform,
-        )
-        return posterior, torch.arange(float(len(condition)))[:, None]
+        return at_conditions(direct, condition)
 
     def _condition(self, x: Tensor | None, action: Tensor | None) -> Tensor:
         if x is None or action is None:
@@ -226,6 +219,31 @@ class ActionPosterior:
             )
         rows = outcome_rows(x, self.x_shape)
         return pack(rows, action_rows(action, self.action_dim, num_rows=len(rows)))
+
+
+def at_conditions(
+    direct: DirectPosterior, condition: Tensor
+) -> tuple[DirectPosterior, Tensor]:
+    """Return a posterior given the number of a row, and these numbers.
+
+    sbi refuses NaN in a condition, and its diagnostics drop such rows; the number of a
+    row has none.
+
+    Args:
+        direct: Over packed conditions.
+        condition: Packed conditions, shape (n, c).
+
+    Returns:
+        The posterior, and numbers of shape (n, 1).
+    """
+    posterior = DirectPosterior(
+        _AtConditions(direct.posterior_estimator, condition),
+        direct.prior,
+        max_sampling_batch_size=direct.max_sampling_batch_size,
+        device=direct.device,
+        enable_transform=direct.enable_transform,
+    )
+    return posterior, torch.arange(float(len(condition)))[:, None]
 
 
 class _Rewritten(ConditionalDensityEstimator):

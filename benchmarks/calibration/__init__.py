@@ -1,0 +1,1 @@
+"""Are bad networks and beliefs flagged, and good ones not?"""

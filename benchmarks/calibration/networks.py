@@ -1,0 +1,127 @@
+"""Networks that were trained, under-trained, or are wrong at one action."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sbi_active import ASBI, MixtureDensity
+from sbi_active.diagnostics import check_calibration
+from sbi_active.inference import ActionPosterior
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
+from sbi_active.tasks import Task, get_task
+
+#: Name of a problem: task and options.
+PROBLEMS: dict[str, tuple[str, dict[str, Any]]] = {
+    "numerical": ("numerical", {}),
+    "square": ("numerical", {"variant": "square"}),
+    "location": ("location_finding", {}),
+    "oscillator": ("oscillator", {}),
+}
+TRAINED = MixtureDensity(num_iterations=3_000)
+NUM_TRAINED, NUM_UNDER = 20_000, 5_000
+COLUMNS = [
+    *("problem", "kind", "seed", "steps", "verdict", "flagged_strata", "strata"),
+    *("coverage", "gap", "lost", "wrong_flagged", "others_flagged", "cpu_seconds"),
+    "reason",
+]
+
+
+def train(task: Task, settings: MixtureDensity, rows: int, seed: int) -> ASBI:
+    """Return a trainer after one round from the prior."""
+    with forked_generators(derive_seed(seed, "train")):
+        inference = ASBI(task.prior, density_estimator=settings)
+        theta = task.prior.sample(torch.Size([rows]))
+        action = task.actions.sample((rows,))
+        x = simulate(task.simulator, theta, action, seed=derive_seed(seed, "x")).x
+        inference.append_simulations(theta, x, action=action, belief=task.prior)
+        inference.train()
+    return inference
+
+
+class WrongAt(torch.nn.Module):
+    """A network whose posteriors at one action are half as wide and moved."""
+
+    def __init__(self, network: Any, action: Tensor) -> None:
+        super().__init__()
+        self.network, self.action = network, action
+        self.shrink, self.move = 0.5, 1.0
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            return getattr(super().__getattr__("network"), name)
+
+    def _parts(self, condition: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        dim = len(self.action)
+        wrong = (condition[:, -dim:] - self.action).abs().amax(1) < 1e-4
+        with forked_generators(0):
+            draws = self.network.sample(torch.Size([200]), condition)
+        return wrong, draws.mean(0), draws.std(0)
+
+    def sample(self, shape: torch.Size, condition: Tensor, **_: Any) -> Tensor:
+        draws = self.network.sample(shape, condition)
+        wrong, center, spread = self._parts(condition)
+        moved = center + self.move * spread + self.shrink * (draws - center)
+        return torch.where(wrong[:, None], moved, draws)
+
+    def log_prob(self, theta: Tensor, condition: Tensor, **_: Any) -> Tensor:
+        wrong, center, spread = self._parts(condition)
+        back = center + (theta - center - self.move * spread) / self.shrink
+        there = self.network.log_prob(back, condition)
+        there = there - theta.shape[-1] * torch.tensor(self.shrink).log()
+        return torch.where(wrong, there, self.network.log_prob(theta, condition))
+
+
+def network_row(problem: str, kind: str, seed: int) -> dict[str, object]:
+    """Return the row of one network: "trained", "under" or "one action"."""
+    begin = time.process_time()
+    name, options = PROBLEMS[problem]
+    task = get_task(name, **options)
+    steps = TRAINED.num_iterations
+    if kind == "under":
+        steps = 20 + derive_seed(seed, "steps") % 81
+        under = replace(MixtureDensity.faithful(), num_iterations=steps)
+        inference = train(task, under, NUM_UNDER, seed)
+    else:
+        inference = train(task, TRAINED, NUM_TRAINED, seed)
+    wrong, posterior = None, inference.build_posterior()
+    if kind == "one action":
+        wrong = derive_seed(seed, "wrong") % len(task.actions)
+        packed: Any = posterior.packed()
+        action = task.actions.values[wrong]
+        packed.posterior_estimator = WrongAt(packed.posterior_estimator, action)
+        posterior = ActionPosterior(packed, posterior.x_shape, posterior.action_dim)
+    size = 2_000 if kind == "one action" else 1_000
+    found = check_calibration(
+        posterior,
+        task.simulator,
+        actions=task.actions,
+        num_simulations=size,
+        max_strata=24 if kind == "one action" else 12,
+        seed=derive_seed(seed, "check"),
+    )
+    flagged = [s.verdict != "trust" for s in found.strata]
+    others = [f for k, f in enumerate(flagged) if k != wrong]
+    return {
+        "problem": problem,
+        "kind": kind,
+        "seed": seed,
+        "steps": steps,
+        "verdict": found.verdict,
+        "flagged_strata": sum(flagged),
+        "strata": len(flagged),
+        "coverage": found.overall.coverage[0.9],
+        "gap": found.overall.gap,
+        "lost": found.overall.lost,
+        "wrong_flagged": "" if wrong is None else int(flagged[wrong]),
+        "others_flagged": "" if wrong is None else sum(others),
+        "cpu_seconds": time.process_time() - begin,
+        "reason": found.reasons[0] if found.reasons else "",
+    }

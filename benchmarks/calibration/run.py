@@ -1,0 +1,118 @@
+"""Are bad networks and beliefs flagged, and good ones not?
+
+    python -m benchmarks.calibration.run --table networks --problem numerical
+    python -m benchmarks.calibration.run --table beliefs --problem square
+    python -m benchmarks.calibration.run --summary
+
+networks: under-trained (20 to 100 steps of the paper's network on 5,000 rows), trained
+(3,000 steps of the default one on 20,000), and trained but wrong at one action.
+beliefs: refined ones, and the same twice as wide, half as wide, or without one of two
+modes; "always" where every inference has the error, and ranks alone can tell.
+
+Resumable: a row that stands in the CSV is not run again. Seeds from 2000 on judge.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import warnings
+from pathlib import Path
+
+from benchmarks.calibration import beliefs, networks
+from sbi_active.diagnostics.verdict import clopper_pearson
+
+RESULTS = Path(__file__).parent / "results"
+TABLES = {
+    "networks": (networks.network_row, networks.COLUMNS, networks.PROBLEMS),
+    "beliefs": (beliefs.belief_row, beliefs.COLUMNS, beliefs.PROBLEMS),
+}
+KINDS = {
+    "networks": ("under", "trained", "one action"),
+    "beliefs": beliefs.KINDS,
+}
+
+
+def path(table: str) -> Path:
+    """Return the file of a table."""
+    return RESULTS / f"{table}.csv"
+
+
+def read(table: str) -> list[dict[str, str]]:
+    """Return the rows so far."""
+    if not path(table).exists():
+        return []
+    with path(table).open(newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def run(table: str, problem: str, kind: str, seeds: range) -> None:
+    """Run the seeds that are not there yet."""
+    make, columns, _ = TABLES[table]
+    done = {(r["problem"], r["kind"], int(r["seed"])) for r in read(table)}
+    for seed in seeds:
+        if (problem, kind, seed) in done:
+            continue
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            row = make(problem, kind, seed)
+        is_new = not path(table).exists()
+        with path(table).open("a", newline="") as file:
+            writer = csv.DictWriter(file, columns)
+            if is_new:
+                writer.writeheader()
+            writer.writerow(
+                {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
+            )
+        print(problem, kind, seed, row["verdict"], row["reason"], flush=True)
+
+
+def summary(table: str, first: int) -> None:
+    """Print the share flagged, by problem and kind."""
+    groups: dict[tuple[str, str], list[dict[str, str]]] = {}
+    for row in read(table):
+        if int(row["seed"]) >= first:
+            groups.setdefault((row["problem"], row["kind"]), []).append(row)
+    for (problem, kind), rows in groups.items():
+        n = len(rows)
+        k = sum(row["verdict"] != "trust" for row in rows)
+        low, high = clopper_pearson(k, n, 0.05)
+        cpu = sum(float(row["cpu_seconds"]) for row in rows) / n
+        line = f"{problem:12s} {kind:14s} flagged {k}/{n} ({low:.2f} to {high:.2f})"
+        if kind == "one action":
+            at = sum(int(row["wrong_flagged"]) for row in rows)
+            only = sum(
+                row["wrong_flagged"] == "1" and row["others_flagged"] == "0"
+                for row in rows
+            )
+            line += f", at the wrong action {at}, only there {only}"
+        print(f"{line}; {cpu:.1f} CPU s")
+
+
+def main() -> None:
+    """Run what is asked for and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--table", choices=[*TABLES], default="networks")
+    parser.add_argument("--problem", action="append")
+    parser.add_argument("--kind", action="append")
+    parser.add_argument("--first", type=int, default=2_000)
+    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    given = parser.parse_args()
+    if given.summary:
+        for table in TABLES:
+            summary(table, given.first)
+        return
+    for problem in given.problem or [*TABLES[given.table][2]][:3]:
+        for kind in given.kind or KINDS[given.table]:
+            run(
+                given.table,
+                problem,
+                kind,
+                range(given.first, given.first + given.seeds),
+            )
+    summary(given.table, given.first)
+
+
+if __name__ == "__main__":
+    main()

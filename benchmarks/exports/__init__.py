@@ -1,0 +1,1 @@
+"""Do exports open in ArviZ of both generations?"""

@@ -1,0 +1,323 @@
+r"""Is a refined belief right? Asked at run time, without any further truth.
+
+Two questions, which find different errors:
+
+- Refits. The same trials are inferred again with other seeds. A belief that lost a
+  mode, or is too wide or narrow by accident, differs from these in nats.
+- Posterior SBC. Parameters from the belief, outcomes of the executed actions simulated
+  with them, and both old and new trials inferred with the same settings: the parameters
+  are then draws of that posterior, and their ranks in it are uniform. Errors that every
+  inference makes show here, the more the more the new outcomes tell, which is why each
+  action is simulated ``num_copies`` times.
+
+What no check around a belief can find is a mode that each inference loses in the same
+way; :func:`.check_calibration` draws from all of the prior.
+
+References:
+    Saeilynoja, Schmitt, Buerkner & Vehtari 2025, arXiv:2502.03279 (posterior SBC);
+    Cook, Gelman & Rubin, J. Comp. Graph. Stat. 2006 (the chi-square of ranks).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import chi2, norm
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.diagnostics.calibration import Verdict, worst
+from sbi_active.diagnostics.check import is_campaign
+from sbi_active.diagnostics.log_score import smooth
+from sbi_active.inference.beliefs.belief import names_of
+from sbi_active.inference.refinement.settings import RefinementOptions
+from sbi_active.inference.refinement.stages import refine
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
+
+#: From actions (t, action_dim), outcomes (t, *x_shape) and a seed to a belief.
+Infer = Callable[[Tensor, Tensor, int], Distribution]
+
+NUM_COMPARED = 1_000  # draws behind a divergence
+DIFFERENT = 0.3  # nats a parameter; twice the width is .8 or .3 by the direction
+EXCLUDED = 0.6  # nats a parameter of refits that the belief does not hold
+DEEPEST = 12.0  # nats that one draw may count
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeliefCheck:
+    """Whether a refined belief can be trusted.
+
+    Attributes:
+        verdict: "trust"; "refine" where the belief is not that of a second inference,
+            or ranks are not uniform; "stop" where it excludes what others hold or is
+            too narrow.
+        reasons: For it, a sentence each.
+        parameter_names: One a parameter; the last of the figures is the joint density.
+        beyond: Nats by which refits, at their own draws, exceed the belief; one a
+            refit, the belief is too narrow or elsewhere.
+        within: The same at the belief's draws: it is too wide, or elsewhere.
+        spread: Standard deviation of the normal scores of the ranks, one a parameter
+            and one for the density: 1 where right, more for too narrow.
+        spread_interval: Of that, 95 %.
+        shift: Mean of the scores, alike.
+        p_value: Of spread and shift together, alike.
+        num_repeats: Repeats of posterior SBC.
+        num_simulations: Rows of new outcomes.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+    beyond: tuple[float, ...]
+    within: tuple[float, ...]
+    spread: tuple[float, ...]
+    spread_interval: tuple[tuple[float, float], ...]
+    shift: tuple[float, ...]
+    p_value: tuple[float, ...]
+    num_repeats: int
+    num_simulations: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all figures, in a form that JSON can hold."""
+        return {
+            name: [*value] if isinstance(value, tuple) else value
+            for name, value in asdict(self).items()
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{self.verdict}: {self.num_repeats} repeats around the belief"]
+        lines += [f"- {reason}" for reason in self.reasons]
+        if self.beyond:
+            pairs = zip(self.beyond, self.within, strict=True)
+            texts = [f"{a:.2f} and {b:.2f}" for a, b in pairs]
+            lines.append(f"  refits differ by {'; '.join(texts)} nats")
+        names = (*self.parameter_names, "density")
+        for k in range(len(self.spread)):
+            low, high = self.spread_interval[k]
+            lines.append(
+                f"  {names[k]}: scores spread {self.spread[k]:.2f} ({low:.2f} to "
+                f"{high:.2f}), shift {self.shift[k]:.2f}, p = {self.p_value[k]:.2g}"
+            )
+        return "\n".join(lines)
+
+
+def check_belief(
+    inference: Any,
+    simulator: Callable[..., Any] | None = None,
+    *,
+    num_repeats: int = 40,
+    num_copies: int = 6,
+    num_refits: int = 2,
+    num_posterior_samples: int = 200,
+    refinement: RefinementOptions | None = None,
+    belief: Distribution | None = None,
+    infer: Infer | None = None,
+    level: float = 0.02,
+    seed: int = 0,
+) -> BeliefCheck:
+    """Return whether a refined belief is right, by refits and posterior SBC.
+
+    Each repeat costs an inference; with ``num_repeats=0`` only the refits are made,
+    which find most accidents at the price of two.
+
+    Args:
+        inference: A trainer or a campaign after at least one trial.
+        simulator: None takes the campaign's.
+        num_repeats: Inferences of simulated trials; 0, or at least 10.
+        num_copies: New outcomes of each executed action in a repeat.
+        num_refits: Inferences of the same trials with other seeds.
+        num_posterior_samples: Draws that a repeat's parameters are ranked among.
+        refinement: None takes the campaign's settings, or the defaults.
+        belief: To be judged; None takes the current one.
+        infer: ``infer(action, x, seed)`` gives a belief; None refines.
+        level: Probability that ranks alone flag a right belief, at most.
+        seed: Of everything random here.
+
+    Raises:
+        ValueError: If there is no trial, no simulator, or sizes are too small.
+    """
+    if num_repeats and (num_repeats < 10 or num_copies < 1):
+        raise ValueError(
+            f"expected num_repeats 0 or at least 10, num_copies at least 1; got "
+            f"{num_repeats} and {num_copies}; use 40 and 6"
+        )
+    if num_repeats == 0 and num_refits < 1:
+        raise ValueError("expected repeats or refits; got neither; pass num_refits=2")
+    prior, trials = _given(inference)
+    if is_campaign(inference):
+        simulator = inference.simulator if simulator is None else simulator
+        own = inference.state.options.refinement
+        refinement = own if refinement is None else refinement
+    if simulator is None or not trials:
+        raise ValueError(
+            "expected a simulator and at least one trial; got "
+            f"{'no simulator' if simulator is None else 'no trial'}; pass simulator, "
+            "and check a belief after its first update"
+        )
+    belief = inference.belief if belief is None else belief
+    assert belief is not None
+    action = torch.stack([t.action for t in trials])
+    x = torch.stack([t.x for t in trials])
+    if infer is None:
+        infer = _refinement(simulator, prior, refinement)
+    refits = [
+        _compare(belief, infer(action, x, derive_seed(seed, "refit", r)), seed)
+        for r in range(num_refits)
+    ]
+    scores = np.zeros((0, 0))
+    if num_repeats:
+        scores = _scores(
+            *(belief, simulator, infer, action, x),
+            sizes=(num_repeats, num_copies, num_posterior_samples),
+            seed=seed,
+        )
+    names = getattr(simulator, "parameter_names", None)
+    names = names_of(belief, belief.event_shape[0]) if names is None else names
+    return _judge((*names,), refits, scores, level, len(x) * num_copies * num_repeats)
+
+
+def _given(inference: Any) -> tuple[Distribution, Sequence[Any]]:
+    """Return the prior and the trials behind a belief."""
+    if is_campaign(inference):
+        return inference.prior, inference.state.explained
+    if not hasattr(inference, "trials"):
+        raise TypeError(
+            f"expected a trainer or a campaign; got {type(inference).__name__}; pass "
+            "inference, whose update gave the belief"
+        )
+    return inference._prior, inference.trials
+
+
+def _refinement(
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    settings: RefinementOptions | None,
+) -> Infer:
+    def infer(action: Tensor, x: Tensor, seed: int) -> Distribution:
+        return refine(simulator, prior, action, x, settings=settings, seed=seed)
+
+    return infer
+
+
+def _compare(
+    belief: Distribution, other: Distribution, seed: int
+) -> tuple[float, float]:
+    """Return E[log other - log belief] at the other's draws, and the reverse."""
+    with forked_generators(derive_seed(seed, "compare")):
+        there = other.sample(torch.Size([NUM_COMPARED])).float()
+        here = belief.sample(torch.Size([NUM_COMPARED])).float()
+
+    def excess(a: Distribution, b: Distribution, theta: Tensor) -> float:
+        gap = (smooth(a, theta) - smooth(b, theta)).nan_to_num(nan=0.0, posinf=DEEPEST)
+        return float(gap.clamp(-DEEPEST, DEEPEST).mean())
+
+    return excess(other, belief, there), excess(belief, other, here)
+
+
+def _scores(
+    belief: Distribution,
+    simulator: Callable[..., Any],
+    infer: Infer,
+    action: Tensor,
+    x: Tensor,
+    *,
+    sizes: tuple[int, int, int],
+    seed: int,
+) -> np.ndarray:
+    """Return normal scores of the ranks of parameters and density, (repeats, d + 1)."""
+    num, copies, num_draws = sizes
+    with forked_generators(derive_seed(seed, "truths")):
+        truths = belief.sample(torch.Size([num])).float()
+    new = action.repeat(copies, 1)
+    scores = []
+    for k, theta in enumerate(truths):
+        rows = simulate(
+            simulator,
+            theta.expand(len(new), -1),
+            new,
+            seed=derive_seed(seed, "new", k),
+        ).without_missing()
+        after = infer(
+            torch.cat([action, rows.action.to(action)]),
+            torch.cat([x, rows.x.to(x)]),
+            derive_seed(seed, "repeat", k),
+        )
+        with forked_generators(derive_seed(seed, "rank", k)):
+            draws = after.sample(torch.Size([num_draws])).float()
+            ties = np.random.random(len(theta) + 1)
+        values = torch.cat([draws, smooth(after, draws)[:, None]], 1).double()
+        own = torch.cat([theta, smooth(after, theta[None])]).double()
+        below = (values < own).sum(0).numpy() + ties * (values == own).sum(0).numpy()
+        scores.append(norm.ppf((below + 0.5) / (num_draws + 1)))
+    return np.stack(scores)
+
+
+def _judge(
+    names: tuple[str, ...],
+    refits: Sequence[tuple[float, float]],
+    scores: np.ndarray,
+    level: float,
+    num_simulations: int,
+) -> BeliefCheck:
+    dim, found = len(names), list[tuple[Verdict, str]]()
+    beyond = tuple(a for a, _ in refits)
+    within = tuple(b for _, b in refits)
+    if refits:
+        nearest = min(range(len(refits)), key=lambda r: max(refits[r]))
+        a, b = refits[nearest]
+        text = (
+            f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
+        )
+        if a > EXCLUDED * dim:
+            found.append(("stop", f"{text}; it is too narrow or lost a mode"))
+        elif max(a, b) > DIFFERENT * dim:
+            found.append(("refine", f"{text}; raise num_histories"))
+        elif max(max(pair) for pair in refits) > 2 * DIFFERENT * dim:
+            found.append(
+                (
+                    "refine",
+                    "two inferences of the same trials differ; raise num_histories",
+                )
+            )
+    n, is_other = len(scores), bool(found)
+    spread, shift, p_value, ends = [], [], [], []
+    labels = (*names, "the density")
+    for k in range(scores.shape[1] if n else 0):
+        z = scores[:, k]
+        total = float((z**2).sum())
+        tail = min(2 * min(chi2.sf(total, n), chi2.cdf(total, n)), 1.0)
+        side = 2 * float(norm.sf(abs(z.mean()) * n**0.5))
+        spread.append(float((total / n) ** 0.5))
+        shift.append(float(z.mean()))
+        p_value.append(float(min(2 * min(tail, side), 1.0)))
+        quantiles = chi2.ppf([0.975, 0.025], n)
+        ends.append(tuple(float((total / q) ** 0.5) for q in quantiles))
+        if p_value[k] < level / (dim + 1):
+            text = f"ranks of {labels[k]} in repeats are not uniform (p = "
+            text += f"{p_value[k]:.1g})"
+            # The truth of a wide belief lies where the density is high.
+            wide = shift[k] > 0 if k == dim else spread[k] < 1
+            if is_other:  # of the belief and the repeats, which is wrong?
+                found.append(("refine", text))
+            else:
+                word = "wide" if wide else "narrow"
+                text += f": beliefs are too {word} or misplaced"
+                found.append(("refine" if wide else "stop", text))
+    return BeliefCheck(
+        verdict=worst([v for v, _ in found]),
+        reasons=(*(text for _, text in found),),
+        parameter_names=names,
+        beyond=beyond,
+        within=within,
+        spread=(*spread,),
+        spread_interval=(*ends,),
+        shift=(*shift,),
+        p_value=(*p_value,),
+        num_repeats=n,
+        num_simulations=num_simulations,
+    )

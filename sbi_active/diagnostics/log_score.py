@@ -1,0 +1,154 @@
+r"""The log-score gap: what a posterior loses against the right one, in nats.
+
+.. math::
+    G = E\big[\log p(\theta | x, \xi) - \log q(\theta | x, \xi)\big]
+      = E\,\mathrm{KL}(p \| q) \ge 0
+
+Ranks and coverage are uniform for the prior itself, whatever x says; G is not zero for
+it. It is also the expected information gain less the network's own bound on it.
+
+With declared noise, :math:`p(\theta | x) = b(\theta) p(x | \theta) / Z`. Z comes from
+importance sampling with the truth among the draws, which makes Z too large on average
+and G a lower bound. Otherwise a classifier tells truths from draws of q, and bounds the
+same divergence from below on rows that it was not trained on.
+
+References:
+    Foster et al., AISTATS 2020, arXiv:1911.00294 (bounds with a proposal); Nguyen,
+    Wainwright & Jordan, IEEE Trans. Inf. Theory 2010 (the bound by a classifier);
+    Linhart et al., NeurIPS 2023, arXiv:2306.03580 (classifiers as a local check).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from sbi.utils.sbiutils import within_support
+from sklearn.ensemble import HistGradientBoostingClassifier
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import SimulatorModel, simulate
+
+LARGEST = 6.0  # of a classifier's log ratio: what thousands of rows can tell
+
+
+def smooth(belief: Distribution, theta: Tensor) -> Tensor:
+    """Return a belief's log density without simulations, (..., d) -> (...)."""
+    log_prob: Any = getattr(belief, "smooth_log_prob", belief.log_prob)
+    inside = within_support(belief, theta.reshape(-1, theta.shape[-1]))
+    value = log_prob(theta).double()
+    return torch.where(inside.reshape(theta.shape[:-1]), value, -torch.inf)
+
+
+def gap_by_likelihood(
+    simulator: SimulatorModel,
+    belief: Distribution,
+    theta: Tensor,
+    action: Tensor,
+    x: Tensor,
+    log_q: Callable[[Tensor], Tensor],
+    draws: Tensor,
+    *,
+    num_contrastive: int,
+    seed: int,
+) -> Tensor:
+    r"""Return :math:`\log p(\theta|x,\xi) - \log q`, on average a lower bound.
+
+    Args:
+        simulator: With declared noise.
+        belief: Of theta before x.
+        theta: Truths, shape (n, d).
+        action: Shape (n, action_dim).
+        x: Shape (n, *x_shape).
+        log_q: Log density of rows of draws, (m, n, d) -> (m, n).
+        draws: Of q, shape (m, n, d).
+        num_contrastive: Draws of q and of the belief, as many of each.
+        seed: Of the belief's draws.
+
+    Returns:
+        Shape (n,), nats.
+    """
+    n, m = len(theta), num_contrastive
+    with forked_generators(derive_seed(seed, "contrast")):
+        other = belief.sample(torch.Size([m * n])).reshape(m, n, -1).float()
+    rows = torch.cat([theta[None], draws[:m], other])
+    with torch.no_grad():
+        q = log_q(rows).double()
+    b = smooth(belief, rows)
+    finite = b.isfinite()
+    likelihood = torch.full(b.shape, -torch.inf, dtype=torch.float64)
+    pairs = rows[finite], action.expand(len(rows), *action.shape)[finite]
+    seen = x.expand(len(rows), *x.shape)[finite]
+    bare = simulator.without_noise()
+    mean = simulate(bare, *pairs, seed=derive_seed(seed, "mean")).x.double()
+    likelihood[finite] = noise_log_prob(simulator, seen.double(), mean)
+    proposal = torch.logaddexp(q, b) - math.log(2)
+    log_weight = (likelihood + b - proposal).nan_to_num(nan=-torch.inf)
+    log_z = log_weight.logsumexp(0) - math.log(len(rows))
+    return likelihood[0] + b[0] - q[0] - log_z
+
+
+def noise_log_prob(simulator: SimulatorModel, x: Tensor, mean: Tensor) -> Tensor:
+    """Return log p(x | mean), shape (n,); where one alone is NaN it is impossible."""
+    assert simulator.noise is not None
+    value = simulator.noise.log_prob(x, mean.nan_to_num(0.0)).double()
+    agrees = (x.isnan() == mean.isnan()).flatten(1).all(1)
+    nothing = x.isnan().flatten(1).all(1)
+    return torch.where(agrees, torch.where(nothing, 0.0, value), -torch.inf)
+
+
+def gap_by_classifier(
+    theta: Tensor, condition: Tensor, draws: Tensor, log_q: Any, *, seed: int
+) -> Tensor:
+    r"""Return terms of a lower bound on the gap, by a classifier trained on half.
+
+    .. math::
+        G \ge E_p[T] - E_q[e^T] + 1
+
+    with T the classifier's log ratio of truths over draws of q.
+
+    Args:
+        theta: Truths, shape (n, d).
+        condition: Packed (x, action), shape (n, c).
+        draws: Of q, shape (m, n, d), at least three.
+        log_q: As in :func:`gap_by_likelihood`.
+        seed: Of the halves and the classifier.
+
+    Returns:
+        Shape (n,), nats.
+    """
+    center = draws.mean(0)
+    spread = draws.std(0).clamp_min(1e-12)
+
+    def features(rows: Tensor) -> np.ndarray:
+        with torch.no_grad():
+            density = log_q(rows[None])[0]
+        parts = [condition, (rows - center) / spread, rows, density[:, None]]
+        return torch.cat(parts, 1).double().numpy()
+
+    true, false = features(theta), [features(d) for d in draws[:2]]
+    half = np.random.default_rng(derive_seed(seed, "half")).permutation(len(theta)) % 2
+    terms = np.zeros(len(theta))
+    for k in (0, 1):
+        on, off = half != k, half == k
+        model = HistGradientBoostingClassifier(
+            max_iter=60, max_depth=4, early_stopping=True, random_state=k
+        )
+        model.fit(
+            np.concatenate([true[on], false[0][on]]),
+            np.repeat([1, 0], int(on.sum())),
+        )
+        p, *q = (_log_ratio(model, f[off]) for f in (true, *false))
+        terms[off] = p - np.mean([np.exp(v) for v in q], 0) + 1
+    return torch.from_numpy(terms)
+
+
+def _log_ratio(model: Any, rows: np.ndarray) -> np.ndarray:
+    probability = model.predict_proba(rows)[:, 1]
+    ratio = np.log(probability) - np.log1p(-probability)
+    return np.clip(ratio, -LARGEST, LARGEST)

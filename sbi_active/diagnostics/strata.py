@@ -1,0 +1,57 @@
+"""Groups of actions that are judged apart."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import torch
+from sklearn.cluster import KMeans
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace
+from sbi_active.seeding import derive_seed
+
+
+def stratified_actions(
+    space: ActionSpace, num_rows: int, max_strata: int, *, seed: int
+) -> tuple[Tensor, Tensor, list[str]]:
+    """Return actions, the group of each, and what the groups are called.
+
+    Up to ``max_strata`` listed actions are a group each, with as many rows; of more
+    actions, or of a continuum, neighbors are put together.
+
+    Args:
+        space: Of actions.
+        num_rows: Rows n.
+        max_strata: Groups at most.
+        seed: Of draws and groups.
+
+    Returns:
+        Actions (n, action_dim), labels (n,) int64, and a name a group.
+    """
+    listed = space.listed()
+    if listed is not None and len(listed) <= max_strata:
+        label = torch.arange(num_rows) % len(listed)
+        return listed[label], label, [_name(space, row) for row in listed]
+    action = space.sample((num_rows,), seed=derive_seed(seed, "action"))
+    if listed is not None:  # each of them as often
+        order = np.random.default_rng(derive_seed(seed, "order"))
+        rounds = math.ceil(num_rows / len(listed))
+        rows = np.concatenate([order.permutation(len(listed)) for _ in range(rounds)])
+        action = listed[torch.from_numpy(rows[:num_rows])]
+    scale = action.double().std(0).clamp_min(1e-12)
+    places = (action.double() / scale).numpy()
+    groups = min(max_strata, len(np.unique(places, axis=0)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        means = KMeans(groups, n_init=4, random_state=derive_seed(seed, "k") % 2**31)
+        label = torch.from_numpy(means.fit_predict(places).astype(np.int64))
+    names = [f"near {_name(space, action[label == k].mean(0))}" for k in range(groups)]
+    return action, label, names
+
+
+def _name(space: ActionSpace, action: Tensor) -> str:
+    cells = zip(space.names, action.tolist(), space.units, strict=True)
+    return ", ".join(f"{n} {v:.3g}{' ' + u if u else ''}" for n, v, u in cells)

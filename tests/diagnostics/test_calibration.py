@@ -1,0 +1,211 @@
+import json
+from types import SimpleNamespace
+
+import matplotlib
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import (
+    ASBI,
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    SimulatorModel,
+)
+from sbi_active.diagnostics import check_belief, check_calibration
+from sbi_active.diagnostics.verdict import clopper_pearson, ks_distance
+from sbi_active.inference import ActionPosterior
+from sbi_active.seeding import forked_generators
+
+matplotlib.use("Agg")
+PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))
+ACTIONS = DiscreteActions([0.5, 1.0, 2.0], names=["gain"])
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.2))
+
+
+class Exact:
+    """The exact posterior without the edges, changed at one action."""
+
+    def __init__(self, factor=1.0, at=None):
+        self.factor, self.at = factor, at
+
+    def parts(self, condition):
+        x, action = condition[:, :1], condition[:, 1:]
+        sd = 0.2 / action
+        if self.at is not None:
+            wrong = (action - self.at).abs() < 1e-4
+            sd = torch.where(wrong, self.factor * sd, sd)
+        else:
+            sd = self.factor * sd
+        return torch.distributions.Normal(x / action, sd)
+
+    def log_prob(self, theta, condition):
+        return self.parts(condition).log_prob(theta).sum(-1)
+
+    def sample(self, shape, condition):
+        return self.parts(condition).sample(shape)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    settings = MixtureDensity(hidden_features=(16,), num_iterations=10)
+    with forked_generators(0):
+        inference = ASBI(PRIOR, density_estimator=settings)
+        theta, action = PRIOR.sample((500,)), ACTIONS.sample((500,))
+        inference.append_simulations(theta, MODEL(theta, action), action=action)
+        inference.train()
+    return inference
+
+
+def with_network(trained, network):
+    posterior = trained.build_posterior()
+    packed = posterior.packed()
+    network.input_shape = torch.Size([1])
+    network.condition_shape = torch.Size([2])
+
+    class Module(torch.nn.Module):
+        input_shape, condition_shape = torch.Size([1]), torch.Size([2])
+        log_prob = staticmethod(network.log_prob)
+        sample = staticmethod(network.sample)
+
+    packed.posterior_estimator = Module()
+    return ActionPosterior(packed, posterior.x_shape, posterior.action_dim)
+
+
+def test_a_right_network_is_trusted_and_a_wrong_one_flagged(trained):
+    right = check_calibration(
+        with_network(trained, Exact()), MODEL, actions=ACTIONS, num_simulations=600
+    )
+    assert right.verdict == "trust"
+    assert not right.flagged
+    assert abs(right.overall.gap) < 0.1
+    narrow = check_calibration(
+        with_network(trained, Exact(0.4, at=1.0)),
+        MODEL,
+        actions=ACTIONS,
+        num_simulations=600,
+    )
+    assert narrow.flagged == ["gain 1"]
+    assert narrow.verdict == "stop"
+
+
+def test_a_blunt_network_passes_ranks_and_not_the_gap(trained):
+    class Blunt(Exact):
+        def parts(self, condition):
+            low = -torch.ones(len(condition), 1)
+            return torch.distributions.Uniform(low, -low, validate_args=False)
+
+    for gap in ("likelihood", "classifier"):
+        found = check_calibration(
+            with_network(trained, Blunt()),
+            MODEL,
+            actions=ACTIONS,
+            num_simulations=600,
+            gap=gap,
+        )
+        assert found.verdict == "refine"
+        assert "blunt" in found.reasons[0]
+        low, high = found.overall.coverage_interval[0.9]
+        assert low < 0.9 < high
+
+
+def test_a_result_says_itself(trained):
+    found = check_calibration(
+        trained, MODEL, actions=ACTIONS, num_simulations=150, parameter_names=["k"]
+    )
+    assert json.loads(json.dumps(found.to_dict()))["verdict"] == found.verdict
+    assert str(found).startswith(found.verdict)
+    assert len(found.plot().axes) == 4
+    assert found.label.max() == 2
+    again = check_calibration(
+        trained, MODEL, actions=ACTIONS, num_simulations=150, parameter_names=["k"]
+    )
+    assert again.to_dict() == found.to_dict()
+
+
+def test_bad_input_is_an_error(trained):
+    with pytest.raises(ValueError, match="expected a simulator and actions"):
+        check_calibration(trained, MODEL)
+    with pytest.raises(ValueError, match="at least 100"):
+        check_calibration(trained, MODEL, actions=ACTIONS, num_simulations=50)
+    with pytest.raises(TypeError, match="got str"):
+        check_calibration("network", MODEL, actions=ACTIONS)
+
+    def noisy(theta, action):
+        return theta * action + torch.randn_like(theta)
+
+    with pytest.raises(ValueError, match="declares its noise"):
+        check_calibration(trained, noisy, actions=ACTIONS, gap="likelihood")
+
+
+def test_intervals():
+    assert clopper_pearson(0, 10, 0.05) == pytest.approx((0, 0.3085), abs=1e-3)
+    assert ks_distance(torch.linspace(0.05, 0.95, 10).numpy()) == pytest.approx(0.05)
+
+
+class Normal(torch.distributions.MultivariateNormal):
+    """A belief in closed form."""
+
+
+def gaussian(action, x, factor=1.0):
+    precision = 1e-4 + (action**2).sum() / 0.04
+    mean = (action * x).sum() / 0.04 / precision
+    return Normal(mean.reshape(1), factor**2 / precision.reshape(1, 1))
+
+
+@pytest.mark.parametrize(
+    ("own", "every", "verdicts"),
+    [
+        (1.0, 1.0, ("trust",)),
+        (2.0, 1.0, ("refine",)),
+        (0.5, 1.0, ("stop", "refine")),
+        (2.0, 2.0, ("refine",)),
+        (0.5, 0.5, ("stop",)),
+    ],
+)
+def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
+    action = torch.tensor([[1.0], [2.0]])
+    x = torch.tensor([[0.4], [0.9]])
+    prior = Normal(torch.zeros(1), 1e4 * torch.eye(1))
+    trials = [SimpleNamespace(action=a, x=v) for a, v in zip(action, x, strict=True)]
+    belief = gaussian(action, x, own)
+    inference = SimpleNamespace(trials=trials, belief=belief, _prior=prior)
+    found = check_belief(
+        inference, MODEL, infer=lambda a, x, _: gaussian(a, x, every), num_repeats=60
+    )
+    assert found.verdict in verdicts, found
+    assert json.dumps(found.to_dict())
+    assert str(found).startswith(found.verdict)
+
+
+def test_rounds_a_continuum_of_actions_and_invalid_rows(trained):
+    space = BoxActions([0.5], [2.0], names=["gain"])
+
+    def fails(theta, action):
+        x = theta * action
+        return torch.where(action > 1.8, torch.nan, x)
+
+    model = SimulatorModel(fails, noise=GaussianNoise(0.2))
+    posterior = with_network(trained, Exact())
+    found = check_calibration(
+        [posterior, posterior], model, actions=space, num_simulations=200, max_strata=3
+    )
+    assert [s.round for s in found.strata] == [1, 1, 1, 2, 2, 2]
+    assert found.strata[-1].name.startswith("round 2, near gain")
+    assert found.num_invalid > 10
+    assert len(found.ranks) + found.num_invalid == 400
+    assert found.verdict == "trust"
+
+
+def test_a_check_leaves_the_generators_and_the_rows_alone(trained):
+    before = torch.random.get_rng_state()
+    posterior = trained.build_posterior()
+    found = [
+        check_calibration(posterior, MODEL, actions=ACTIONS, num_simulations=150)
+        for _ in range(2)
+    ]
+    assert (found[0].ranks == found[1].ranks).all()
+    assert (torch.random.get_rng_state() == before).all()
+    assert found[0].verdict != "trust" or found[0].overall.lost < 0.4
