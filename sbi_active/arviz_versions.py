@@ -77,7 +77,8 @@ def inference_data(groups: Groups) -> Any:
     """Return InferenceData, or from ArviZ 1.0 on a DataTree."""
     if int(az.__version__.split(".")[0]) >= 1:
         return data_tree(groups)
-    return az.InferenceData(**groups.datasets())
+    datasets: dict[str, Any] = groups.datasets()
+    return az.InferenceData(**datasets)
 
 
 def pareto_smoothed(

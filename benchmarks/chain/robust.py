@@ -15,6 +15,7 @@ import time
 import warnings
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 
@@ -96,7 +97,7 @@ def main() -> None:
     )
     print(table.to_string())
     for case in ("gross", "clean"):
-        gain = (table[case]["robust"] - table[case]["plain"]).median()
+        gain = np.nanmedian(table[case]["robust"] - table[case]["plain"])
         print(
             f"{case}: median gain of log p(truth) {gain:.2f} nats, {len(table)} seeds"
         )

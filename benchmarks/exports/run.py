@@ -94,7 +94,7 @@ def main() -> None:
     read_nc: Any = xr.open_datatree if IS_NEW else az.from_netcdf
     read_zarr: Any = xr.open_datatree if IS_NEW else az.from_zarr
     ppc: Any = getattr(az, "plot_ppc_dist" if IS_NEW else "plot_ppc")
-    theta = {"var_names": ["theta"]}
+    theta: dict[str, Any] = {"var_names": ["theta"]}
     calls: dict[str, Callable[[], Any]] = {
         "summary": lambda: az.summary(data),
         "rhat": lambda: az.rhat(data),

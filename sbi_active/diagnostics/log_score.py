@@ -136,8 +136,9 @@ def gap_by_classifier(
     terms = np.zeros(len(theta))
     for k in (0, 1):
         on, off = half != k, half == k
+        options: Any = {"early_stopping": True}
         model = HistGradientBoostingClassifier(
-            max_iter=60, max_depth=4, early_stopping=True, random_state=k
+            max_iter=60, max_depth=4, random_state=k, **options
         )
         model.fit(
             np.concatenate([true[on], false[0][on]]),

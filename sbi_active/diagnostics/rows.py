@@ -31,7 +31,9 @@ class RowPosterior(DirectPosterior):
         assert isinstance(made, cls)
         return made, index
 
-    def sample_batched(self, sample_shape: Any, x: Tensor, **_: Any) -> Tensor:
+    def sample_batched(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, sample_shape: Any, x: Tensor, **_: Any
+    ) -> Tensor:
         """Return draws given each row, shape (m, n, theta_dim)."""
         num = torch.Size(sample_shape).numel()
         network: Any = self.posterior_estimator

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,7 +47,10 @@ def stratified_actions(
     groups = min(max_strata, len(np.unique(places, axis=0)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        means = KMeans(groups, n_init=4, random_state=derive_seed(seed, "k") % 2**31)
+        starts: Any = 4
+        means = KMeans(
+            groups, n_init=starts, random_state=derive_seed(seed, "k") % 2**31
+        )
         label = torch.from_numpy(means.fit_predict(places).astype(np.int64))
     names = [f"near {_name(space, action[label == k].mean(0))}" for k in range(groups)]
     return action, label, names

@@ -10,6 +10,7 @@ import numpy as np
 import pyro
 import torch
 from pyro import poutine
+from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal, StudentT, constraints
 
@@ -141,7 +142,7 @@ def from_pyro(
         for name, size in zip(first, prior.sizes, strict=True)
         for i in range(size)
     ]
-    noise = _noise([trace.nodes[outcome]["fn"] for trace in traces])
+    noise = _noise([_node(trace, outcome)["fn"] for trace in traces])
     function = _Row(model, first, prior.sizes, outcome, noise is not None)
     simulator = SimulatorModel(
         function, noise=noise, batched=False, parameter_names=names
@@ -172,8 +173,12 @@ class _Row:
         with forked_generators(int(rng.integers(2**62))), torch.no_grad():
             model = pyro.condition(self.model, data=data)
             trace = poutine.trace(model).get_trace(torch.as_tensor(action).float())
-        node = trace.nodes[self.outcome]
+        node = _node(trace, self.outcome)
         return (node["fn"].mean if self.is_mean else node["value"]).reshape(-1).numpy()
+
+
+def _node(trace: Any, site: str) -> dict[str, Any]:
+    return trace.nodes[site]
 
 
 def _latent(trace: Any, outcome: str) -> dict[str, Distribution]:
@@ -183,7 +188,7 @@ def _latent(trace: Any, outcome: str) -> dict[str, Distribution]:
         if node["type"] == "sample"
         and not node["is_observed"]
         and name != outcome
-        and not isinstance(node["fn"], poutine.subsample_messenger._Subsample)
+        and not isinstance(node["fn"], _Subsample)
     }
 
 

@@ -87,7 +87,8 @@ class Pool:
         self._restore()
         if len(self._rows) > 1:  # once joined they stay so
             parts = [(r.theta, r.action, r.x, r.status) for r in self._rows]
-            self._rows = [Simulations(*map(torch.cat, zip(*parts, strict=True)))]
+            theta, action, x, status = map(torch.cat, zip(*parts, strict=True))
+            self._rows = [Simulations(theta, action, x, status)]
             self._log_proposal = [torch.cat(self._log_proposal)]
         return self._rows[0]
 

@@ -89,7 +89,7 @@ class BridgedBelief(SimulatedBelief):
         theta = super()._sample(num_samples)
         if self.free.any():
             fresh = self.prior.sample(torch.Size([num_samples])).to(theta)
-            theta[:, self.free] = fresh[:, self.free]
+            theta = torch.where(torch.from_numpy(self.free), fresh, theta)
         return theta
 
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:

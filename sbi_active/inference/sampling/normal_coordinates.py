@@ -95,7 +95,7 @@ class NormalCoordinates:
         mixed = torch.where(mask, a, b), torch.where(mask, b, a)
         prior = self.base.prior
         apart, together = (
-            sum(prior.log_prob(part).double() for part in parts)
+            torch.stack([prior.log_prob(part).double() for part in parts]).sum(0)
             for parts in (mixed, (a, b))
         )
         return bool(torch.allclose(apart, together, rtol=1e-4, atol=1e-3))
