@@ -181,7 +181,7 @@ def summary(path: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
-    parser.add_argument("--seeds", type=int, nargs=2, default=[2100, 2140])
+    parser.add_argument("--seeds", type=int, nargs=2, default=[2200, 2240])
     parser.add_argument("--references", type=int, default=2)
     parser.add_argument("--campaign", action="store_true")
     parser.add_argument("--summary", action="store_true")

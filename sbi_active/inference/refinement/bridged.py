@@ -42,7 +42,8 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
 
-PER_PARAMETER = 0.4  # times num_effective: particles a parameter
+PER_PARAMETER = 0.8  # times num_effective: particles a parameter
+WIDTHS = ((1.0, 0.4), (2.0, 0.3), (3.0, 0.3))  # of the guess, and their weights
 FEWEST = 400  # particles
 FEW = 4  # parameters up to which three times the histories are enough
 REMEMBERED = 0.3  # correlation of particles with where they began that is too much
@@ -244,10 +245,12 @@ def _bridged(
     """Return particles of all parameters; only those that trials inform are moved."""
     guess, axes = laplace.guess, np.flatnonzero(~free)
     cov = guess.factors @ np.swapaxes(guess.factors, 1, 2)
+    factors = np.linalg.cholesky(cov[:, axes[:, None], axes])
+    # Tails that bend away from the normal of a mode are out of its own reach.
     own = NormalMixture(
-        guess.weights,
-        guess.means[:, axes],
-        np.linalg.cholesky(cov[:, axes[:, None], axes]),
+        np.concatenate([guess.weights * weight for _, weight in WIDTHS]),
+        np.concatenate([guess.means[:, axes]] * len(WIDTHS)),
+        np.concatenate([factors * width for width, _ in WIDTHS]),
     )
     rest = np.zeros((1, coordinates.dim))
 
