@@ -1,6 +1,6 @@
 """Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
 
-    python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2100 2140
+    python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2200 2240
     python -m benchmarks.chain.run --references 2   # first seeds with a reference
     python -m benchmarks.chain.run --campaign      # CPU time of a round, chosen actions
     python -m benchmarks.chain.run --summary
