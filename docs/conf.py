@@ -31,6 +31,7 @@ extensions = [
     "mathml",
     "outside",
     "reference",
+    "results",
 ]
 exclude_patterns = ["_build", "_ext", "conf.py", "**/__pycache__", "**/README*"]
 templates_path = ["_templates"]
