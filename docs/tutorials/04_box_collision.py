@@ -36,5 +36,20 @@ campaign.plot(theta_true=task.theta_true, num_predicted=16)
 print(belief.diagnostics)
 
 # %% [markdown]
-# `sbi_active.tasks.box_collision.render.render(theta, action, "push.gif")` draws a push
-# as an animation, where there is a display or an offscreen renderer.
+# The first push, as the belief's mean has it. A picture is drawn where there is a display
+# or an offscreen renderer (EGL or OSMesa); the text of the error names what to install.
+
+# %% mystnb={"image": {"alt": "Animation of a pusher that drives one box into another"}}
+import tempfile
+from pathlib import Path
+
+from IPython.display import HTML, Image
+from sbi_active.tasks.box_collision import render
+
+path = Path(tempfile.mkdtemp()) / "push.gif"
+try:
+    render(belief.mean, campaign.history[0].action, path)
+    shown = Image(path)
+except RuntimeError as error:
+    shown = HTML(f"<p>No picture here: {str(error).split(';')[0]}</p>")
+shown
