@@ -2,12 +2,12 @@
 # # Box collision in MuJoCo
 #
 # The paper's robot experiment: a box is pushed into another one, and friction and mass
-# are to be found from where the boxes come to rest. The simulator is MuJoCo, the "real"
-# system the same with hidden parameters.
+# are to be found from where the boxes come to rest. The simulator is MuJoCo, the
+# "real" system the same with hidden parameters.
 #
 # Reduced sizes: two trials with few simulations, some seconds. The committed result,
-# ten campaigns a target with six trials each, stands in
-# [box collision](../benchmarks.md#box-collision).
+# ten campaigns a target with six trials each, stands in [box
+# collision](../benchmarks.md#box-collision).
 
 # %%
 from sbi_active import Campaign, CampaignOptions
@@ -29,21 +29,23 @@ print(belief)
 # %%
 campaign.plot(theta_true=task.theta_true, num_predicted=16)
 # %% [markdown]
-# What limits the belief is said with it. Two pushes determine the density and leave the
-# two frictions wide; six do more, see the committed result.
+# What limits the belief is said with it. Two pushes determine the density and leave
+# the two frictions wide; six do more, see the committed result.
 
 # %%
 print(belief.diagnostics)
 
 # %% [markdown]
-# The first push, as the belief's mean has it. A picture is drawn where there is a display
-# or an offscreen renderer (EGL or OSMesa); the text of the error names what to install.
+# The first push, as the belief's mean has it. A picture is drawn where there is a
+# display or an offscreen renderer (EGL or OSMesa); the text of the error names what to
+# install.
 
 # %% mystnb={"image": {"alt": "Animation of a pusher that drives one box into another"}}
 import tempfile
 from pathlib import Path
 
 from IPython.display import HTML, Image
+
 from sbi_active.tasks.box_collision import render
 
 path = Path(tempfile.mkdtemp()) / "push.gif"
@@ -51,5 +53,5 @@ try:
     render(belief.mean, campaign.history[0].action, path)
     shown = Image(path)
 except RuntimeError as error:
-    shown = HTML(f"<p>No picture here: {str(error).split(';')[0]}</p>")
+    shown = HTML(f"<p>No picture here: {error}</p>")
 shown

@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Pouring in PyBullet, summaries as actions
 #
-# The paper's second robot task: a bucket of cubes is poured on the ground, and friction,
-# rolling friction and restitution are to be found from a depth image. Which summary of the
-# image the belief rests on is part of what is chosen.
+# The paper's second robot task: a bucket of cubes is poured on the ground, and
+# friction, rolling friction and restitution are to be found from a depth image. Which
+# summary of the image the belief rests on is part of what is chosen.
 #
-# Reduced sizes: five cubes instead of 100, four settings of the bucket instead of 27, a
-# budget of some hundred pours, two trials. What was measured with 100 cubes, and what falls
-# short there, stands in [pouring](../pouring.md).
+# Reduced sizes: five cubes instead of 100, four settings of the bucket instead of 27,
+# a budget of some hundred pours, two trials. What was measured with 100 cubes, and
+# what falls short there, stands in [pouring](../pouring.md).
 
 # %%
 import importlib.util
@@ -44,9 +44,9 @@ if installed:
 
 # %% [markdown]
 # Summaries are functions of raw rows, or objects with `fit` and `transform`, of which
-# copies are fitted to the simulations of a round. `SummaryAction` joins them with what the
-# robot does, and adds an entry to the action, which the simulator leaves aside. It runs
-# once for all summaries, so that the choice costs nothing.
+# copies are fitted to the simulations of a round. `SummaryAction` joins them with what
+# the robot does, and adds an entry to the action, which the simulator leaves aside. It
+# runs once for all summaries, so that the choice costs nothing.
 
 
 # %%
@@ -91,8 +91,8 @@ if installed:
     print(belief)
 
 # %% [markdown]
-# Five cubes and a few hundred pours tell little, and the belief says how far it is to be
-# trusted:
+# Five cubes and a few hundred pours tell little, and the belief says how far it is to
+# be trusted:
 
 # %%
 if installed:

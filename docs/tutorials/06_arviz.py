@@ -51,8 +51,8 @@ az.plot_pair(data, var_names=["theta"], kind="kde", figsize=(5, 4))
 az.plot_ppc(data, num_pp_samples=50, figsize=(6, 3.5))
 
 # %% [markdown]
-# `to_datatree` gives the same as a tree of xarray, which ArviZ 1.x reads and which needs no
-# ArviZ at all:
+# `to_datatree` gives the same as a tree of xarray, which ArviZ 1.x reads and which
+# needs no ArviZ at all:
 
 # %%
 from sbi_active import to_datatree
@@ -63,8 +63,8 @@ tree["posterior"]["theta"].mean(("chain", "draw")).to_series().round(3)
 
 # %% [markdown]
 # Draws of a belief are independent, so that convergence of chains is no question here.
-# `belief.diagnostics` says how many effective draws are behind it and how far it is from
-# that of endless simulations.
+# `belief.diagnostics` says how many effective draws are behind it and how far it is
+# from that of endless simulations.
 #
 # ## Can the network be trusted, and at which actions?
 #
@@ -84,5 +84,5 @@ print(calibration)
 # %%
 calibration.plot()
 # %% [markdown]
-# A network of 300 steps and few rows is quick, and what it loses is said. Refined beliefs
-# are checked by `check_belief`: see [can it be trusted](../trust.md).
+# A network of 300 steps and few rows is quick, and what it loses is said. Refined
+# beliefs are checked by `check_belief`: see [can it be trusted](../trust.md).

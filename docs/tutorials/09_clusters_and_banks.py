@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Clusters, banks, dear simulators
 #
-# Outcomes depend on the seed, the parameters and the action alone: not on the number of
-# workers, nor on whether they are processes here or a cluster. So a run can be moved.
+# Outcomes depend on the seed, the parameters and the action alone: not on the number
+# of workers, nor on whether they are processes here or a cluster. So a run can be
+# moved.
 
 # %%
 import tempfile
@@ -23,8 +24,8 @@ here.counts
 # %% [markdown]
 # ## On a Dask cluster
 #
-# By one line of joblib's configuration. This page starts a cluster of one thread in its
-# own process; yours is `distributed.Client("scheduler:8786")`.
+# By one line of joblib's configuration. This page starts a cluster of one thread in
+# its own process; yours is `distributed.Client("scheduler:8786")`.
 
 # %%
 import distributed
@@ -82,9 +83,9 @@ print(
 # %% [markdown]
 # ## A simulator that takes a minute
 #
-# `max_simulations` is a budget for the whole campaign, never exceeded: belief, designs and
-# scores share one pool of rows, which Gaussian processes interpolate. `planned_trials` is
-# how many trials it is to last for.
+# `max_simulations` is a budget for the whole campaign, never exceeded: belief, designs
+# and scores share one pool of rows, which Gaussian processes interpolate.
+# `planned_trials` is how many trials it is to last for.
 
 # %%
 from sbi_active import Campaign, CampaignOptions, DiscreteActions
@@ -98,5 +99,6 @@ print(campaign.belief)
 print("simulated", campaign.state.meter.spent, "of", options.max_simulations)
 
 # %% [markdown]
-# With `bank="folder"`, `num_workers=8` and `time_limit=600` these rows are kept, run side by
-# side and given up after ten minutes: see [how many](../howto/how_many_simulations.md).
+# With `bank="folder"`, `num_workers=8` and `time_limit=600` these rows are kept, run
+# side by side and given up after ten minutes: see [how
+# many](../howto/how_many_simulations.md).
