@@ -6,6 +6,7 @@ the search lie in the package of the theme, and formulas become MathML.
 
 import os
 import sys
+from ctypes.util import find_library
 from importlib.metadata import version as version_of
 from pathlib import Path
 
@@ -16,6 +17,9 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
     filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")])
 )
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Pictures of MuJoCo without a display; naming EGL where it is not breaks the import.
+if not os.environ.get("DISPLAY") and find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
 
 project = "sbi-active"
 author = "The sbi-active developers"
@@ -31,6 +35,7 @@ extensions = [
     "mathml",
     "outside",
     "reference",
+    "results",
 ]
 exclude_patterns = ["_build", "_ext", "conf.py", "**/__pycache__", "**/README*"]
 templates_path = ["_templates"]

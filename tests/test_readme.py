@@ -170,19 +170,42 @@ def test_getting_started(run, capsys, tmp_path, monkeypatch):
     assert len(page.campaign.history) == 1
 
 
-def test_questions(run, capsys):
-    """The pages of one question each, and what their snippets are to show."""
+def test_question_how_many_simulations(run):
     (enough,) = run("docs/howto/how_many_simulations.md")
     assert 0 < enough.found.num_simulations <= 3_000
+
+
+def test_question_failed_trial(run):
     (failed,) = run("docs/howto/failed_trial.md")
     assert [t.status for t in failed.campaign.history] == ["invalid", "missing"]
     # Off the table, further than 1 m: friction is below what slides as far.
     speed = failed.campaign.history[0].action
     assert failed.campaign.belief.mean < speed**2 / (2 * 9.81)
+
+
+def test_question_which_parameters(run, capsys):
     run("docs/howto/which_parameters.md")
     assert "friction * mass" in capsys.readouterr().out
+
+
+def test_question_two_models(run):
     (rivals,) = run("docs/howto/two_models.md")
     assert rivals.actions.contains(torch.as_tensor(rivals.found.action)[None]).all()
+
+
+def test_question_thrown_ball(run, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (ball,) = run("docs/howto/thrown_ball.md")
+    assert ball.report.verdict == "drag"
+    (line,) = [t for t in capsys.readouterr().out.splitlines() if t[:9] == "drag [1/m"]
+    mean, sd = (float(v) for v in line.split("]")[1].split("+-"))
+    assert abs(mean - 0.05) < 3 * sd < 0.05  # of the film's
+    table = ball.report.before_after.set_index("metric")
+    # Errors of a camera of 1 cm, and of starts that its first frames tell.
+    assert table.loc["rmse", "after"] < 0.03 < table.loc["rmse", "before"]
+    text = (ROOT / "docs/howto/thrown_ball.md").read_text()
+    (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
 
 
 def test_no_page_is_forgotten():
@@ -207,6 +230,7 @@ def test_no_page_is_forgotten():
         "failed_trial.md",
         "which_parameters.md",
         "two_models.md",
+        "thrown_ball.md",
         "pouring.md",
         "robust.md",
     }

@@ -121,12 +121,14 @@ def compared(task: Task, campaign: Campaign, index: int) -> Tensor | str:
     return c2st(*pair, seed=1)
 
 
-def run_method(setting: str, method: str, trials: int) -> list[dict[str, str]]:
+def run_method(
+    setting: str, method: str, trials: int, *, is_summary: bool = False
+) -> list[dict[str, str]]:
     """Run the trials that are not in the file yet and return all its rows."""
     path = RESULTS / f"methods_{setting}_{method}.csv"
     done = {int(row["seed"]) for row in read(path)}
     for seed in range(trials):
-        if seed in done:
+        if seed in done or is_summary:
             continue
         start = time.process_time()
         rows = run_trial(make_task("linear", "fixed", seed), method, setting, seed)
@@ -177,13 +179,19 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", default=[*METHODS], choices=[*METHODS])
     parser.add_argument("--setting", choices=["faithful", "default"], default="default")
     parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
-    table = [
-        summary(method, run_method(arguments.setting, method, arguments.trials))
-        for method in arguments.methods
-    ]
+    table = []
+    for method in arguments.methods:
+        rows = run_method(
+            arguments.setting,
+            method,
+            arguments.trials,
+            is_summary=arguments.summary,
+        )
+        table.append(summary(method, rows))
     table += [[k, *v, *[""] * 5] for k, v in (PUBLISHED | PAPER).items()]
     header = [f"{arguments.setting} (trials)", "median log p(truth), round 1 / 2 / .."]
     header += [f"RepErr({a:g})" for a in REPORTED]

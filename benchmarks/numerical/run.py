@@ -162,7 +162,7 @@ def run_setting(arguments: argparse.Namespace, method: str, setting: str) -> lis
     path.parent.mkdir(parents=True, exist_ok=True)
     done = {int(row["seed"]) for row in read(path)}
     for seed in range(arguments.trials):
-        if seed in done:
+        if seed in done or arguments.summary:
             continue
         start = time.process_time()
         task = make_task(arguments.task, arguments.truth, seed)
@@ -258,6 +258,7 @@ def main() -> None:
     parser.add_argument(
         "--jitter", type=float, default=0.0, help="relative error of executed actions"
     )
+    parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore", message="the executed action")
     torch.set_num_threads(1)
@@ -274,7 +275,7 @@ def main() -> None:
     header += [f"RepErr({a:g})" for a in REPORTED]
     if arguments.truth == "fixed" and arguments.task == "linear":
         table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in PUBLISHED.items()]
-    print(as_table(table, header))
+    print(as_table(table, header), end="\n\n")
     print("\n".join(lines))
 
 

@@ -80,7 +80,7 @@ def forgotten(site: Path) -> list[str]:
     for path in (site / "reference" / "api").glob("*.html"):
         anchors |= Page(path.read_text(encoding="utf-8")).anchors
     missing = []
-    for package in (*sbi_active._HOMES, "tasks"):
+    for package in (*sbi_active._HOMES, "pyro", "tasks"):
         if package == "export":
             continue
         names = importlib.import_module(f"sbi_active.{package}").__all__

@@ -18,7 +18,7 @@ from sphinx.application import Sphinx
 import sbi_active
 
 PAGES = Path(__file__).parents[1] / "reference" / "api"
-PACKAGES = [name for name in (*sbi_active._HOMES, "tasks") if name != "export"]
+PACKAGES = [n for n in (*sbi_active._HOMES, "pyro", "tasks") if n != "export"]
 #: Modules whose classes and functions users meet without importing them, by package.
 FURTHER = {
     "actions": {"sbi_active.actions.waveforms": ()},

@@ -2,12 +2,12 @@
 # # Box collision in MuJoCo
 #
 # The paper's robot experiment: a box is pushed into another one, and friction and mass
-# are to be found from where the boxes come to rest. The simulator is MuJoCo, the "real"
-# system the same with hidden parameters.
+# are to be found from where the boxes come to rest. The simulator is MuJoCo, the
+# "real" system the same with hidden parameters.
 #
 # Reduced sizes: two trials with few simulations, some seconds. The committed result,
-# ten campaigns a target with six trials each, stands in
-# [box collision](../benchmarks.md#box-collision).
+# ten campaigns a target with six trials each, stands in [box
+# collision](../benchmarks.md#box-collision).
 
 # %%
 from sbi_active import Campaign, CampaignOptions
@@ -29,12 +29,32 @@ print(belief)
 # %%
 campaign.plot(theta_true=task.theta_true, num_predicted=16)
 # %% [markdown]
-# What limits the belief is said with it. Two pushes determine the density and leave the
-# two frictions wide; six do more, see the committed result.
+# What limits the belief is said with it. Two pushes determine the density and leave
+# the two frictions wide; six do more, see the committed result.
 
 # %%
 print(belief.diagnostics)
 
 # %% [markdown]
-# `sbi_active.tasks.box_collision.render.render(theta, action, "push.gif")` draws a push
-# as an animation, where there is a display or an offscreen renderer.
+# The first push, as the belief's mean has it. A picture is drawn where there is a
+# display or an offscreen renderer (EGL or OSMesa); the text of the error names what to
+# install.
+
+# %%
+import tempfile
+from base64 import b64encode
+from pathlib import Path
+
+from IPython.display import HTML
+
+from sbi_active.tasks.box_collision import render
+
+path = Path(tempfile.mkdtemp()) / "push.gif"
+try:
+    render(belief.mean, campaign.history[0].action, path)
+    film = b64encode(path.read_bytes()).decode()
+    alt = "Animation: a pusher drives one box into another, which slides and stops"
+    shown = f'<img alt="{alt}" src="data:image/gif;base64,{film}">'
+except RuntimeError as error:
+    shown = f"<p>No picture here: {error}</p>"
+HTML(shown)

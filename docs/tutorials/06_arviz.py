@@ -51,6 +51,38 @@ az.plot_pair(data, var_names=["theta"], kind="kde", figsize=(5, 4))
 az.plot_ppc(data, num_pp_samples=50, figsize=(6, 3.5))
 
 # %% [markdown]
-# Draws of a belief are independent, so that convergence is no question here:
-# `belief.diagnostics` takes its place, and says how many effective draws are behind it
-# and how far the belief is from that of endless simulations.
+# `to_datatree` gives the same as a tree of xarray, which ArviZ 1.x reads and which
+# needs no ArviZ at all:
+
+# %%
+from sbi_active import to_datatree
+
+tree = to_datatree(campaign)
+print(", ".join(tree.children))
+tree["posterior"]["theta"].mean(("chain", "draw")).to_series().round(3)
+
+# %% [markdown]
+# Draws of a belief are independent, so that convergence of chains is no question here.
+# `belief.diagnostics` says how many effective draws are behind it and how far it is
+# from that of endless simulations.
+#
+# ## Can the network be trusted, and at which actions?
+#
+# `check_calibration` draws parameters from the prior and outcomes at every action, and
+# judges ranks, coverage and the nats that the network loses, each with its interval:
+
+# %%
+from sbi_active import ASBI, MixtureDensity
+from sbi_active.diagnostics import check_calibration
+
+inference = ASBI(prior, density_estimator=MixtureDensity(num_iterations=300))
+theta, pushed = prior.sample((2_000,)), actions.sample((2_000,))
+inference.append_simulations(theta, model(theta, pushed), action=pushed).train()
+calibration = check_calibration(inference, model, actions=actions, num_simulations=300)
+print(calibration)
+
+# %%
+calibration.plot()
+# %% [markdown]
+# A network of 300 steps and few rows is quick, and what it loses is said. Refined
+# beliefs are checked by `check_belief`: see [can it be trusted](../trust.md).

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Clusters, banks, dear simulators
 #
-# Outcomes depend on the seed, the parameters and the action alone: not on the number of
-# workers, nor on whether they are processes here or a cluster. So a run can be moved.
+# Outcomes depend on the seed, the parameters and the action alone: not on the number
+# of workers, nor on whether they are processes here or a cluster. So a run can be
+# moved.
 
 # %%
 import tempfile
@@ -23,8 +24,8 @@ here.counts
 # %% [markdown]
 # ## On a Dask cluster
 #
-# By one line of joblib's configuration. This page starts a cluster of one thread in its
-# own process; yours is `distributed.Client("scheduler:8786")`.
+# By one line of joblib's configuration. This page starts a cluster of one thread in
+# its own process; yours is `distributed.Client("scheduler:8786")`.
 
 # %%
 import distributed
@@ -82,7 +83,22 @@ print(
 # %% [markdown]
 # ## A simulator that takes a minute
 #
-# A campaign takes `CampaignOptions(bank="folder", num_workers=8, time_limit=600,
-# network="on demand")`: rows go to the bank, and only those are simulated that the
-# belief and the design need: see
-# [how many](../howto/how_many_simulations.md).
+# `max_simulations` is a budget for the whole campaign, never exceeded: belief, designs
+# and scores share one pool of rows, which Gaussian processes interpolate.
+# `planned_trials` is how many trials it is to last for.
+
+# %%
+from sbi_active import Campaign, CampaignOptions, DiscreteActions
+
+actions = DiscreteActions([1.0, 2.0, 3.0], names=["speed"], units=["m/s"])
+options = CampaignOptions(max_simulations=200, planned_trials=2)
+campaign = Campaign(model, prior, actions, seed=0, options=options)
+truth = torch.tensor([[0.4]])
+campaign.run(lambda action: model(truth, action[None])[0], num_rounds=2)
+print(campaign.belief)
+print("simulated", campaign.state.meter.spent, "of", options.max_simulations)
+
+# %% [markdown]
+# With `bank="folder"`, `num_workers=8` and `time_limit=600` these rows are kept, run
+# side by side and given up after ten minutes: see [how
+# many](../howto/how_many_simulations.md).

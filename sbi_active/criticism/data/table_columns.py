@@ -114,9 +114,11 @@ def find_columns(
         needed = ["action", "x"]
     for key in needed:
         if not found[key]:
+            nothing = "; where nothing was set, add a column action_none of ones"
             raise ValueError(
                 f"expected columns {PREFIXES[key]}*; got {', '.join(names)} in "
                 f"{source}; name them, as in action_speed, x_distance[m]"
+                f"{nothing if key == 'action' else ''}"
             )
     used = [name for group in found.values() for name in group]
     stated = _units(used, names, units or {}, source)

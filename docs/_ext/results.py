@@ -1,0 +1,186 @@
+"""Write the tables of the committed rows, as the benchmarks' own commands print them.
+
+Nothing is run again: each command reads its CSV files. No figure of these is typed.
+"""
+
+import contextlib
+import io
+import re
+import runpy
+import sys
+from itertools import pairwise
+from pathlib import Path
+from unittest import mock
+
+from sphinx.application import Sphinx
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "reference" / "api" / "results.txt"
+EMPTY = re.compile(r"nan( (/|\+-) nan)*")
+#: Title, its section in benchmarks.md or the page, and the commands.
+TABLES = {
+    "The paper's numerical model": (
+        "benchmarks.md#the-papers-numerical-model-beside-the-paper-and-the-exact-limit",
+        "benchmarks.numerical.run --summary",
+        "benchmarks.numerical.run --summary --trials 60 --settings default "
+        "--methods asbi",
+        "benchmarks.numerical.run --summary --truth random --trials 40 "
+        "--settings default --methods asbi",
+        "benchmarks.numerical.run --summary --task sinh "
+        "--settings default default_500 --methods asbi",
+        "benchmarks.numerical.run --summary --task square "
+        "--settings default default_500 --methods asbi",
+        "benchmarks.numerical.run --summary --task oscillator --truth random "
+        "--settings default default_500 --methods asbi",
+        "benchmarks.numerical.methods --summary --setting faithful",
+        "benchmarks.numerical.methods --summary --setting default",
+    ),
+    "Box collision": (
+        "benchmarks.md#box-collision",
+        "benchmarks.box_collision.run --summary",
+        "benchmarks.box_collision.run --summary --table coverage --rounds 3",
+        "benchmarks.box_collision.run --summary --setting learned "
+        "--methods asbi nsbi alhi nlhi --trials 3",
+    ),
+    "The closed loop, effects known": (
+        "benchmarks.md#the-closed-loop-on-worlds-whose-truth-is-known",
+        *(
+            f"benchmarks.criticism.run --summary --table loop --world {world}"
+            for world in "ABCD"
+        ),
+        *(
+            f"benchmarks.criticism.run --summary --table {table} --world {world} "
+            "--trials 12"
+            for table in ("open", "pairs")
+            for world in "AB"
+        ),
+        "benchmarks.criticism.run --summary --table active --world A",
+    ),
+    "Verdicts where every model is wrong": (
+        "benchmarks.md#verdicts-where-every-model-is-wrong",
+        "benchmarks.misfit.run --summary --group own --first 1100",
+        "benchmarks.misfit.start_states --summary",
+    ),
+    "Forces that nobody declared": (
+        "benchmarks.md#forces-that-nobody-declared",
+        "benchmarks.forces.run --summary",
+    ),
+    "A chain of many parameters": (
+        "benchmarks.md#a-chain-of-many-parameters",
+        "benchmarks.chain.run --summary",
+    ),
+    "Bad networks and beliefs flagged": (
+        "benchmarks.md#bad-networks-and-beliefs-flagged",
+        "benchmarks.calibration.run --summary",
+    ),
+    "Dear simulators": (
+        "benchmarks.md#dear-simulators",
+        "benchmarks.dear.run --table",
+    ),
+    "Pouring": ("pouring.md", "benchmarks.pouring.run --summary"),
+}
+
+
+def printed(command: str) -> str:
+    """Return what a command prints, run in this process."""
+    module, *_ = argv = command.split()
+    text = io.StringIO()
+    path = [str(ROOT), *sys.path]
+    with (
+        mock.patch.object(sys, "argv", argv),
+        mock.patch.object(sys, "path", path),
+        contextlib.redirect_stdout(text),
+    ):
+        try:
+            runpy.run_module(module, run_name="__main__")
+        except FileNotFoundError:  # rows that are being made again
+            return "No rows are committed now."
+    if not text.getvalue().strip():
+        raise ValueError(f"expected a table of {command}; got nothing; commit its rows")
+    return text.getvalue()
+
+
+def as_markdown(text: str) -> str:
+    """Return printed lines with their tables as Markdown; all else as it stands."""
+    lines: list[str] = []
+    given = [*text.splitlines(), ""]
+    number, plain = 0, []
+
+    def flush() -> None:
+        while plain and not plain[-1].strip():
+            plain.pop()
+        if any(line.strip() for line in plain):
+            lines.extend(["```text", *plain, "```", ""])
+        plain.clear()
+
+    while number < len(given):
+        line = given[number]
+        rule = given[number + 1] if number + 1 < len(given) else ""
+        if re.fullmatch(r"-{2,}(  -+)+", rule):
+            flush()
+            rows, number = [line], number + 2
+            while given[number] and in_columns(given[number], rule):
+                rows.append(given[number])
+                number += 1
+            lines += [*table([cells(row, rule) for row in rows]), ""]
+            continue
+        if line.startswith("|"):
+            flush()
+            while given[number].startswith("|"):
+                lines.append(given[number])
+                number += 1
+            lines.append("")
+            continue
+        if line.startswith("## "):
+            flush()
+            lines += [f"**{line.removeprefix('## ')}**", ""]
+        elif line.strip() or plain:
+            plain.append(line)
+        number += 1
+    flush()
+    return "\n".join(lines)
+
+
+def in_columns(row: str, rule: str) -> bool:
+    """Return whether a line keeps the gaps between the columns free."""
+    return all(a == "-" or b == " " for a, b in zip(rule, row, strict=False))
+
+
+def cells(row: str, rule: str) -> list[str]:
+    """Return the cells of a row, by the columns of the rule under its header."""
+    starts = [m.start() for m in re.finditer(r"-+", rule)] + [None]
+    found = [row[a:b].strip() for a, b in pairwise(starts)]
+    return ["" if EMPTY.fullmatch(cell) else cell for cell in found]
+
+
+def table(rows: list[list[str]]) -> list[str]:
+    """Return rows, the header first, as a Markdown table."""
+    rows = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
+    return [
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+        for row in rows
+    ]
+
+
+def page() -> str:
+    """Return all tables, each under the command that printed it."""
+    lines: list[str] = []
+    for title, (place, *commands) in TABLES.items():
+        lines += [f"## {title}", "", f"What it is: [{title}](/{place}).", ""]
+        for command in commands:
+            lines += [f"```bash\npython -m {command}\n```", ""]
+            lines += [as_markdown(printed(command)), ""]
+    return "\n".join(lines)
+
+
+def _generate(app: Sphinx) -> None:
+    PAGE.parent.mkdir(parents=True, exist_ok=True)
+    text = page()
+    if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
+        PAGE.write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the tables before the pages are read."""
+    app.connect("builder-inited", _generate)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
