@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.tasks.pouring.raster import NUM_PIXELS, height_image
-from sbi_active.tasks.pouring.scene import (
+from sbi_active.tasks.pouring.materials import (
     EFFECT_NAMES,
     MOST_PARTICLES,
     NOTHING_ELSE,
     Particles,
     Surface,
     Surroundings,
-    pour,
 )
+from sbi_active.tasks.pouring.raster import NUM_PIXELS, height_image
+from sbi_active.tasks.pouring.scene import pour
 
 __all__ = ["ACTION_NAMES", "ACTION_UNITS", "PARAMETER_NAMES", "Pours", "images_of"]
 

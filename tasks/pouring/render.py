@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib import image
 
-from sbi_active.tasks.pouring.scene import DT, SCALE, World, cubes, pour
+from sbi_active.tasks.pouring.materials import cubes
+from sbi_active.tasks.pouring.scene import DT, SCALE, World, pour
 
 __all__ = ["render"]
 

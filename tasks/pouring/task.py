@@ -15,8 +15,8 @@ from sbi_active.criticism import Effect
 from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks.base import Task
 from sbi_active.tasks.pouring.effects import make_effects
+from sbi_active.tasks.pouring.materials import cubes, load_pybullet
 from sbi_active.tasks.pouring.model import ACTION_NAMES, ACTION_UNITS, Pours
-from sbi_active.tasks.pouring.scene import cubes, load_pybullet
 from sbi_active.tasks.pouring.summaries import ImagePCA, mesh_coverage
 
 __all__ = ["PouringTask", "Summary", "grid"]

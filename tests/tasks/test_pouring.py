@@ -10,7 +10,8 @@ from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("pybullet")
 from sbi_active.tasks.pouring import images_of  # noqa: E402
-from sbi_active.tasks.pouring.scene import Particles, cubes, pour  # noqa: E402
+from sbi_active.tasks.pouring.materials import Particles, cubes  # noqa: E402
+from sbi_active.tasks.pouring.scene import pour  # noqa: E402
 
 LOW = torch.tensor([20.0, 0.0, 5.0])  # the cheapest action that shows much
 
