@@ -9,14 +9,14 @@ from torch import Tensor
 
 __all__ = ["GridBelief"]
 
-SIDE = 40  # cells along each parameter: half a standard deviation at the narrowest
+SIDE = 20  # cells along each parameter
 
 
 class GridBelief:
-    r"""A density that is constant within each of 40 x 40 x 40 cells.
+    r"""A density that is constant within each of 20 x 20 x 20 cells.
 
     Args:
-        log_density: At the middles of the cells, up to a constant, shape (64000,).
+        log_density: At the middles of the cells, up to a constant, shape (8000,).
     """
 
     def __init__(self, log_density: Tensor) -> None:
@@ -24,7 +24,7 @@ class GridBelief:
 
     @staticmethod
     def middles() -> Tensor:
-        """Return the middles of the cells, shape (64000, 3)."""
+        """Return the middles of the cells, shape (8000, 3)."""
         line = (torch.arange(SIDE) + 0.5) / SIDE
         return torch.cartesian_prod(line, line, line)
 
@@ -43,27 +43,3 @@ class GridBelief:
         """Return draws, shape (n, 3)."""
         index = self.log_density.softmax(0).multinomial(shape[0], replacement=True)
         return self.middles()[index] + (torch.rand(shape[0], 3) - 0.5) / SIDE
-
-    def flattened(self, theta: Tensor, effective: float) -> GridBelief:
-        r"""Return :math:`b^\tau` with the largest :math:`\tau \le 1` that rows support.
-
-        Args:
-            theta: Rows from the prior, shape (n, 3).
-            effective: Sample size of their weights to reach, 0 for :math:`\tau = 1`.
-        """
-        low, high = 0.0, 1.0
-        log_b = self.log_prob(theta)
-        if _size(log_b) >= effective:
-            return self
-        for _ in range(30):
-            middle = (low + high) / 2
-            if _size(middle * log_b) >= effective:
-                low = middle
-            else:
-                high = middle
-        return GridBelief(low * self.log_density)
-
-
-def _size(log_weight: Tensor) -> float:
-    weight = log_weight.softmax(0)
-    return float(1 / (weight**2).sum())

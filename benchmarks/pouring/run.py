@@ -2,37 +2,43 @@
 
     python -m benchmarks.pouring.run --bank FOLDER                  # both targets
     python -m benchmarks.pouring.run --bank FOLDER --table coverage --rounds 3
+    python -m benchmarks.pouring.run --bank FOLDER --table bank     # left-out pours
     python -m benchmarks.pouring.run --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method and target, in ``benchmarks/pouring/results``.
 
-Algorithm 1 on 100 cubes. A round's rows are drawn with replacement from a bank of pours
-from the prior, so that a round simulates nothing but its trial; how many distinct pours
-it rests on is a column. They are weighted by the belief b to a power, the proposal
-pi = b^tau with as many effective rows as ``--effective`` says, and the next belief is
-b(theta) q(theta | x_o, xi) / pi(theta). With ``--effective 0`` tau is 1 and the beliefs
-are chained as in the paper; a bank is then too thin from round 3 on.
-One network a summary; the action is (h, p, v, delta), and delta is compared on common
-pours: a fifth of the bank, which no network learns from.
+Algorithm 1 on 100 cubes. A campaign simulates nothing but its trials: the likelihood of
+each action and summary is learned once from a bank of pours from the prior
+(``likelihood``), a belief is the product of its trials' on a grid, and the action
+(h, p, v, delta) is chosen by the expected information gain under the same likelihoods.
+NSBI has the same belief and random actions.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import pickle
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.summary import coverage_table, read, summarize
-from sbi_active import ASBI, MixtureDensity
+from benchmarks.pouring.likelihood import (
+    ImageLikelihood,
+    components,
+    cross_validated,
+    observed,
+    thumbnails,
+)
+from benchmarks.pouring.summary import bank_table, coverage_table, read, summarize
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, mesh_coverage
@@ -40,74 +46,92 @@ from sbi_active.tasks.pouring import images_of, mesh_coverage
 RESULTS = Path(__file__).parent / "results"
 METHODS = ("asbi", "nsbi")
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
-FEWEST = 5  # effective held-out pours of an action, to be compared with others
+NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain
+NUM_COMPONENTS = 36
 COLUMNS = [
     *["seed", "theta_true", "round", "height", "position", "rate", "delta", "in_view"],
     *["eig", "eig_se", "eig_pca", "eig_mesh", "log_prob_true", "hpd"],
-    *["num_distinct", "effective", "cpu_training", "cpu_design", "cpu_trial"],
+    *["num_rows", "power", "cpu_design", "cpu_trial"],
 ]
 
 
 @dataclass(frozen=True)
-class Pool:
-    """Pours that rounds draw on.
+class Learned:
+    """What one summary of an action's pours tells.
 
     Attributes:
-        theta: Shape (n, 3).
-        action: Shape (n, 3).
-        images: Shape (n, 22500).
-        coverage: Shape (n, 36).
-        is_held_out: Whether a row is kept from training, shape (n,).
+        likelihood: Learned from them.
+        num: Pours behind it.
+        told: Log posterior density of each left-out pour's theta, shape (num,).
+        mass: Of what is denser, shape (num,).
+        mean: Of thumbnails, shape (900,), where the summary is components.
+        axes: Shape (900, k).
     """
 
-    theta: Tensor
-    action: Tensor
-    images: Tensor
-    coverage: Tensor
-    is_held_out: Tensor
+    likelihood: ImageLikelihood
+    num: int
+    told: np.ndarray
+    mass: np.ndarray
+    mean: np.ndarray
+    axes: np.ndarray
 
-    @classmethod
-    def of(cls, folder: Path, task: Any, most: int | None) -> Pool:
-        """Read a bank."""
-        rows = read_bank(folder, most=most)
-        images = images_of(rows.poses, task.pours.particles)
-        held_out = torch.arange(len(rows)) % 5 == 0
-        return cls(rows.theta, rows.action, images, mesh_coverage(images), held_out)
+    def log_prob(self, theta: Tensor, image: Tensor, delta: int) -> Tensor:
+        """Return log densities of an image (22500,) at theta (n, 3)."""
+        coverage = mesh_coverage(image[None]).numpy().astype(np.float64)
+        summary = np.sqrt(coverage)
+        if not delta:
+            summary = (thumbnails(image[None].numpy()) - self.mean) @ self.axes
+        seen = observed(self.likelihood, summary[0], not coverage.any())
+        return torch.from_numpy(self.likelihood.at(theta.double().numpy(), seen))
+
+
+def learn(folder: Path, task: Any, most: int | None) -> list[list[Learned]]:
+    """Return what is learned of a bank, by delta and action."""
+    rows = read_bank(folder, most=most)
+    coverage, pictures = [], []
+    for start in range(0, len(rows), 500):
+        images = images_of(rows.poses[start : start + 500], task.pours.particles)
+        coverage.append(mesh_coverage(images).numpy().astype(np.float64))
+        pictures.append(thumbnails(images.numpy()))
+    mesh, small = np.concatenate(coverage), np.concatenate(pictures)
+    theta = rows.theta.double().numpy()
+    found: list[list[Learned]] = [[], []]
+    for action in task.actions.values:
+        mine = (rows.action == action).all(1).numpy()
+        is_empty = ~mesh[mine].any(1)
+        mean, axes = components(small[mine], NUM_COMPONENTS)
+        summaries = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
+        for delta, summary in enumerate(summaries):
+            fitted, told, mass = cross_validated(theta[mine], summary, is_empty)
+            found[delta].append(
+                Learned(fitted, int(mine.sum()), told, mass, mean, axes)
+            )
+    return found
 
 
 def run_trial(
-    task: Any, pool: Pool, method: str, seed: int, arguments: argparse.Namespace
+    task: Any, learned: list[list[Learned]], method: str, seed: int, rounds: int
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
-    belief = GridBelief.uniform()
+    belief, middles = GridBelief.uniform(), GridBelief.middles()
     rows = []
-    for index in range(arguments.rounds):
+    for index in range(rounds):
         start = time.process_time()
-        proposal = belief.flattened(pool.theta, arguments.effective)
-        weight = proposal.log_prob(pool.theta).softmax(0)
-        trained, distinct = train(task, pool, weight, seed, index, arguments)
-        learned = time.process_time()
-        gains, errors = zip(
-            *[
-                expected_gain(task, pool, weight, proposal, inference, x)
-                for inference, x, _ in trained
-            ],
-            strict=True,
-        )
-        gain, error = torch.stack(gains), torch.stack(errors)  # (2, actions)
+        gain = error = np.full((2, len(task.actions.values)), np.nan)
         if method == "asbi":
+            own_seed = derive_seed(seed, "gain", index)
+            gain, error = expected_gains(learned, belief, own_seed)
             choice = int(gain.argmax())
         else:
             with forked_generators(derive_seed(seed, "action", index)):
-                choice = int(torch.randint(gain.numel(), ()))
+                choice = int(torch.randint(gain.size, ()))
         delta, place = divmod(choice, gain.shape[1])
         action = task.actions.values[place]
         designed = time.process_time()
         image = task.real_system(action, seed=derive_seed(seed, "real", index))
-        inference, _, summary = trained[delta]
-        log_q = at_trial(inference, summary(image[None]), action)
-        belief = GridBelief(log_q + belief.log_density - proposal.log_density)
-        log_q = float(belief.log_prob(task.theta_true))
+        own = learned[delta][place]
+        belief = GridBelief(belief.log_density + own.log_prob(middles, image, delta))
+        log_p = float(belief.log_prob(task.theta_true))
         with forked_generators(derive_seed(seed, "draws", index)):
             draws = belief.sample(torch.Size([NUM_DRAWS]))
         rows.append(
@@ -124,118 +148,43 @@ def run_trial(
                 "eig_se": float(error[delta, place]),
                 "eig_pca": float(gain[0].max()),
                 "eig_mesh": float(gain[1].max()),
-                "log_prob_true": log_q,
-                "hpd": float((belief.log_prob(draws) > log_q).double().mean()),
-                "num_distinct": distinct,
-                "effective": float(1 / (weight**2).sum()),
-                "cpu_training": learned - start,
-                "cpu_design": designed - learned,
+                "log_prob_true": log_p,
+                "hpd": float((belief.log_prob(draws) > log_p).double().mean()),
+                "num_rows": own.num,
+                "power": own.likelihood.power,
+                "cpu_design": designed - start,
                 "cpu_trial": time.process_time() - designed,
             }
         )
     return rows
 
 
-def train(
-    task: Any,
-    pool: Pool,
-    weight: Tensor,
-    seed: int,
-    index: int,
-    arguments: argparse.Namespace,
-) -> tuple[list[Any], int]:
-    """Return a network, the pool's rows and the summary of each, and distinct rows.
-
-    A first round depends on nothing but the pool, and so is kept.
-    """
-    if index == 0:
-        if "first" not in _kept:
-            _kept["first"] = learn(task, pool, weight, 0, index, arguments)
-        return _kept["first"]
-    return learn(task, pool, weight, seed, index, arguments)
-
-
-_kept: dict[str, Any] = {}
-
-
-def learn(
-    task: Any,
-    pool: Pool,
-    weight: Tensor,
-    seed: int,
-    index: int,
-    arguments: argparse.Namespace,
-) -> tuple[list[Any], int]:
-    """Train as :func:`train` says."""
-    learning = weight * ~pool.is_held_out
-    with forked_generators(derive_seed(seed, "rows", index)):
-        drawn = learning.multinomial(arguments.draws, replacement=True)
-    distinct = drawn.unique()
-    summaries = task.summaries(
-        pool.images[distinct[:600]], num_components=arguments.components
-    )
-    used = torch.cat([distinct, torch.nonzero(pool.is_held_out)[:, 0]])
-    trained = []
-    for delta, summary in enumerate(summaries.values()):
-        x = pool.coverage
-        if not delta:
-            z = summary(pool.images[used])
-            x = torch.zeros(len(pool.theta), z.shape[1])
-            x[used] = z
-        with forked_generators(derive_seed(seed, "train", index, delta)):
-            inference = ASBI(task.prior, NETWORK, show_progress_bars=False)
-            inference.append_simulations(
-                pool.theta[drawn], x[drawn], action=pool.action[drawn]
-            ).train()
-        trained.append((inference, x, summary))
-    return trained, len(distinct)
-
-
-def at_trial(inference: ASBI, x: Tensor, action: Tensor) -> Tensor:
-    """Return the network's log density at the middles of the grid, one trial's."""
-    theta = GridBelief.middles()
-    posterior = inference.build_posterior()
-    parts = [
-        posterior.log_posterior(
-            part, x.expand(len(part), -1), action.expand(len(part), -1)
-        ).detach()
-        for part in theta.split(8_000)
+def expected_gains(
+    learned: list[list[Learned]], belief: GridBelief, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gains by delta and action, nats, and their errors, on common draws."""
+    with forked_generators(seed):
+        theta = belief.sample(torch.Size([NUM_ALL])).double().numpy()
+    gains = [
+        [
+            own.likelihood.gain(theta, NUM_OUTER, np.random.default_rng(seed))
+            for own in by_action
+        ]
+        for by_action in learned
     ]
-    return torch.cat(parts).double()
+    values = np.array(gains)
+    return values.mean(2), values.std(2) / np.sqrt(NUM_OUTER)
 
 
-NETWORK = MixtureDensity(hidden_features=(64, 64), num_components=5)
-
-
-def expected_gain(
-    task: Any, pool: Pool, weight: Tensor, belief: Any, inference: Any, x: Tensor
-) -> tuple[Tensor, Tensor]:
-    r"""Return :math:`E[\log q(\theta | x, \xi) - \log b(\theta)]` and its error.
-
-    Of each action, over the held-out pours by the weights of the belief; minus infinity
-    where these are too few.
-    """
-    rows = torch.nonzero(pool.is_held_out & (weight > 1e-9))[:, 0]
-    theta, action = pool.theta[rows], pool.action[rows]
-    log_q = inference.build_posterior().log_posterior(theta, x[rows], action).double()
-    log_ratio = (log_q - belief.log_prob(theta).double()).clamp(min=-20)
-    values = task.actions.values
-    gain = torch.full((len(values),), -torch.inf, dtype=torch.float64)
-    error = torch.full_like(gain, torch.inf)
-    for k, value in enumerate(values):
-        mine = (action == value).all(1)
-        share = weight[rows][mine]
-        total = share.sum()
-        if not mine.any() or total <= 0:
-            continue
-        share = share / total
-        effective = 1 / (share**2).sum()
-        if effective < FEWEST:
-            continue
-        gain[k] = (share * log_ratio[mine]).sum()
-        variance = (share * (log_ratio[mine] - gain[k]) ** 2).sum()
-        error[k] = (variance / effective).sqrt()
-    return gain.detach(), error.detach()
+def kept(arguments: argparse.Namespace) -> list[list[Learned]]:
+    """Return what is learned of the bank, from a file of our own where there is one."""
+    path = arguments.learned
+    if path is not None and path.exists():
+        return pickle.loads(path.read_bytes())
+    learned = learn(arguments.bank, get_task("pouring"), arguments.most)
+    if path is not None:
+        path.write_bytes(pickle.dumps(learned))
+    return learned
 
 
 def make_task(target: str, seed: int) -> Any:
@@ -253,7 +202,10 @@ def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
 
 
 def run_missing(
-    method: str, target: str, pool: Pool, arguments: argparse.Namespace
+    method: str,
+    target: str,
+    learned: list[list[Learned]],
+    arguments: argparse.Namespace,
 ) -> None:
     """Run the trials that are not in the file yet."""
     path = path_of(method, target, arguments)
@@ -263,7 +215,9 @@ def run_missing(
         if seed in done:
             continue
         start = time.process_time()
-        rows = run_trial(make_task(target, seed), pool, method, seed, arguments)
+        rows = run_trial(
+            make_task(target, seed), learned, method, seed, arguments.rounds
+        )
         is_new = not path.exists()
         with path.open("a", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -283,22 +237,17 @@ def short(value: object) -> object:
 def parse() -> argparse.Namespace:
     """Return the arguments."""
     parser = argparse.ArgumentParser(description="The paper's pouring.")
-    parser.add_argument("--table", choices=["paper", "coverage"], default="paper")
+    parser.add_argument(
+        "--table", choices=["paper", "coverage", "bank"], default="paper"
+    )
     parser.add_argument("--bank", type=Path, help="folder of pours")
+    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
     parser.add_argument("--most", type=int, help="pours to take of it (all)")
     parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=[*METHODS])
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--first", type=int, default=2_000, help="seed of the first")
     parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--draws", type=int, default=3_000, help="rows a round")
-    parser.add_argument(
-        "--effective",
-        type=float,
-        default=4_000,
-        help="pours that a round rests on at least; 0 chains beliefs as the paper does",
-    )
-    parser.add_argument("--components", type=int, default=36)
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()
@@ -314,10 +263,13 @@ def main() -> None:
     targets = [arguments.target] if arguments.target else ["1", "2"]
     targets = ["prior"] if is_coverage else targets
     if not arguments.summary:
-        pool = Pool.of(arguments.bank, get_task("pouring"), arguments.most)
+        learned = kept(arguments)
+        if arguments.table == "bank":
+            print(bank_table(learned))
+            return
         for target in targets:
             for method in arguments.methods:
-                run_missing(method, target, pool, arguments)
+                run_missing(method, target, learned, arguments)
     cells = {}
     for method in arguments.methods:
         for target in targets:

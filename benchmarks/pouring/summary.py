@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from sbi_active.plots import as_table
 
-__all__ = ["coverage_table", "read", "summarize"]
+__all__ = ["bank_table", "coverage_table", "read", "summarize"]
 
 #: Section 5.4, read from the text: medians of ASBI after the first and last rounds.
 PUBLISHED = {
@@ -53,7 +54,7 @@ def summarize(cells: Cells) -> str:
         last = by_round[-1]
         seconds = sum(
             np.array([float(r[f"cpu_{part}"]) for r in rows]).mean()
-            for part in ("training", "design", "trial")
+            for part in ("design", "trial")
         )
         log_p.append(
             [
@@ -62,7 +63,7 @@ def summarize(cells: Cells) -> str:
                 " / ".join(f"{np.median(v):.2f}" for v in by_round),
                 f"{last.min():.2f} .. {last.max():.2f}",
                 PUBLISHED.get((method, target), "-"),
-                f"{column(rows, 'num_distinct', rounds[-1]).mean():.0f}",
+                f"{column(rows, 'num_distinct', rounds[-1]).mean():.2f}",
                 f"{seconds:.0f}",
             ]
         )
@@ -83,7 +84,7 @@ def summarize(cells: Cells) -> str:
     first = as_table(
         log_p,
         ["", "trials", "median log p(truth) by round", "last: min .. max"]
-        + ["paper (1,000 cubes)", "pours in round 6", "CPU s a round"],
+        + ["paper (1,000 cubes)", "mean power", "CPU s a round"],
     )
     second = as_table(
         chosen,
@@ -129,3 +130,29 @@ def coverage_table(cells: Cells) -> str:
             table.append([*entry, f"{log_p.mean():.2f}"])
     header = ["", "round", "truths", "in 50 % region", "in 90 % region", "mean log p"]
     return as_table(table, header) if table else "no trials yet"
+
+
+def bank_table(learned: Sequence[Sequence[Any]]) -> str:
+    """Return how well left-out pours of a bank are told, by summary.
+
+    Args:
+        learned: By delta and action, with ``told``, ``mass`` and ``likelihood.power``.
+    """
+    table = []
+    for label, actions in zip(("PCA", "mesh coverage"), learned, strict=True):
+        told = [one.told.mean() for one in actions]
+        mass = np.concatenate([one.mass for one in actions])
+        num = len(mass)
+        table.append(
+            [
+                label,
+                str(num),
+                f"{np.mean(told):.2f}",
+                f"{np.min(told):.2f} .. {np.max(told):.2f}",
+                f"{(mass <= 0.5).mean():.3f}",
+                f"{(mass <= 0.9).mean():.3f}",
+                f"{np.mean([one.likelihood.power for one in actions]):.2f}",
+            ]
+        )
+    header = ["", "pours", "mean log p", "by action", "in 50 % region"]
+    return as_table(table, [*header, "in 90 % region", "mean power"])
