@@ -21,6 +21,7 @@ import argparse
 import csv
 import pickle
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,14 @@ from benchmarks.pouring.likelihood import (
     observed,
     thumbnails,
 )
-from benchmarks.pouring.summary import bank_table, coverage_table, read, summarize
+from benchmarks.pouring.reference import abc_log_prob
+from benchmarks.pouring.summary import (
+    bank_table,
+    coverage_table,
+    read,
+    reference_table,
+    summarize,
+)
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, mesh_coverage
@@ -87,6 +95,15 @@ class Learned:
 
 def learn(folder: Path, task: Any, most: int | None) -> list[list[Learned]]:
     """Return what is learned of a bank, by delta and action."""
+    found: list[list[Learned]] = [[], []]
+    for delta, theta, summary, is_empty, basis in summarized(folder, task, most):
+        fitted, told, mass = cross_validated(theta, summary, is_empty)
+        found[delta].append(Learned(fitted, len(theta), told, mass, *basis))
+    return found
+
+
+def summarized(folder: Path, task: Any, most: int | None) -> Iterator[tuple[Any, ...]]:
+    """Yield delta, theta, summaries, whether empty, and components, by action."""
     rows = read_bank(folder, most=most)
     coverage, pictures = [], []
     for start in range(0, len(rows), 500):
@@ -95,17 +112,20 @@ def learn(folder: Path, task: Any, most: int | None) -> list[list[Learned]]:
         pictures.append(thumbnails(images.numpy()))
     mesh, small = np.concatenate(coverage), np.concatenate(pictures)
     theta = rows.theta.double().numpy()
-    found: list[list[Learned]] = [[], []]
     for action in task.actions.values:
         mine = (rows.action == action).all(1).numpy()
         is_empty = ~mesh[mine].any(1)
         mean, axes = components(small[mine], NUM_COMPONENTS)
         summaries = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
         for delta, summary in enumerate(summaries):
-            fitted, told, mass = cross_validated(theta[mine], summary, is_empty)
-            found[delta].append(
-                Learned(fitted, int(mine.sum()), told, mass, mean, axes)
-            )
+            yield delta, theta[mine], summary, is_empty, (mean, axes)
+
+
+def by_nearest(folder: Path, task: Any, most: int | None) -> list[list[np.ndarray]]:
+    """Return what nearest pours alone tell of left-out ones, by delta and action."""
+    found: list[list[np.ndarray]] = [[], []]
+    for delta, theta, summary, *_ in summarized(folder, task, most):
+        found[delta].append(abc_log_prob(theta, summary))
     return found
 
 
@@ -265,7 +285,8 @@ def main() -> None:
     if not arguments.summary:
         learned = kept(arguments)
         if arguments.table == "bank":
-            print(bank_table(learned))
+            nearest = by_nearest(arguments.bank, get_task("pouring"), arguments.most)
+            print(bank_table(learned), reference_table(learned, nearest), sep="\n\n")
             return
         for target in targets:
             for method in arguments.methods:

@@ -12,7 +12,7 @@ from scipy import stats
 
 from sbi_active.plots import as_table
 
-__all__ = ["bank_table", "coverage_table", "read", "summarize"]
+__all__ = ["bank_table", "coverage_table", "read", "reference_table", "summarize"]
 
 #: Section 5.4, read from the text: medians of ASBI after the first and last rounds.
 PUBLISHED = {
@@ -63,7 +63,7 @@ def summarize(cells: Cells) -> str:
                 " / ".join(f"{np.median(v):.2f}" for v in by_round),
                 f"{last.min():.2f} .. {last.max():.2f}",
                 PUBLISHED.get((method, target), "-"),
-                f"{column(rows, 'num_distinct', rounds[-1]).mean():.2f}",
+                f"{column(rows, 'power', rounds[-1]).mean():.2f}",
                 f"{seconds:.0f}",
             ]
         )
@@ -156,3 +156,29 @@ def bank_table(learned: Sequence[Sequence[Any]]) -> str:
         )
     header = ["", "pours", "mean log p", "by action", "in 50 % region"]
     return as_table(table, [*header, "in 90 % region", "mean power"])
+
+
+def reference_table(
+    learned: Sequence[Sequence[Any]], nearest: Sequence[Sequence[np.ndarray]]
+) -> str:
+    """Return how far left-out pours are from what their nearest pours tell.
+
+    Args:
+        learned: By delta and action, with ``told``.
+        nearest: Log densities of the same pours by the nearest ones, likewise.
+    """
+    table = []
+    for k, label in enumerate(("PCA", "mesh coverage")):
+        abc = np.concatenate([*nearest[k]])
+        gap = abc - np.concatenate([one.told for one in learned[k]])
+        pairs = zip(nearest[k], learned[k], strict=True)
+        worst = max(float(a.mean() - one.told.mean()) for a, one in pairs)
+        table.append(
+            [
+                label,
+                f"{abc.mean():.2f} +- {abc.std() / np.sqrt(len(abc)):.2f}",
+                f"{gap.mean():+.2f} +- {gap.std() / np.sqrt(len(gap)):.2f}",
+                f"{worst:+.2f}",
+            ]
+        )
+    return as_table(table, ["", "ABC, mean log p", "less ours", "at worst, an action"])
