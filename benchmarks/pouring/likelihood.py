@@ -193,8 +193,8 @@ class ImageLikelihood:
             normal = rng.standard_normal((num_outer, mean.shape[1])) @ self.root.T
             heavy = np.sqrt(self.freedom / rng.chisquare(self.freedom, num_outer))
             x = mean[:num_outer] + spread[:num_outer] * normal * heavy[:, None]
-            x = x[is_full]
-            every[is_full] = log_filled + self.density(x[:, None] - mean, spread)
+            apart = np.asarray(x[is_full])[:, None] - np.asarray(mean)
+            every[is_full] = log_filled + self.density(apart, spread)
         every = self.power * every
         own = every[np.arange(num_outer), np.arange(num_outer)]
         return own - logsumexp(every, 1) + np.log(len(theta))

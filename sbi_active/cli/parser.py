@@ -17,9 +17,11 @@ TASKS = (
     "numerical",
     "oscillator",
     "box_collision",
+    "pouring",
     "servo_pendulum",
     "ball_drops",
     "location_finding",
+    "chain",
 )
 #: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
 METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")

@@ -145,7 +145,7 @@ def test_exported(made, capsys, tmp_path):
     main(["update", "camp"])
     assert main(["export", "camp", "--netcdf", "out.nc"]) == 0
     data = az.from_netcdf(tmp_path / "out.nc")
-    assert data["posterior"]["theta"].shape == (1, 2000, 2)
+    assert data["posterior"]["theta"].shape == (4, 500, 2)
 
 
 def test_a_missing_effect_is_found_and_adopted(made, capsys, monkeypatch):

@@ -264,7 +264,9 @@ def _of_observation(
 
 
 def _normal(sd: Tensor) -> Distribution:
-    return Independent(Normal(torch.zeros_like(sd), sd), 1)
+    # Zero where nothing is known of the noise yet; Pyro turns the check of it on.
+    normal = Normal(torch.zeros_like(sd), sd, validate_args=False)
+    return Independent(normal, 1, validate_args=False)
 
 
 def _lift(phi: Tensor, x: Tensor) -> Tensor:
