@@ -197,7 +197,7 @@ class ImageLikelihood:
             every[is_full] = log_filled + self.density(apart, spread)
         every = self.power * every
         own = every[np.arange(num_outer), np.arange(num_outer)]
-        return own - logsumexp(every, 1) + np.log(len(theta))
+        return own - np.asarray(logsumexp(every, axis=1)) + np.log(len(theta))
 
 
 def cross_validated(
