@@ -26,6 +26,7 @@ from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summari
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.rule import PASSES
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
@@ -33,6 +34,7 @@ from sbi_active.criticism.results import (
     UNEXPLAINED,
     Detection,
     Evaluation,
+    ModelKey,
     NextAction,
     Residuals,
     Tracing,
@@ -247,7 +249,7 @@ class Criticism:
                     tracing = trace(
                         self.rivals, detection, groups, actions=self.actions
                     )
-            if tracing.verdict in (UNEXPLAINED, SCATTER):
+            if self._is_missed(tracing):
                 # It is no error of a sensor: a process that follows the action is.
                 self._misfit = find_misfit(
                     self.rivals, groups, is_known=True, search=self._few
@@ -260,6 +262,17 @@ class Criticism:
                 tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
         return self._tracing
+
+    def _is_missed(self, tracing: Tracing) -> bool:
+        """Return whether the model of a verdict misses the trials nevertheless."""
+        if tracing.verdict in (UNEXPLAINED, SCATTER):
+            return True
+        if not tracing.chosen or self.rivals.measurements.is_sequence:
+            return False
+        if any(e.hook == "noise" for e in self.effects):  # that it may be
+            return False
+        evidence = self.rivals.fit(ModelKey(tracing.chosen)).evidence
+        return self.detect().refutes(evidence, PASSES)
 
     def add(
         self, effects: Sequence[str] | None = None

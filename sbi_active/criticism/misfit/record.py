@@ -16,7 +16,6 @@ from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.verdict import Misfit
-from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
     UNEXPLAINED,
     Detection,
@@ -169,12 +168,7 @@ def keep_draws(
 
 def _weights(misfit: Misfit) -> dict[ModelKey, float]:
     """Return the models that count, by their errors on left-out parts."""
-    found = misfit.search.found
-    weights = weights_by_error(
-        {key: candidate.left.square for key, candidate in found.items()},
-        {key: candidate.log_prior for key, candidate in found.items()},
-        derive_seed(misfit.rivals.seed, "weights"),
-    )
+    weights = misfit.weights()
     kept = [key for key, weight in weights.items() if weight >= COUNTS]
     return {key: weights[key] for key in kept[:MOST_COUNTED]}
 
@@ -194,7 +188,7 @@ def _found(
         sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
         passes=misfit.passes(choice.key),
         size=last.posterior.size,
-        time_scale=last.posterior.time_scale,
+        time_scale=last.posterior.time_scale if m.is_sequence else np.nan,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in weights.items()},
     )
