@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -121,6 +122,25 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
     )
 
 
+def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
+    """Return a verdict of other evidence with the intervals that hold under misfit.
+
+    Args:
+        tracing: Of numbers without a time axis, of which no declared effect predicts
+            left-out trials better: larger noise or something undeclared.
+        misfit: The models.
+    """
+    own = tracing.evidences.get(tracing.model)
+    key = ModelKey(tracing.key.effects)
+    if own is None or key not in misfit.search.found:
+        return tracing
+    model = misfit.model(key)
+    u = _drawn(misfit.rivals, model, model.u, misfit.covariance(key))
+    draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
+    found = tracing.evidences | {tracing.model: replace(own, draws=draws)}
+    return replace(tracing, evidences=found)
+
+
 def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
@@ -143,11 +163,7 @@ def keep_draws(
     if key in rivals.fits:
         return rivals.fits[key].evidence
     before = rivals.simulator.num_simulations if key.effects else 0
-    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(key)))
-    values, vectors = np.linalg.eigh(cov)
-    root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
-    u = np.clip(u, model.low, model.high)
+    u = _drawn(rivals, model, center, cov)
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
     sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS))
     rival = rivals.rival(key)
@@ -164,6 +180,15 @@ def keep_draws(
     )
     rivals.fits[key] = Fit(rival, sample, evidence)
     return evidence
+
+
+def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:
+    """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
+    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.clip(values, 0, None))
+    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
+    return np.clip(u, model.low, model.high)
 
 
 def _weights(misfit: Misfit) -> dict[ModelKey, float]:

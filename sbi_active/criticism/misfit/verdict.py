@@ -23,9 +23,10 @@ from sbi_active.criticism.misfit.rule import PASSES, Choice, Scored, admitted, c
 from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
-from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.results import UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
+from sbi_active.criticism.under_misfit import NAMED
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
@@ -80,6 +81,15 @@ class Misfit:
             action,
             between=self._between(key),
         )
+
+    def replaces(self, verdict: str) -> bool:
+        """Return whether it says more than a verdict of numbers without a time axis.
+
+        Numbers that scatter more than declared, each for itself, leave some effect that
+        predicts a few of them better: there it has to be the probable cause.
+        """
+        best = max(self.choice.cause.values(), default=0.0)
+        return best > NAMED or (verdict == UNEXPLAINED and best > 0)
 
     def weights(self) -> dict[ModelKey, float]:
         """Return how much each model counts by its errors on left-out parts."""
