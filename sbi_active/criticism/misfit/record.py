@@ -130,14 +130,15 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
             left-out trials better: larger noise or something undeclared.
         misfit: The models.
     """
-    own = tracing.evidences.get(tracing.model)
-    key = ModelKey(tracing.key.effects)
-    if own is None or key not in misfit.search.found:
-        return tracing
-    model = misfit.model(key)
-    u = _drawn(misfit.rivals, model, model.u, misfit.covariance(key))
-    draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
-    found = tracing.evidences | {tracing.model: replace(own, draws=draws)}
+    found = dict(tracing.evidences)
+    for name, own in found.items():
+        key = ModelKey(own.key.effects)
+        if key not in misfit.search.found:
+            continue
+        model = misfit.model(key)
+        u = _drawn(misfit.rivals, model, model.u, misfit.covariance(key))
+        draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
+        found[name] = replace(own, draws=draws)
     return replace(tracing, evidences=found)
 
 

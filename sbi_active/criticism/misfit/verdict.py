@@ -213,7 +213,8 @@ def settled(
         top = max(admitted(scored), key=lambda key: scored[key].log_p)
         missing = _missing(search, top)
         if not missing:
-            return choose(scored, search.names, equivalent)
+            timed = search.rivals.measurements.is_sequence
+            return choose(scored, search.names, equivalent, timed=timed)
         for key in missing:
             search.fit_set(key)
 
