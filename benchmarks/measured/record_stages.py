@@ -270,7 +270,9 @@ def table(rows: dict[str, Any], unit: str) -> str:
             f"{_errors(row.get('after'))} | {row['trial_simulations']:,} | "
             f"{row['cpu_seconds']:.0f} |"
         )
-    lines += [*_replays(rows), "", aliases(rows)]
+    lines += _replays(rows)
+    if any(name.startswith("without ") for name in rows):
+        lines += ["", aliases(rows)]
     lines += ["", f"| least squares | fitted, {unit} | {head} |", "|---|---|---|"]
     for name, row in rows.get("least squares", {}).items():
         lines.append(f"| {name} | {row['fitted']:.3f} | {_errors(row['held'])} |")
