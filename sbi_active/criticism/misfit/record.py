@@ -145,11 +145,20 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
 def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
-    return keep_draws(misfit.rivals, model, model.u, misfit.covariance(key), log_z)
+    cov = misfit.covariance(key)
+    # Draws as wide as misfit asks leave the valleys of what bends: left-out trials are
+    # predicted from the best fit, and so are others.
+    return keep_draws(misfit.rivals, model, model.u, cov, log_z, best=model.u)
 
 
 def keep_draws(
-    rivals: RivalSet, model: LinearModel, center: Array, cov: Array, log_z: float
+    rivals: RivalSet,
+    model: LinearModel,
+    center: Array,
+    cov: Array,
+    log_z: float,
+    *,
+    best: Array | None = None,
 ) -> Evidence:
     """Return a linear model's record, and keep its draws as its posterior sample.
 
@@ -159,6 +168,7 @@ def keep_draws(
         center: Of its posterior, shape (d,).
         cov: Of its posterior, shape (d, d).
         log_z: Its evidence, nats.
+        best: Where other trials are predicted from, shape (d,); None takes the draws.
     """
     key = model.key
     if key in rivals.fits:
@@ -166,7 +176,7 @@ def keep_draws(
     before = rivals.simulator.num_simulations if key.effects else 0
     u = _drawn(rivals, model, center, cov)
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
-    sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS))
+    sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS), best)
     rival = rivals.rival(key)
     evidence = Evidence(
         key=key,
@@ -178,6 +188,9 @@ def keep_draws(
         names=rivals.names_of(rival),
         draws=rival.coordinates.to_z(u)[:, : model.own],
         best_chi_square=model.chi_square[0],
+        best=None
+        if best is None
+        else rival.coordinates.to_z(best[None])[0, : model.own],
     )
     rivals.fits[key] = Fit(rival, sample, evidence)
     return evidence
@@ -244,7 +257,7 @@ def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials) -> Array:
     channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
     channel[m.position] = m.channel
     x = held_out.x.double().numpy().ravel()[prediction.position]
-    error = x - prediction.mean.mean(0)
+    error = x - prediction.middle
     return np.sqrt(_by_channel(error**2, channel[prediction.position]))
 
 
