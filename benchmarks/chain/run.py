@@ -13,9 +13,9 @@ between two seeds of the reference. "density_rank" is the share of draws whose d
 is below that of the truth: the smallest 90 % region holds it where that is at least .1,
 one answer a truth. "covered" counts parameters within their central 90 % interval; of
 one truth they go together, so that its interval has the truths' spread, not that of as
-many coins. Seeds 2200 to 2238 were judged before modes were searched as they are. CPU time is that of the refinement, and "simulator_s" what the same rows
-cost the simulator alone. Rows are added to results/, and those that are there are not
-run again.
+many coins. Seeds 2200 to 2238 were judged before modes were searched as they are. CPU
+time is that of the refinement, and "simulator_s" what the same rows cost the simulator
+alone. Rows are added to results/, and those that are there are not run again.
 """
 
 from __future__ import annotations
