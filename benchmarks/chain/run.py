@@ -3,7 +3,7 @@
     python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2300 2340
     python -m benchmarks.chain.run --references 2   # first seeds with a reference
     python -m benchmarks.chain.run --campaign      # CPU time of a round, chosen actions
-    python -m benchmarks.chain.run --summary
+    python -m benchmarks.chain.run --summary       # of rounds with --campaign
 
 Each seed has a truth drawn from the prior and six trials at random actions, refined
 with the defaults but for a defensive share of 1e-6, since one draw of the prior among
@@ -186,6 +186,23 @@ def summary(path: Path) -> str:
     return as_table(rows, [*lines[0]])
 
 
+def round_summary(path: Path) -> str:
+    """Return a line for each number of parameters, CPU seconds a round."""
+    lines = []
+    for dim, part in pd.read_csv(path).groupby("parameters"):
+        seconds, simulator = part["cpu_s"], part["simulation_s"]
+        line = [dim, part["seed"].nunique(), len(part), f"{seconds.median():.1f}"]
+        line += [f"{seconds.max():.1f}", f"{simulator.median():.2f}"]
+        parts = ("design_s", "training_s", "update_s")
+        line += [f"{part[name].median():.1f}" for name in parts]
+        lines.append(
+            [str(value) for value in [*line, f"{part['trustworthy'].mean():.2f}"]]
+        )
+    header = ["parameters", "campaigns", "rounds", "CPU s a round", "most"]
+    header += ["its rows' simulation", "design", "training", "update", "trustworthy"]
+    return as_table(lines, header)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
@@ -201,7 +218,7 @@ def main() -> None:
     name = "rounds.csv" if options.campaign else "beliefs.csv"
     path = options.out / name
     if options.summary:
-        print(summary(path))
+        print(round_summary(path) if options.campaign else summary(path))
         return
     for seed in range(*options.seeds):
         for dim in options.parameters:
