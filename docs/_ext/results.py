@@ -68,6 +68,11 @@ TABLES = {
     "A chain of many parameters": (
         "benchmarks.md#a-chain-of-many-parameters",
         "benchmarks.chain.run --summary",
+        "benchmarks.chain.run --campaign --summary",
+    ),
+    "Robust updates": (
+        "robust.md",
+        "benchmarks.chain.robust --summary",
     ),
     "Bad networks and beliefs flagged": (
         "benchmarks.md#bad-networks-and-beliefs-flagged",
