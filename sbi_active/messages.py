@@ -62,6 +62,7 @@ ANCHORS = {
     "begin up to": "late-starts",
     "have a measurement and no input": "no-input",
     "takes no argument": "argument-not-taken",
+    "leave a polynomial of order": "not-polynomial",
     "expected at least 3 repeats to estimate noise": "few-repeats",
     # Of simulations.
     "simulations of the design are": "rows-missing",

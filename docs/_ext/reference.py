@@ -25,10 +25,7 @@ FURTHER = {
     "actions": {"sbi_active.actions.waveforms": ()},
     "criticism": {
         "sbi_active.criticism.results": (),
-        "sbi_active.criticism.effects.first_samples": (
-            "start_from_first_samples",
-            "zero_from_first_samples",
-        ),
+        "sbi_active.criticism.effects.first_samples": ("zero_from_first_samples",),
     },
     "design": {"sbi_active.export": ("to_inference_data",)},
     "inference": {"sbi_active.inference.beliefs.diagnostics": ()},
