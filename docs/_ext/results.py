@@ -91,7 +91,7 @@ TABLES = {
         "benchmarks.criticism.campaign --summary --policy check",
     ),
     "Verdicts where every model is wrong": (
-        "benchmarks.misfit.run --summary --group own --first 1100",
+        "benchmarks.misfit.run --summary",
         "benchmarks.misfit.start_states --summary",
     ),
     "Forces that nobody declared": ("benchmarks.forces.run --summary",),
