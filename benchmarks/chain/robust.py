@@ -102,6 +102,8 @@ def summary(rows: pd.DataFrame) -> str:
     """Return a line a case; only seeds that both methods ran count."""
     lines = []
     for case, part in rows.groupby("case"):
+        if {*METHODS} - {*part["method"]}:
+            continue
         table = part.pivot(index="seed", columns="method", values="log_prob_truth")
         table, own = table.dropna(), part[part["method"] == "robust"]
         gain, r_hat = table["robust"] - table["plain"], own["largest_r_hat"]
@@ -109,7 +111,7 @@ def summary(rows: pd.DataFrame) -> str:
         lines.append(
             [
                 *(str(case), str(len(table))),
-                f"{gain.median():.2f}",
+                f"{gain.median():.3g}",
                 f"{gain.min():.3g} to {gain.max():.3g}",
                 f"{own['probability_outlier'].median():.2f}",
                 f"{own['probability_others'].max():.2f}",
