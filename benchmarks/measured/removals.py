@@ -128,7 +128,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
                 f"| {name} | {verdict} | {causes} | {row['trial_simulations']:,} | "
                 f"{row['cpu_seconds']:.0f} |"
             )
-        real = {CAUSE, BESIDE} if which == "servo" else set()
+        real = {CAUSE} if which == "servo" else set()
         alias = [row for row in own.values() if {*row["named"]} - real]
         told = sum(row["share_said"] for row in alias)
         lines += [
