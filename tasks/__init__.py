@@ -12,7 +12,7 @@ from sbi_active.tasks.chain import ChainTask
 from sbi_active.tasks.location_finding import LocationFindingTask
 from sbi_active.tasks.numerical import NumericalTask
 from sbi_active.tasks.oscillator import OscillatorTask
-from sbi_active.tasks.pouring import PouringTask
+from sbi_active.tasks.pouring import PouringRealTask, PouringTask
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask
 
 __all__ = ["TASKS", "Task", "get_task"]
@@ -22,6 +22,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "oscillator": OscillatorTask,
     "box_collision": BoxCollisionTask,
     "pouring": PouringTask,
+    "pouring_real": PouringRealTask,
     "servo_pendulum": ServoPendulumTask,
     "ball_drops": BallDropsTask,
     "location_finding": LocationFindingTask,

@@ -37,7 +37,8 @@ class Task(ABC):
         prior: Over the parameters.
         actions: The default action space.
         simulator: With its noise.
-        theta_true: Parameters of the real system, shape (theta_dim,).
+        theta_true: Parameters of the real system, shape (theta_dim,); NaN where it is
+            no point of the model.
     """
 
     name: str

@@ -1,7 +1,13 @@
 """Pours from the prior, kept as poses: what a first round may cost nothing of.
 
-    python -m benchmarks.pouring.bank FOLDER --rows 6000             # 27 actions
+    python -m benchmarks.pouring.bank FOLDER --rows 2300             # 27 actions
+    python -m benchmarks.pouring.bank FOLDER --part likely --rows 150
+    python -m benchmarks.pouring.bank FOLDER --part repeats --rows 100
     python -m benchmarks.pouring.bank FOLDER --report
+
+A part ``likely`` pours at the actions that designs choose most alone, and is learned
+from as ``prior`` is; ``repeats`` pours each theta five times at one action, half of
+them at those, and tunes alone.
 
 Resumable: files of 50 rows each, written whole. Row i of a part is a function of the
 part's name and i alone, so that any number of processes may fill one folder, each with
@@ -26,8 +32,10 @@ from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 
 ROWS_A_FILE = 50
-#: Task by part.
-PARTS = {"prior": "pouring"}
+PARTS = ("prior", "likely", "repeats")
+AT_A_THETA = 5  # pours, of part "repeats"
+#: Actions that designed campaigns choose most.
+LIKELY = ((20, 0, 0.5), (20, 0, 2), (20, -30, 5), (140, -30, 5), (140, 0, 2))
 
 
 @dataclass(frozen=True)
@@ -56,12 +64,21 @@ def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
     with forked_generators(seed):
         theta = task.prior.sample(torch.Size([ROWS_A_FILE]))
     action = task.actions.sample((ROWS_A_FILE,), seed=seed)
+    likely = torch.tensor(LIKELY, dtype=action.dtype)
+    if part == "likely":
+        action = likely.repeat(-(-ROWS_A_FILE // len(likely)), 1)[:ROWS_A_FILE]
+    elif part == "repeats":
+        num = ROWS_A_FILE // AT_A_THETA
+        again = likely[torch.arange(num) % len(likely)]
+        some = torch.where(torch.arange(num)[:, None] < num // 2, action[:num], again)
+        theta = theta[:num].repeat_interleave(AT_A_THETA, 0)
+        action = some.repeat_interleave(AT_A_THETA, 0)
     return theta, action, row_seeds(seed, ROWS_A_FILE)
 
 
 def fill(folder: Path, part: str, num: int, share: tuple[int, int]) -> None:
     """Simulate the files that are missing."""
-    task: Any = get_task(PARTS[part])
+    task: Any = get_task("pouring")
     folder = folder / part
     folder.mkdir(parents=True, exist_ok=True)
     mine, of = share
@@ -105,6 +122,18 @@ def read(folder: Path, part: str = "prior", *, most: int | None = None) -> Rows:
         torch.from_numpy(np.concatenate([f["action"] for f in files])),
         np.concatenate([f["poses"] for f in files]),
         sum(float(f["cpu_seconds"]) for f in files),
+    )
+
+
+def read_parts(folder: Path, parts: tuple[str, ...]) -> Rows:
+    """Return the rows of those parts that are there, the first of which must be."""
+    found = [read(folder, parts[0])]
+    found += [read(folder, part) for part in parts[1:] if (folder / part).exists()]
+    return Rows(
+        torch.cat([rows.theta for rows in found]),
+        torch.cat([rows.action for rows in found]),
+        np.concatenate([rows.poses for rows in found]),
+        sum(rows.cpu_seconds for rows in found),
     )
 
 

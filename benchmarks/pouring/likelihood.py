@@ -8,14 +8,28 @@ coverage, or principal components of blurred images):
     + \log t_\nu(s(x); m(\theta), \Sigma + V(\theta)),
 
 s three learned numbers (Fearnhead & Prangle 2012), m and V Gaussian processes with
-learned noise, and Student errors from residuals of left-out pours (Wood, Nature 2010).
+learned noise, and Student errors from residuals of left-out pours (Wood, Nature 2010),
+their size :math:`\Sigma(\theta)` log-quadratic in theta.
 An image without a cube has the first term alone: its statistics are one atom, which no
 density describes. A belief takes p to the power w that gives left-out pours the highest
 posterior density: 1 where the model is right, 0 where it tells nothing.
+
+What m is wrong by at theta is the same each time the action is repeated. With
+:math:`e \sim N(0, V + c \Sigma)` shared by repeats and :math:`(1 - c) \Sigma` of each
+alone, k earlier statistics of mean :math:`\bar s` leave
+
+.. math::
+    m' = m + \frac{k (V + c \Sigma)}{(1 - c) \Sigma + k (V + c \Sigma)} (\bar s - m),
+
+and less of V, for each statistic by itself; and as the scale of Student's errors is
+theta's own, it is the same for all repeats, which tell of it. So a repeat tells less
+than a first pour. c is ``SHARED``, from pours of one theta and action (``repeats.py``),
+and so is ``DOUBT``, the share of outcomes that tell nothing of theta.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,6 +57,12 @@ NUM_CELLS = 10  # along each parameter, of the grid that left-out pours are judg
 FEWEST = 24  # pours with a cube in view, to learn a density from
 LEAST = -9.0  # log probability of what no pour of an action did
 POWERS = np.linspace(0, 1.2, 13)
+#: Share of the noise's variance that repeats of an action have in common.
+SHARED = 0.5
+#: Share of outcomes that are taken to tell nothing.
+DOUBT = 0.1
+LOG_SQUARE = -1.27, np.pi**2 / 2  # mean and variance of log chi^2 of one degree
+SLOPE = 0.5  # deviation a priori of coefficients of the noise's log variance
 
 
 def thumbnails(images: Array) -> Array:
@@ -74,22 +94,28 @@ class ImageLikelihood:
     Attributes:
         statistic: Of summaries; None where too few pours had a cube in view.
         processes: One a statistic.
-        sd: Scale of the Student errors, shape (q,).
+        sd: Scale of the Student errors at typical theta, shape (q,).
+        uneven: Of the logarithm of its square, shape (p, q).
+        typical: Mean of its features, shape (p,).
         root: Cholesky factor of their correlation, shape (q, q).
         freedom: Their degrees of freedom.
         empty: Probability of an image without cubes; None where no pour had one.
         filled: Of the opposite.
         power: That a belief takes it to.
+        shared: Share of the noise's variance that repeats have in common.
     """
 
     statistic: Statistic | None
     processes: tuple[GaussianProcess, ...]
     sd: Array
+    uneven: Array
+    typical: Array
     root: Array
     freedom: float
     empty: TrialOutcome | None
     filled: TrialOutcome | None
     power: float = 1.0
+    shared: float = SHARED
 
     @staticmethod
     def fit(theta: Array, summary: Array, is_empty: Array) -> ImageLikelihood:
@@ -103,7 +129,9 @@ class ImageLikelihood:
         seen = ~is_empty
         if seen.sum() < FEWEST:
             none = np.zeros(0)
-            return ImageLikelihood(None, (), none, np.eye(1), 5.0, empty, filled)
+            return ImageLikelihood(
+                None, (), none, none, none, np.eye(1), 5.0, empty, filled
+            )
         statistic, own = learned_statistic(summary[seen], z[seen], seed=0)
         processes = tuple(
             GaussianProcess.fit(z[seen], own[:, [j]], noisy=True)
@@ -111,19 +139,53 @@ class ImageLikelihood:
         )
         left_out = np.concatenate([p.left_out for p in processes], 1)
         sd = np.concatenate([p.noise_sd for p in processes])
-        root = correlation_root(left_out / sd)
-        square = (np.linalg.solve(root, (left_out / sd).T) ** 2).sum(0)
+        features = _quadratic(z[seen])
+        typical = features.mean(0)
+        uneven = _log_variance(features - typical, left_out)
+        white = left_out / sd * np.exp(-0.5 * (features - typical) @ uneven)
+        root = correlation_root(white)
+        square = (np.linalg.solve(root, white.T) ** 2).sum(0)
         freedom, scale = _student(square, own.shape[1])
         return ImageLikelihood(
-            statistic, processes, sd * scale, root, freedom, empty, filled
+            statistic,
+            processes,
+            sd * scale,
+            uneven,
+            typical,
+            root,
+            freedom,
+            empty,
+            filled,
         )
 
-    def predict(self, theta: Array) -> tuple[Array, Array]:
-        """Return means and deviations of statistics at theta (n, 3), both (n, q)."""
-        parts = [process.predict(2 * theta - 1) for process in self.processes]
-        means, variances = zip(*parts, strict=True)
-        variance = np.concatenate(variances, 1)
-        return np.concatenate(means, 1), np.sqrt(self.sd**2 + variance)
+    def parts(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Return means, V and Sigma of statistics at theta (n, 3), each (n, q)."""
+        z = 2 * theta - 1
+        means, errors = zip(*(p.predict(z) for p in self.processes), strict=True)
+        noise = self.sd**2 * np.exp((_quadratic(z) - self.typical) @ self.uneven)
+        return np.concatenate(means, 1), np.concatenate(errors, 1), noise
+
+    def predict(
+        self,
+        theta: Array,
+        earlier: Sequence[Array] = (),
+        parts: tuple[Array, Array, Array] | None = None,
+    ) -> tuple[Array, Array, float]:
+        """Return means and deviations of statistics, both (n, q), and their freedom.
+
+        Args:
+            theta: Shape (n, 3).
+            earlier: Statistics of earlier trials of this action, each of shape (q,).
+            parts: Of these theta, where they are known.
+        """
+        known = self.parts(theta) if parts is None else parts
+        freedom, square = self.freedom, np.zeros(len(theta))
+        for k, seen in enumerate(earlier):
+            mean, spread = repeated(*known, earlier[:k], self.shared)
+            square += self.square(seen - mean, spread)
+        mean, spread = repeated(*known, earlier, self.shared)
+        later = freedom + mean.shape[1] * len(earlier)
+        return mean, spread * np.sqrt((freedom + square) / later)[:, None], later
 
     def probability_empty(self, theta: Array) -> Array:
         """Return log P(empty) and log P(not empty), shape (2, n)."""
@@ -134,42 +196,63 @@ class ImageLikelihood:
         both = np.stack([self.empty.log_prob(z), self.filled.log_prob(z)])
         return both - logsumexp(both, 0)
 
-    def at(self, theta: Array, observed: Array | None) -> Array:
+    def at(
+        self, theta: Array, observed: Array | None, earlier: Sequence[Array] = ()
+    ) -> Array:
         """Return w log p of one outcome at theta (n, 3), shape (n,).
 
         Args:
             theta: Shape (n, 3).
             observed: Its statistics, shape (q,); None of an image without cubes.
+            earlier: As in :meth:`predict`.
         """
-        return self.at_each(theta, [observed])[0]
+        return self.at_each(theta, [observed], earlier)[0]
 
-    def at_each(self, theta: Array, outcomes: list[Any]) -> Array:
+    def at_each(
+        self,
+        theta: Array,
+        outcomes: list[Any],
+        earlier: Sequence[Array] = (),
+        parts: tuple[Array, Array, Array] | None = None,
+    ) -> Array:
         """Return w log p of outcomes at theta (n, 3), shape (outcomes, n)."""
         log_empty, log_filled = self.probability_empty(theta)
         found = np.empty((len(outcomes), len(theta)))
         mean = spread = np.zeros(0)
+        freedom = self.freedom
         if self.statistic is not None:
-            mean, spread = self.predict(theta)
+            mean, spread, freedom = self.predict(theta, earlier, parts)
         for row, seen in zip(found, outcomes, strict=True):
             if seen is None:
                 row[:] = log_empty
             elif self.statistic is None:
                 row[:] = np.maximum(log_filled, LEAST)
             else:
-                row[:] = log_filled + self.density(seen[None] - mean, spread)
+                row[:] = log_filled + self.density(seen[None] - mean, spread, freedom)
         return self.power * found
 
-    def density(self, residual: Array, spread: Array) -> Array:
-        """Return the Student log density, both (..., q) -> (...)."""
-        nu, q = self.freedom, residual.shape[-1]
+    def square(self, residual: Array, spread: Array) -> Array:
+        """Return the sum of whitened squares, both (..., q) -> (...)."""
         white = (residual / spread) @ np.linalg.inv(self.root).T
+        return (white**2).sum(-1)
+
+    def density(self, residual: Array, spread: Array, freedom: float) -> Array:
+        """Return the Student log density, both (..., q) -> (...)."""
+        nu, q = freedom, residual.shape[-1]
         constant = (
             gammaln(0.5 * (nu + q)) - gammaln(0.5 * nu) - 0.5 * q * np.log(nu * np.pi)
         )
         volume = np.log(spread).sum(-1) + np.log(np.diag(self.root)).sum()
-        return constant - volume - 0.5 * (nu + q) * np.log1p((white**2).sum(-1) / nu)
+        tail = np.log1p(self.square(residual, spread) / nu)
+        return constant - volume - 0.5 * (nu + q) * tail
 
-    def gain(self, theta: Array, num_outer: int, rng: np.random.Generator) -> Array:
+    def gain(
+        self,
+        theta: Array,
+        num_outer: int,
+        rng: np.random.Generator,
+        earlier: Sequence[Array] = (),
+    ) -> Array:
         r"""Return contributions to the expected information gain, nats, (num_outer,).
 
         .. math::
@@ -179,6 +262,7 @@ class ImageLikelihood:
             theta: Draws from the belief, shape (m, 3); outcomes are drawn at the first.
             num_outer: How many.
             rng: Of the outcomes.
+            earlier: As in :meth:`predict`.
         """
         uniform = rng.random(num_outer)
         if self.power == 0:
@@ -189,12 +273,12 @@ class ImageLikelihood:
         if self.statistic is None:
             every[is_full] = np.maximum(log_filled, LEAST)
         else:
-            mean, spread = self.predict(theta)
+            mean, spread, freedom = self.predict(theta, earlier)
             normal = rng.standard_normal((num_outer, mean.shape[1])) @ self.root.T
-            heavy = np.sqrt(self.freedom / rng.chisquare(self.freedom, num_outer))
+            heavy = np.sqrt(freedom / rng.chisquare(freedom, num_outer))
             x = mean[:num_outer] + spread[:num_outer] * normal * heavy[:, None]
             apart = np.asarray(x[is_full])[:, None] - np.asarray(mean)
-            every[is_full] = log_filled + self.density(apart, spread)
+            every[is_full] = log_filled + self.density(apart, spread, freedom)
         every = self.power * every
         own = every[np.arange(num_outer), np.arange(num_outer)]
         return own - np.asarray(logsumexp(every, axis=1)) + np.log(len(theta))
@@ -224,10 +308,11 @@ def cross_validated(
         ]
         log_p[out] = fitted.at_each(cells, seen)
     place = np.minimum((theta * NUM_CELLS).astype(int), NUM_CELLS - 1)
-    index = np.asarray(np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3))
-    score = [_told(power * log_p, index)[0].mean() for power in POWERS]
+    index = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)
+    own = np.take_along_axis(log_p, index[:, None], 1)[:, 0]
+    score = [_told(power * log_p, power * own)[0].mean() for power in POWERS]
     power = float(POWERS[int(np.argmax(score))])
-    told, mass = _told(power * log_p, index)
+    told, mass = _told(power * log_p, power * own)
     whole = ImageLikelihood.fit(theta, summary, is_empty)
     return replace(whole, power=power), told, mass
 
@@ -239,12 +324,68 @@ def observed(likelihood: ImageLikelihood, summary: Array, is_empty: bool) -> Any
     return likelihood.statistic(summary[None])[0]
 
 
-def _told(log_p: Array, index: Array) -> tuple[Array, Array]:
-    """Return log density of the truth's cell, and the mass of denser ones, (n,)."""
-    log_mass = log_p - logsumexp(log_p, 1, keepdims=True)
-    own = np.take_along_axis(log_mass, index[:, None], 1)
-    mass = np.where(log_mass > own, np.exp(log_mass), 0).sum(1)
-    return own[:, 0] + np.log(log_p.shape[1]), mass
+def doubted(log_p: Array, power: float) -> Array:
+    r"""Return w log p where a share of outcomes tells nothing, shape (..., n).
+
+    .. math::
+        w \log \Bigl((1 - \epsilon) p(x | \theta) + \epsilon \int p(x | \theta')
+        p(\theta') \, \mathrm d\theta' \Bigr)
+
+    Args:
+        log_p: w log p at draws from the prior, or at equal cells of it, (..., n).
+        power: w.
+    """
+    if power == 0:
+        return log_p
+    own = log_p / power
+    mean = logsumexp(own, -1, keepdims=True) - np.log(own.shape[-1])
+    return power * np.logaddexp(np.log(1 - DOUBT) + own, np.log(DOUBT) + mean)
+
+
+def repeated(
+    mean: Array, error: Array, noise: Array, earlier: Sequence[Array], shared: float
+) -> tuple[Array, Array]:
+    """Return mean and deviation of a statistic given earlier ones of the same action.
+
+    Args:
+        mean: Shape (n, q), as all that follow.
+        error: V.
+        noise: Sigma.
+        earlier: Statistics, each of shape (q,).
+        shared: c.
+    """
+    common, alone, num = error + shared * noise, (1 - shared) * noise, len(earlier)
+    if num:
+        known = num * common / (alone + num * common)
+        mean = mean + known * (np.mean([*earlier], 0) - mean)
+        common = common * (1 - known)
+    return mean, np.sqrt(alone + common)
+
+
+def _quadratic(z: Array) -> Array:
+    """Return linear and quadratic terms, (n, 3) -> (n, p)."""
+    row, column = np.triu_indices(z.shape[1])
+    return np.concatenate([z, z[:, row] * z[:, column]], 1)
+
+
+def _log_variance(features: Array, residual: Array) -> Array:
+    """Return coefficients (p, q) of log variances of residuals (n, q)."""
+    mean, variance = LOG_SQUARE
+    target = np.log(residual**2 + 1e-6 * (residual**2).mean(0)) - mean
+    gram = features.T @ features / variance + np.eye(features.shape[1]) / SLOPE**2
+    return np.linalg.solve(gram, features.T @ (target - target.mean(0)) / variance)
+
+
+def _told(log_p: Array, own: Array) -> tuple[Array, Array]:
+    """Return log density of the truth, and the mass of what is denser, (n,).
+
+    Args:
+        log_p: At cells of the prior, shape (n, m).
+        own: At the truth, shape (n,).
+    """
+    total = logsumexp(log_p, 1)
+    mass = np.where(log_p > own[:, None], np.exp(log_p - total[:, None]), 0).sum(1)
+    return own - total + np.log(log_p.shape[1]), mass
 
 
 def _student(square: Array, q: int) -> tuple[float, float]:

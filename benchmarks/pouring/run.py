@@ -10,36 +10,27 @@ method and target, in ``benchmarks/pouring/results``.
 
 Algorithm 1 on 100 cubes. A campaign simulates nothing but its trials: the likelihood of
 each action and summary is learned once from a bank of pours from the prior
-(``likelihood``), a belief is the product of its trials' on a grid, and the action
-(h, p, v, delta) is chosen by the expected information gain under the same likelihoods.
-NSBI has the same belief and random actions.
+(``likelihood``), a belief is the tempered product of its trials' on a grid, the action
+(h, p, v, delta) chosen by the expected information gain under the same likelihoods.
+NSBI has the same belief and random actions. ALHI and NLHI have one neural likelihood a
+summary in their place (``network``).
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import pickle
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.likelihood import (
-    ImageLikelihood,
-    components,
-    cross_validated,
-    observed,
-    thumbnails,
-)
-from benchmarks.pouring.reference import abc_log_prob
+from benchmarks.pouring.learned import ByAction, Earlier, by_nearest, kept
+from benchmarks.pouring.network import ByNetwork, kept_networks
 from benchmarks.pouring.summary import (
     bank_table,
     coverage_table,
@@ -49,13 +40,14 @@ from benchmarks.pouring.summary import (
 )
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
-from sbi_active.tasks.pouring import images_of, mesh_coverage
 
 RESULTS = Path(__file__).parent / "results"
-METHODS = ("asbi", "nsbi")
+METHODS = ("asbi", "nsbi", "alhi", "nlhi")
+ACTIVE, BY_NETWORK = ("asbi", "alhi"), ("alhi", "nlhi")
+#: The product of k trials is taken to the power k^-TEMPERED: what is chosen for its
+#: gain is chosen for the error of its learned likelihood too. From seeds 100 to 149.
+TEMPERED = 0.25
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
-NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain
-NUM_COMPONENTS = 36
 COLUMNS = [
     *["seed", "theta_true", "round", "height", "position", "rate", "delta", "in_view"],
     *["eig", "eig_se", "eig_pca", "eig_mesh", "log_prob_true", "hpd"],
@@ -63,148 +55,66 @@ COLUMNS = [
 ]
 
 
-@dataclass(frozen=True)
-class Learned:
-    """What one summary of an action's pours tells.
-
-    Attributes:
-        likelihood: Learned from them.
-        num: Pours behind it.
-        told: Log posterior density of each left-out pour's theta, shape (num,).
-        mass: Of what is denser, shape (num,).
-        mean: Of thumbnails, shape (900,), where the summary is components.
-        axes: Shape (900, k).
-    """
-
-    likelihood: ImageLikelihood
-    num: int
-    told: np.ndarray
-    mass: np.ndarray
-    mean: np.ndarray
-    axes: np.ndarray
-
-    def log_prob(self, theta: Tensor, image: Tensor, delta: int) -> Tensor:
-        """Return log densities of an image (22500,) at theta (n, 3)."""
-        coverage = mesh_coverage(image[None]).numpy().astype(np.float64)
-        summary = np.sqrt(coverage)
-        if not delta:
-            summary = (thumbnails(image[None].numpy()) - self.mean) @ self.axes
-        seen = observed(self.likelihood, summary[0], not coverage.any())
-        return torch.from_numpy(self.likelihood.at(theta.double().numpy(), seen))
-
-
-def learn(folder: Path, task: Any, most: int | None) -> list[list[Learned]]:
-    """Return what is learned of a bank, by delta and action."""
-    found: list[list[Learned]] = [[], []]
-    for delta, theta, summary, is_empty, basis in summarized(folder, task, most):
-        fitted, told, mass = cross_validated(theta, summary, is_empty)
-        found[delta].append(Learned(fitted, len(theta), told, mass, *basis))
-    return found
-
-
-def summarized(folder: Path, task: Any, most: int | None) -> Iterator[tuple[Any, ...]]:
-    """Yield delta, theta, summaries, whether empty, and components, by action."""
-    rows = read_bank(folder, most=most)
-    coverage, pictures = [], []
-    for start in range(0, len(rows), 500):
-        images = images_of(rows.poses[start : start + 500], task.pours.particles)
-        coverage.append(mesh_coverage(images).numpy().astype(np.float64))
-        pictures.append(thumbnails(images.numpy()))
-    mesh, small = np.concatenate(coverage), np.concatenate(pictures)
-    theta = rows.theta.double().numpy()
-    for action in task.actions.values:
-        mine = (rows.action == action).all(1).numpy()
-        is_empty = ~mesh[mine].any(1)
-        mean, axes = components(small[mine], NUM_COMPONENTS)
-        summaries = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
-        for delta, summary in enumerate(summaries):
-            yield delta, theta[mine], summary, is_empty, (mean, axes)
-
-
-def by_nearest(folder: Path, task: Any, most: int | None) -> list[list[np.ndarray]]:
-    """Return what nearest pours alone tell of left-out ones, by delta and action."""
-    found: list[list[np.ndarray]] = [[], []]
-    for delta, theta, summary, *_ in summarized(folder, task, most):
-        found[delta].append(abc_log_prob(theta, summary))
-    return found
-
-
 def run_trial(
-    task: Any, learned: list[list[Learned]], method: str, seed: int, rounds: int
+    task: Any, learned: ByAction | ByNetwork, is_active: bool, seed: int, rounds: int
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
-    belief, middles = GridBelief.uniform(), GridBelief.middles()
-    rows = []
+    belief, middles = GridBelief.uniform(), GridBelief.middles().double().numpy()
+    rows: list[dict[str, object]] = []
+    total = np.zeros(len(middles))
+    tempered = TEMPERED if isinstance(learned, ByAction) else 0.0
+    earlier: Earlier = defaultdict(list)
     for index in range(rounds):
         start = time.process_time()
-        gain = error = np.full((2, len(task.actions.values)), np.nan)
-        if method == "asbi":
+        gain = error = np.full((2, len(learned.actions)), np.nan)
+        if is_active:
             own_seed = derive_seed(seed, "gain", index)
-            gain, error = expected_gains(learned, belief, own_seed)
+            gain, error = learned.gains(belief, earlier, own_seed)
             choice = int(gain.argmax())
         else:
             with forked_generators(derive_seed(seed, "action", index)):
                 choice = int(torch.randint(gain.size, ()))
         delta, place = divmod(choice, gain.shape[1])
-        action = task.actions.values[place]
+        action = learned.actions[place]
         designed = time.process_time()
         image = task.real_system(action, seed=derive_seed(seed, "real", index))
-        own = learned[delta][place]
-        belief = GridBelief(belief.log_density + own.log_prob(middles, image, delta))
+        total += learned.log_likelihood(middles, image, delta, place, earlier)
+        belief = GridBelief(torch.from_numpy(total * (index + 1.0) ** -tempered))
         log_p = float(belief.log_prob(task.theta_true))
         with forked_generators(derive_seed(seed, "draws", index)):
             draws = belief.sample(torch.Size([NUM_DRAWS]))
-        rows.append(
-            {
-                "seed": seed,
-                "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
-                "round": index + 1,
-                **dict(
-                    zip(("height", "position", "rate"), action.tolist(), strict=True)
-                ),
-                "delta": delta,
-                "in_view": float((image > 0).float().mean()),
-                "eig": float(gain[delta, place]),
-                "eig_se": float(error[delta, place]),
-                "eig_pca": float(gain[0].max()),
-                "eig_mesh": float(gain[1].max()),
-                "log_prob_true": log_p,
-                "hpd": float((belief.log_prob(draws) > log_p).double().mean()),
-                "num_rows": own.num,
-                "power": own.likelihood.power,
-                "cpu_design": designed - start,
-                "cpu_trial": time.process_time() - designed,
-            }
-        )
+        row = {
+            "seed": seed,
+            "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
+            "round": index + 1,
+            **dict(zip(("height", "position", "rate"), action.tolist(), strict=True)),
+            "delta": delta,
+            "in_view": float((image > 0).float().mean()),
+            "eig": float(gain[delta, place]),
+            "eig_se": float(error[delta, place]),
+            "eig_pca": float(gain[0].max()),
+            "eig_mesh": float(gain[1].max()),
+            "log_prob_true": log_p,
+            "hpd": float((belief.log_prob(draws) > log_p).double().mean()),
+            "num_rows": learned.num if isinstance(learned, ByNetwork) else 0,
+            "power": np.nan,
+            "cpu_design": designed - start,
+            "cpu_trial": time.process_time() - designed,
+        }
+        if isinstance(learned, ByAction):
+            own = learned.learned[delta][place]
+            row |= {"num_rows": own.num, "power": own.likelihood.power}
+        rows.append(row)
     return rows
 
 
-def expected_gains(
-    learned: list[list[Learned]], belief: GridBelief, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains by delta and action, nats, and their errors, on common draws."""
-    with forked_generators(seed):
-        theta = belief.sample(torch.Size([NUM_ALL])).double().numpy()
-    gains = [
-        [
-            own.likelihood.gain(theta, NUM_OUTER, np.random.default_rng(seed))
-            for own in by_action
-        ]
-        for by_action in learned
-    ]
-    values = np.array(gains)
-    return values.mean(2), values.std(2) / np.sqrt(NUM_OUTER)
-
-
-def kept(arguments: argparse.Namespace) -> list[list[Learned]]:
-    """Return what is learned of the bank, from a file of our own where there is one."""
+def known(method: str, arguments: argparse.Namespace) -> ByAction | ByNetwork:
+    """Return what a method has learned of the bank."""
     path = arguments.learned
-    if path is not None and path.exists():
-        return pickle.loads(path.read_bytes())
-    learned = learn(arguments.bank, get_task("pouring"), arguments.most)
-    if path is not None:
-        path.write_bytes(pickle.dumps(learned))
-    return learned
+    if method not in BY_NETWORK:
+        return kept(arguments.bank, path)
+    own = None if path is None else path.with_suffix(".networks")
+    return kept_networks(arguments.bank, own)
 
 
 def make_task(target: str, seed: int) -> Any:
@@ -224,7 +134,7 @@ def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
 def run_missing(
     method: str,
     target: str,
-    learned: list[list[Learned]],
+    learned: ByAction | ByNetwork,
     arguments: argparse.Namespace,
 ) -> None:
     """Run the trials that are not in the file yet."""
@@ -236,7 +146,11 @@ def run_missing(
             continue
         start = time.process_time()
         rows = run_trial(
-            make_task(target, seed), learned, method, seed, arguments.rounds
+            make_task(target, seed),
+            learned,
+            method in ACTIVE,
+            seed,
+            arguments.rounds,
         )
         is_new = not path.exists()
         with path.open("a", newline="") as file:
@@ -262,11 +176,10 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--bank", type=Path, help="folder of pours")
     parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
-    parser.add_argument("--most", type=int, help="pours to take of it (all)")
     parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=[*METHODS])
     parser.add_argument("--trials", type=int, default=5)
-    parser.add_argument("--first", type=int, default=2_000, help="seed of the first")
+    parser.add_argument("--first", type=int, default=2_200, help="seed of the first")
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--summary", action="store_true", help="run nothing")
@@ -283,13 +196,14 @@ def main() -> None:
     targets = [arguments.target] if arguments.target else ["1", "2"]
     targets = ["prior"] if is_coverage else targets
     if not arguments.summary:
-        learned = kept(arguments)
         if arguments.table == "bank":
-            nearest = by_nearest(arguments.bank, get_task("pouring"), arguments.most)
-            print(bank_table(learned), reference_table(learned, nearest), sep="\n\n")
+            told = kept(arguments.bank, arguments.learned).learned
+            nearest = by_nearest(arguments.bank, get_task("pouring"))
+            print(bank_table(told), reference_table(told, nearest), sep="\n\n")
             return
-        for target in targets:
-            for method in arguments.methods:
+        for method in arguments.methods:
+            learned = known(method, arguments)
+            for target in targets:
                 run_missing(method, target, learned, arguments)
     cells = {}
     for method in arguments.methods:

@@ -12,7 +12,15 @@ from scipy import stats
 
 from sbi_active.plots import as_table
 
-__all__ = ["bank_table", "coverage_table", "read", "reference_table", "summarize"]
+__all__ = [
+    "bank_table",
+    "column",
+    "coverage_table",
+    "label",
+    "read",
+    "reference_table",
+    "summarize",
+]
 
 #: Section 5.4, read from the text: medians of ASBI after the first and last rounds.
 PUBLISHED = {
@@ -20,6 +28,8 @@ PUBLISHED = {
     ("asbi", "2"): "around 0.8 .. above 3.6",
     ("nsbi", "1"): "near 0",
     ("nsbi", "2"): "near 0",
+    ("alhi", "1"): "below -7",
+    ("alhi", "2"): "below -7",
 }
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
@@ -90,7 +100,29 @@ def summarize(cells: Cells) -> str:
         chosen,
         ["", "share at h = 20 cm", "share by mesh coverage", "gain: mesh less PCA"],
     )
-    return "\n\n".join([first, second, *active_against_random(cells)])
+    shares = [actions_table(cells[key], key[1]) for key in cells if key[0] == "asbi"]
+    return "\n\n".join([first, second, *shares, *active_against_random(cells)])
+
+
+def label(row: Mapping[str, str]) -> str:
+    """Return an action in words."""
+    numbers = (float(row[k]) for k in ("height", "position", "rate"))
+    summary = "mesh" if int(row["delta"]) else "PCA"
+    return ", ".join(f"{v:g}" for v in numbers) + f", {summary}"
+
+
+def actions_table(rows: Rows, target: str) -> str:
+    """Return the share of trials at each action that was chosen, round by round."""
+    rounds = sorted({int(r["round"]) for r in rows})
+    table = []
+    for name in sorted({label(r) for r in rows}):
+        share = [
+            np.mean([label(r) == name for r in rows if int(r["round"]) == number])
+            for number in rounds
+        ]
+        table.append([name, " / ".join(f"{v:.1f}" for v in share)])
+    head = f"target {target}: h cm, p cm, v rad/s, summary"
+    return as_table(table, [head, "share of ASBI's trials by round"])
 
 
 def active_against_random(cells: Cells) -> list[str]:

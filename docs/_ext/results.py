@@ -91,11 +91,14 @@ TABLES = {
         "benchmarks.criticism.campaign --summary --policy check",
     ),
     "Verdicts where every model is wrong": (
-        "benchmarks.misfit.run --summary --group own --first 1100",
+        "benchmarks.misfit.run --summary",
         "benchmarks.misfit.start_states --summary",
     ),
     "Forces that nobody declared": ("benchmarks.forces.run --summary",),
-    "A chain of many parameters": ("benchmarks.chain.run --summary",),
+    "A chain of many parameters": (
+        "benchmarks.chain.run --summary",
+        "benchmarks.chain.run --campaign --summary",
+    ),
     "Bad networks and beliefs flagged": ("benchmarks.calibration.run --summary",),
     "Dear simulators": ("benchmarks.dear.run --table",),
     "The cost of a round": (
@@ -103,6 +106,7 @@ TABLES = {
         "benchmarks.table cost/network.json",
         "benchmarks.table cost/doors.json --only cpu_s*",
     ),
+    "Robust updates": ("benchmarks.chain.robust --summary",),
     "sbi's own tests with the class swapped": (
         "benchmarks.table sbi_suite/result.json --only date sbi original* swapped*",
     ),

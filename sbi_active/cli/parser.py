@@ -18,6 +18,7 @@ TASKS = (
     "oscillator",
     "box_collision",
     "pouring",
+    "pouring_real",
     "servo_pendulum",
     "ball_drops",
     "location_finding",

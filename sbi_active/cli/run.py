@@ -139,6 +139,8 @@ def _reference(task: Task, trials: Sequence[Trial]) -> Any:
     if used:
         x = torch.stack([t.x for t in used if t.x is not None])
         return task.reference(torch.stack([t.action for t in used]), x)
+    if not bool(task.theta_true.isfinite().all()):  # nobody knows it
+        return None
     action = task.actions.values[:1]
     row = simulate(task.simulator, task.theta_true[None], action, seed=0)
     return task.reference(action[:0], row.x[:0])
@@ -152,7 +154,9 @@ def _round_record(
     assert trial.design is not None
     assert trial.x is not None
     index = trial.design.index
-    log_prob = float(campaign.belief.log_prob(task.theta_true))
+    log_prob = math.nan
+    if bool(task.theta_true.isfinite().all()):
+        log_prob = float(campaign.belief.log_prob(task.theta_true))
     record = {
         "round": len(campaign.history),
         "action": trial.action.tolist(),
@@ -207,7 +211,14 @@ def _save(
         "seed": arguments.seed,
         "version": __version__,
         "seconds": wall,
-        "rounds": rounds,
+        "rounds": [
+            # JSON has no NaN, which is where there is no truth.
+            {
+                k: None if isinstance(v, float) and math.isnan(v) else v
+                for k, v in r.items()
+            }
+            for r in rounds
+        ],
     }
     (arguments.out / "result.json").write_text(json.dumps(summary, indent=2) + "\n")
     data = to_inference_data(campaign, seed=arguments.seed)

@@ -124,9 +124,9 @@ class Particles:
         )
 
 
-def cubes(num: int, *, density: float = 1000.0) -> Particles:
-    """Return the paper's cubes, 4 x 4 x 5 mm."""
-    return Particles(np.tile(CUBE, (num, 1)), density=density)
+def cubes(num: int, *, density: float = 1000.0, size: float = 1.0) -> Particles:
+    """Return cubes of a size, 1 for the paper's 4 x 4 x 5 mm."""
+    return Particles(size * np.tile(CUBE, (num, 1)), density=density)
 
 
 def load_pybullet() -> ModuleType:

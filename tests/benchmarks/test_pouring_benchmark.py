@@ -1,15 +1,26 @@
 import numpy as np
 import pytest
+import torch
 
+from benchmarks.pouring.bank import (
+    AT_A_THETA,
+    LIKELY,
+    ROWS_A_FILE,
+    draw,
+)
+from benchmarks.pouring.figures import log_prob_figure, selected_figure
 from benchmarks.pouring.likelihood import (
     ImageLikelihood,
     components,
     cross_validated,
+    doubted,
     grid,
     observed,
+    repeated,
     thumbnails,
 )
 from benchmarks.pouring.reference import abc_log_prob
+from sbi_active.tasks import get_task  # pyright: ignore
 
 
 def pours(n, seed=0, noise=0.1):
@@ -92,3 +103,90 @@ def test_thumbnails_and_components_keep_where_cubes_lie():
     assert axes.shape == (900, 5)  # six images span five dimensions
     back = mean + (small - mean) @ axes @ axes.T
     np.testing.assert_allclose(back, small, atol=1e-8)
+
+
+def test_a_repeat_tells_less_than_a_first_pour():
+    mean, error, noise = np.array([[0.0]]), np.array([[0.04]]), np.array([[1.0]])
+    first = repeated(mean, error, noise, [], 0.2)
+    assert first[0] == 0
+    assert first[1] == pytest.approx(np.sqrt(1.04))
+    # The error that repeats share: exact for normal variables.
+    earlier = [np.array([0.5]), np.array([1.5])]
+    common, alone = 0.24, 0.8
+    cover = common + alone * np.eye(3)
+    known = cover[2, :2] @ np.linalg.inv(cover[:2, :2])
+    moved = repeated(mean, error, noise, earlier, 0.2)
+    assert moved[0] == pytest.approx(known @ [0.5, 1.5])
+    assert moved[1] ** 2 == pytest.approx(cover[2, 2] - known @ cover[:2, 2])
+    # Without anything in common, earlier pours of the action change nothing.
+    same = repeated(mean, 0 * error, noise, earlier, 0.0)
+    assert same[0] == 0
+    assert same[1] == 1
+
+
+def test_what_may_tell_nothing_is_bounded():
+    log_p = np.log(np.array([1e-30, 1.0, 2.0]))
+    assert doubted(log_p, 1.0) == pytest.approx(
+        np.log([0.1, 0.9 + 0.1, 1.8 + 0.1]), abs=1e-9
+    )
+    assert doubted(0.5 * log_p, 0.5) == pytest.approx(0.5 * doubted(log_p, 1.0))
+    assert (doubted(np.zeros(3), 0.0) == 0).all()
+
+
+def test_repeats_far_out_widen_what_is_expected():
+    theta, summary, empty = pours(60)
+    fitted = ImageLikelihood.fit(theta, summary, np.zeros_like(empty))
+    there = np.array([[0.5, 0.5, 0.5]])
+    mean, spread, freedom = fitted.predict(there)
+    near, far = mean[0], mean[0] + 8 * spread[0]
+    close, wide = (fitted.predict(there, [x])[1:] for x in (near, far))
+    assert close[1] == wide[1] == freedom + 3
+    assert (close[0] < spread).all()
+    assert (wide[0] > 1.3 * close[0]).all()
+
+
+def test_noise_that_grows_with_theta_is_seen():
+    rng = np.random.default_rng(0)
+    theta = rng.random((240, 3))
+    size = np.exp(1.5 * theta[:, :1])
+    summary = theta + 0.05 * size * rng.standard_normal((240, 3))
+    fitted = ImageLikelihood.fit(theta, summary, np.zeros(240, dtype=bool))
+    ends = np.array([[0.1, 0.5, 0.5], [0.9, 0.5, 0.5]])
+    _, _, noise = fitted.parts(ends)
+    ratio = np.sqrt(noise[1] / noise[0])
+    assert ratio.min() > 1.5
+    assert ratio.max() < 6  # 3.3
+
+
+def test_a_bank_of_repeats_pours_each_theta_again():
+    pytest.importorskip("pybullet")
+    task = get_task("pouring")
+    theta, action, seeds = draw(task, "repeats", 0)
+    assert len(seeds.unique()) == ROWS_A_FILE
+    for k in range(0, ROWS_A_FILE, AT_A_THETA):
+        assert len(theta[k : k + AT_A_THETA].unique(dim=0)) == 1
+        assert len(action[k : k + AT_A_THETA].unique(dim=0)) == 1
+    assert len(theta.unique(dim=0)) == ROWS_A_FILE // AT_A_THETA
+    _, action, _ = draw(task, "likely", 0)
+    assert len(action.unique(dim=0)) == len(LIKELY)
+    first, again = draw(task, "prior", 0)[0], draw(task, "prior", 0)[0]
+    assert torch.equal(first, again)
+    assert len(first.unique(dim=0)) == ROWS_A_FILE
+
+
+def test_figures_are_drawn_of_the_rows(tmp_path):
+    header = "seed,round,height,position,rate,delta,log_prob_true\n"
+    for target in ("1", "2"):
+        rows = [f"{s},{r},20,0,2,{s % 2},{r + s}" for s in (1, 2) for r in (1, 2)]
+        for method in ("asbi", "alhi"):
+            path = tmp_path / f"target_{target}_{method}.csv"
+            path.write_text(header + "\n".join(rows) + "\n")
+    first, second = log_prob_figure(tmp_path).axes
+    assert [line.get_label() for line in first.get_legend().get_lines()] == [
+        "ASBI",
+        "ALHI",
+    ]
+    middle = next(line for line in first.lines if line.get_label() == "ASBI")
+    assert [*middle.get_ydata()] == [2.5, 3.5]  # medians of the two trials
+    bars = selected_figure(tmp_path).axes[0].patches
+    assert [bar.get_height() for bar in bars] == [0.5] * 4
