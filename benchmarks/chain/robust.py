@@ -104,8 +104,9 @@ def summary(rows: pd.DataFrame) -> str:
     for case, part in rows.groupby("case"):
         if {*METHODS} - {*part["method"]}:
             continue
-        table = part.pivot(index="seed", columns="method", values="log_prob_truth")
-        table, own = table.dropna(), part[part["method"] == "robust"]
+        table: Any = part.pivot(index="seed", columns="method", values="log_prob_truth")
+        table = table.dropna()
+        own: Any = part[part["method"] == "robust"]
         gain, r_hat = table["robust"] - table["plain"], own["largest_r_hat"]
         cost = part.groupby("method")["cpu_s"].median()
         lines.append(

@@ -164,7 +164,7 @@ def summary(path: Path) -> str:
         known = part.dropna(subset="kl")
         share, n = part["covered"] / int(dim), len(part)  # pyright: ignore
         off = t.ppf(0.975, n - 1) * share.std() / n**0.5 if n > 1 else np.nan
-        held = int((part["density_rank"] >= 1 - LEVEL).sum())
+        held = int(np.sum(part["density_rank"].to_numpy() >= 1 - LEVEL))
         low, high = binom.ppf([0.025, 0.975], n, LEVEL).astype(int)
         lines.append(
             {
