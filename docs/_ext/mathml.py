@@ -31,7 +31,9 @@ def _block(writer: Any, node: nodes.Element) -> None:
     number = f'<span class="eqno">({node["number"]})</span>' if node["number"] else ""
     name = f' id="{node["ids"][0]}"' if node["ids"] else ""
     formula = _converted(node, as_block=True)
-    writer.body.append(f'<div class="math"{name} tabindex="0">{number}{formula}</div>')
+    writer.body.append(
+        f'<div class="math"{name} tabindex="0"><span>{formula}</span>{number}</div>'
+    )
     raise nodes.SkipNode
 
 

@@ -76,7 +76,8 @@ def groups(package: str) -> Iterator[tuple[str, list[str]]]:
 def first_line(value: object) -> str:
     """Return what a name is, in a line."""
     text = (inspect.getdoc(value) or "").split("\n\n")[0].replace("\n", " ")
-    return text.replace("|", "\\|") if callable(value) else ""
+    text = re.sub(r":math:`(.+?)`", r"$\1$", text).replace("|", "\\|")
+    return text if callable(value) else ""
 
 
 def page(package: str) -> str:

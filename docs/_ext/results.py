@@ -202,11 +202,11 @@ def file_of(title: str) -> Path:
 
 def tables(commands: Iterable[str]) -> str:
     """Return tables, each under the command that printed it."""
-    lines: list[str] = []
+    lines = ["::::{container} rows", ""]
     for command in commands:
         lines += [f"```bash\npython -m {command}\n```", ""]
         lines += [as_markdown(printed(command)), ""]
-    return "\n".join(lines)
+    return "\n".join([*lines, "::::", ""])
 
 
 def _generate(app: Sphinx) -> None:
