@@ -17,8 +17,7 @@ from sbi_active.plots import save
 __all__ = ["log_prob_figure", "selected_figure"]
 
 RESULTS = Path(__file__).parent / "results"
-METHODS = ("asbi", "nsbi", "alhi", "nlhi")
-COLORS = dict(zip(METHODS, ("C0", "C1", "C2", "C7"), strict=True))
+COLORS: dict[str, str] = {"asbi": "C0", "nsbi": "C1", "alhi": "C2", "nlhi": "C7"}
 CLIPPED = -7.0  # the paper's Figure 11 too shows no less
 
 
@@ -59,7 +58,7 @@ def log_prob_figure(results: Path = RESULTS) -> Any:
     figure, both = subplots(2)
     for target, axes in zip(("1", "2"), both, strict=True):
         by_round = {}
-        for method in METHODS:
+        for method in COLORS:
             rows = read(results / f"target_{target}_{method}.csv")
             if rows:
                 last = max(int(r["round"]) for r in rows)

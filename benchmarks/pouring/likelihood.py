@@ -308,7 +308,7 @@ def cross_validated(
         ]
         log_p[out] = fitted.at_each(cells, seen)
     place = np.minimum((theta * NUM_CELLS).astype(int), NUM_CELLS - 1)
-    index = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)
+    index = np.asarray(np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3))
     own = np.take_along_axis(log_p, index[:, None], 1)[:, 0]
     score = [_told(power * log_p, power * own)[0].mean() for power in POWERS]
     power = float(POWERS[int(np.argmax(score))])
