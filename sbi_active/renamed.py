@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pkgutil
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
+
+from sbi_active.messages import warn
 
 
 def former_names(
@@ -26,7 +27,7 @@ def former_names(
         if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home, _, new = names[name].partition(":")
-        warnings.warn(
+        warn(
             f"{package}.{name} goes in the next version: use {home}.{new}",
             DeprecationWarning,
             stacklevel=stacklevel,

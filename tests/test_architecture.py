@@ -18,6 +18,8 @@ MOST_LINES = 400  # of a file
 #: imports from its own floor and from those before it; never from a later one.
 FLOORS = (
     "callers",
+    "messages",
+    "renamed",
     "seeding",
     "threads",
     "notebook",

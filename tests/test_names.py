@@ -46,7 +46,7 @@ def test_public_names_are_few():
     """A user reads them all in a minute; 80 or so, and the top level's again."""
     assert len(sbi_active.__all__) <= 25
     names = [importlib.import_module(package).__all__ for package in PACKAGES[1:]]
-    assert sum(map(len, names)) <= 88
+    assert sum(map(len, names)) <= 89  # the start of a film among them
 
 
 def test_the_top_level_s_three_lists_agree():

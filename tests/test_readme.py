@@ -211,6 +211,16 @@ def test_question_thrown_ball(run, capsys, tmp_path, monkeypatch):
     assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
 
 
+def test_question_recordings(run, tmp_path, monkeypatch):
+    pytest.importorskip("mcap")
+    monkeypatch.chdir(tmp_path)
+    (read,) = run("docs/howto/recordings.md")
+    assert list(read.frame.columns) == ["time", "angle", "motor"]
+    assert read.frame.time.iloc[-1] == pytest.approx(0.99)
+    assert read.frame.angle.iloc[-1] == pytest.approx(0.99)
+    assert not read.frame.isna().any().any()
+
+
 def test_no_page_is_forgotten():
     pages = {
         page.name
@@ -234,6 +244,7 @@ def test_no_page_is_forgotten():
         "which_parameters.md",
         "two_models.md",
         "thrown_ball.md",
+        "recordings.md",
         "pouring.md",
         "robust.md",
     }

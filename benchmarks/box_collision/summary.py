@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from benchmarks.published import published
 from sbi_active.plots import as_table
 
 __all__ = [
@@ -30,19 +31,10 @@ PARTS = {  # of a round, in the paper's words
     "refinement": ("scoring", "update"),
 }
 #: Table 2: mean and standard deviation of 50 trials, 1e-3 m, at 3, 5 and 7 m/s.
-PUBLISHED = {
-    ("asbi", "1"): ("2.7 +- 0.6", "10.3 +- 2.5", "22.7 +- 8.7"),
-    ("nsbi", "1"): ("19.5 +- 23", "158 +- 230", "532 +- 590"),
-    ("alhi", "1"): ("4.4 +- 4.3", "20.5 +- 20", "84.5 +- 130"),
-    ("nlhi", "1"): ("42.5 +- 66", "297 +- 360", "754 +- 650"),
-    ("asbi", "2"): ("703 +- 190", "0 +- 0", "0 +- 0"),
-    ("nsbi", "2"): ("1850 +- 250", "477 +- 540", "77 +- 140"),
-    ("alhi", "2"): ("1350 +- 580", "262 +- 440", "59.5 +- 160"),
-    ("nlhi", "2"): ("1930 +- 180", "851 +- 570", "300 +- 370"),
-}
-#: Mean speeds of rounds 1 and 6 (section 5.3), and seconds a round (Figure 9).
-PUBLISHED_SPEEDS = {("asbi", "1"): "5.35 .. 8.2", ("asbi", "2"): "5.3 .. 2.7"}
-PUBLISHED_TIME = "simulation 22.2, training 8.2, information gain 4.6: 35 s, with a GPU"
+PUBLISHED = published("box collision")
+#: Mean speeds of rounds 1 and 6, and seconds a round.
+PUBLISHED_SPEEDS = published("box collision speeds")
+(PUBLISHED_TIME,) = published("box collision time")["a round"]
 COMPARED = 3  # round by which target 2 should be pushed more slowly
 COLORS = {"1": "tab:blue", "2": "tab:orange"}
 
@@ -88,7 +80,7 @@ def errors_table(cells: Cells) -> str:
     table = []
     for (method, target), rows in cells.items():
         last = num_rounds(rows)
-        published = PUBLISHED.get((method, target), ("-",) * len(REPORTED))
+        published = PUBLISHED.get(f"{method} {target}", ("-",) * len(REPORTED))
         trials = len(column(rows, "log_prob_true", last))
         entry = [f"target {target}", method.upper(), str(trials)]
         for speed, paper in zip(REPORTED, published, strict=True):
@@ -117,7 +109,7 @@ def rounds_table(cells: Cells) -> str:
                 " / ".join(f"{m:.2f}" for m in medians),
                 gap(rows, last),
                 " / ".join(f"{s:.1f}" for s in speeds),
-                PUBLISHED_SPEEDS.get((method, target), "-"),
+                *PUBLISHED_SPEEDS.get(f"{method} {target}", ("-",)),
                 " / ".join(f"{s:.2f}" for s in shares),
             ]
         )

@@ -1,6 +1,7 @@
 """Robust updates beside plain ones on the numerical task, one gross outlier in ten.
 
     python -m benchmarks.chain.robust --seeds 2000 2010
+    python -m benchmarks.chain.robust --summary
 
 Ten trials at random actions. In "gross" one of them, drawn by the seed, is off by 100
 deviations of the noise; "clean" has none. Both methods take the word of the same kind
@@ -15,18 +16,19 @@ import time
 import warnings
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 
 from benchmarks.chain.run import RESULTS, append
 from sbi_active import ASBI
+from sbi_active.plots import as_table
 from sbi_active.pyro import RobustASBI
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import get_task  # pyright: ignore
 
 NUM_TRIALS, NUM_ROWS, GROSS = 10, 3_000, 100.0
+METHODS: dict[str, Any] = {"plain": ASBI, "robust": RobustASBI}
 
 
 def judged(seed: int, case: str, method: str) -> dict[str, Any]:
@@ -35,7 +37,7 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
         task = task.with_truth(task.prior.sample())
         which = int(torch.randint(NUM_TRIALS, ()))
         sign = float(torch.randn(()).sign())
-    inference: Any = {"plain": ASBI, "robust": RobustASBI}[method](task.prior)
+    inference = METHODS[method](task.prior)
     chosen = task.actions.sample((NUM_TRIALS,), seed=derive_seed(seed, "trials"))
     belief, flagged, others, r_hat = task.prior, 0.0, [], 1.0
     start = time.process_time()
@@ -78,6 +80,7 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs=2, default=[2000, 2010])
+    parser.add_argument("--summary", action="store_true", help="run nothing")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
@@ -87,20 +90,39 @@ def main() -> None:
     if path.exists():
         table = pd.read_csv(path)
         known = {*zip(table["seed"], table["case"], table["method"], strict=True)}
-    for seed in range(*options.seeds):
+    for seed in range(*options.seeds) if not options.summary else ():
         for case in ("gross", "clean"):
-            for method in ("plain", "robust"):
+            for method in METHODS:
                 if (seed, case, method) not in known:
                     append(path, [judged(seed, case, method)])
-    table = pd.read_csv(path).pivot_table(
-        index="seed", columns=["case", "method"], values="log_prob_truth"
-    )
-    print(table.to_string())
-    for case in ("gross", "clean"):
-        gain = np.nanmedian(table[case]["robust"] - table[case]["plain"])
-        print(
-            f"{case}: median gain of log p(truth) {gain:.2f} nats, {len(table)} seeds"
+    print(summary(pd.read_csv(path)))
+
+
+def summary(rows: pd.DataFrame) -> str:
+    """Return a line a case; only seeds that both methods ran count."""
+    lines = []
+    for case, part in rows.groupby("case"):
+        if {*METHODS} - {*part["method"]}:
+            continue
+        table: Any = part.pivot(index="seed", columns="method", values="log_prob_truth")
+        table = table.dropna()
+        own: Any = part[part["method"] == "robust"]
+        gain, r_hat = table["robust"] - table["plain"], own["largest_r_hat"]
+        cost = part.groupby("method")["cpu_s"].median()
+        lines.append(
+            [
+                *(str(case), str(len(table))),
+                f"{gain.median():.3g}",
+                f"{gain.min():.3g} to {gain.max():.3g}",
+                f"{own['probability_outlier'].median():.2f}",
+                f"{own['probability_others'].max():.2f}",
+                f"{r_hat.median():.2f} ({r_hat.max():.2f})",
+                *(f"{cost[m]:.0f}" for m in METHODS),
+            ]
         )
+    header = ["case", "seeds", "median gain", "least to most, nats", "P(outlier)"]
+    header += ["largest P of others", "largest r_hat: median (most)"]
+    return as_table(lines, [*header, *(f"CPU s, {m}" for m in METHODS)])
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.location_finding.bounds import near_cap
+from benchmarks.published import published
 from sbi_active.plots import as_table
 
 __all__ = ["PUBLISHED", "RESULTS", "Rows", "difference", "mean_and_error", "table"]
@@ -28,12 +29,7 @@ NAMES = {
     "myopic_particles": "myopic, particles (exact likelihood)",
 }
 #: sPCE and sNMC, 30 trials, 2,048 roll-outs, as reported by Foster et al. (2021).
-PUBLISHED = {
-    "random (Foster et al.)": ("8.30", "8.32"),
-    "fixed (Foster et al.)": ("8.84", "8.91"),
-    "variational, myopic (Foster et al.)": ("8.78", "9.06"),
-    "DAD (Foster et al.)": ("10.93", "12.38"),
-}
+PUBLISHED = published("location finding")
 BOUNDS = ("spce", "snmc", "lower", "upper")
 COSTS = ("cpu_design", "cpu_belief", "cpu_bounds")
 

@@ -56,10 +56,13 @@ RESULT = Path(__file__).parent / "results" / "ball_and_hoop.json"
 CHANNEL = "speed [V]"
 LABELS = ("begin [s]", "start [V]")
 REMOVALS = (
-    ("compression",),
     ("quadratic drag",),
     ("Coulomb",),
+    ("compression",),
+    ("compression", "Coulomb"),
+    ("compression", "stiction"),
     ("compression", "quadratic drag"),
+    ("compression", "cubic drag"),
     ("compression", "quadratic drag", "cubic drag"),
 )
 #: Effects that least squares is given in any case.
@@ -90,10 +93,10 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         own = torch.from_numpy(free.parameters)[None]
         return row | {"offset free": as_row(free, free_run(own, held, effects))}
 
-    def replay(seed: int) -> Trials:
-        bare, _ = fit_hoop(fitted, (), offset=0.0)
+    def replay(seed: int, names: tuple[str, ...]) -> Trials:
+        fit, effects = fit_hoop(fitted, names, offset=0.0)
         whole = cut(fitted.part(0, FITTED + 1), FITTED)
-        x = run_pieces(torch.from_numpy(bare.parameters)[None], whole)[0, 0]
+        x = run_pieces(torch.from_numpy(fit.parameters)[None], whole, effects)[0, 0]
         x = torch.cat([torch.from_numpy(whole.start), x])
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage[: FITTED + 1], output)

@@ -52,7 +52,11 @@ LABELS = ("begin [s]", "start [V]", "slope [V/s]")
 REMOVALS = (
     ("overflow",),
     ("linear outflow",),
+    ("overflow", "sensor saturation"),
+    ("overflow", "linear outflow"),
     ("linear outflow", "outflow exponent"),
+    ("linear outflow", "outflow exponent", "pump dead zone"),
+    ("overflow", "linear outflow", "outflow exponent"),
     ("overflow", "sensor saturation", "linear outflow", "outflow exponent"),
 )
 #: Effects that least squares is given in any case.
@@ -82,11 +86,11 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         own = torch.from_numpy(whole.parameters[:-2])[None]
         return row | {"as one record": as_row(whole, score(own, scored, effects))}
 
-    def replay(seed: int) -> Trials:
-        bare, _ = fit_tanks(fitted)
-        z = torch.from_numpy(bare.parameters)[None]
+    def replay(seed: int, names: tuple[str, ...]) -> Trials:
+        fit, effects = fit_tanks(fitted, names)
+        z = torch.from_numpy(fit.parameters)[None]
         whole = cut(fitted, len(fitted) - 1, slope=SLOPE)
-        x = run_pieces(z[:, :-2], z[:, None, -2:], whole)[0, 0]
+        x = run_pieces(z[:, :-2], z[:, None, -2:], whole, effects)[0, 0]
         x = torch.cat([torch.from_numpy(whole.start) + z[0, -1:], x])
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage, output)

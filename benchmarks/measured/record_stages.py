@@ -3,16 +3,20 @@
 - ``recorded``: the verdict on the pieces to fit, held-out errors in free run before and
   after, and plain least squares given the same effects on the same split.
 - ``without NAME + ...``: the same with effects removed from the library.
-- ``clean 0``, ``clean 1``, ...: the pieces simulated by the bare model at its
-  least-squares fit, with the sensor's error alone.
+- ``clean 2000``, ``clean 2001``, ...: the pieces simulated by the bare model at its
+  least-squares fit, with the sensor's error alone, by their seeds.
+- ``full 2000``, ...: the same with the effects that help in ``recorded``, at the
+  least-squares fit with them: nothing but these is there to be named.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +32,15 @@ from benchmarks.measured.record_verdicts import read_report
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 
-__all__ = ["Bench", "run_command", "run_stages", "table"]
+__all__ = ["Bench", "aliases", "run_command", "run_stages", "table"]
 
 Errors = dict[str, float]
+
+#: Seed of the first replay; nothing was chosen by those from here on.
+FIRST_REPLAYED = 2_000
+REPLAYS = {"clean": "the bare model", "full": "the model of the first verdict"}
+#: What a report's first paragraph says of an effect that is named.
+SHARE_LEFT = re.compile(r"\d+ %\s+of\s+the\s+excess")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +57,7 @@ class Bench:
             order of the library.
         score: Theta and strengths (n, d), and effects, to errors by held-out record.
         least_squares: Names of effects to a fit's row.
-        replay: Seed to trials that the bare model makes.
+        replay: Seed and names of effects to trials that a fitted model makes.
         nuisances: Declared besides.
     """
 
@@ -59,7 +69,7 @@ class Bench:
     given: Sequence[tuple[str, ...]]
     score: Callable[[Tensor, Sequence[Effect]], Errors]
     least_squares: Callable[[tuple[str, ...]], dict[str, Any]]
-    replay: Callable[[int], Trials]
+    replay: Callable[[int, tuple[str, ...]], Trials]
     nuisances: Sequence[Effect] = ()
 
     @classmethod
@@ -105,6 +115,7 @@ def run_command(
     every = task.recordings.EVERY
     parser.add_argument("--every", type=int, default=every, help="readings kept")
     parser.add_argument("--clean", type=int, default=10, help="clean sets")
+    parser.add_argument("--full", type=int, default=0, help="sets with what helps")
     parser.add_argument("--out", type=Path, default=out)
     parser.add_argument("--reports", type=Path, help="folder for whole reports")
     parser.add_argument("--seed", type=int, default=0)
@@ -118,6 +129,7 @@ def run_command(
         make_bench(records, every=arguments.every),
         arguments.out,
         clean=arguments.clean,
+        full=arguments.full,
         seed=arguments.seed,
         reports=arguments.reports,
     )
@@ -130,6 +142,7 @@ def run_stages(
     path: Path,
     *,
     clean: int = 10,
+    full: int = 0,
     seed: int = 0,
     reports: Path | None = None,
 ) -> dict[str, Any]:
@@ -139,6 +152,7 @@ def run_stages(
         bench: The machine.
         path: JSON file of the results.
         clean: Clean sets.
+        full: Sets that the model of the first verdict makes.
         seed: Of all draws.
         reports: Folder for whole reports.
     """
@@ -152,15 +166,22 @@ def run_stages(
             text = f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s"
             print(text, flush=True)
 
-    stages: dict[str, tuple[tuple[str, ...], int | None]] = {"recorded": ((), None)}
-    stages |= {f"without {' + '.join(gone)}": (gone, None) for gone in bench.removals}
-    stages |= {f"clean {k}": ((), k) for k in range(clean)}
-    for name, (gone, replay) in stages.items():
+    judged: dict[str, tuple[str, ...]] = {"recorded": ()}
+    judged |= {f"without {' + '.join(gone)}": gone for gone in bench.removals}
+    stages = [*judged]
+    stages += [f"clean {FIRST_REPLAYED + k}" for k in range(clean)]
+    stages += [f"full {FIRST_REPLAYED + k}" for k in range(full)]
+    for name in stages:
         if name not in rows:
+            kind, number = name.split(" ")[0], name.split(" ")[-1]
+            trials = None
+            if name not in judged:
+                helps = (*rows["recorded"]["helps"],) if kind == "full" else ()
+                trials = bench.replay(int(number), helps)
             folder = None if reports is None else reports / name.replace(" ", "_")
-            keep(name, judge(bench, gone=gone, replay=replay, seed=seed, folder=folder))
+            gone = judged.get(name, ())
+            keep(name, judge(bench, gone=gone, trials=trials, seed=seed, folder=folder))
     fits = rows.get("least squares", {})
-    judged = [name for name, (_, replay) in stages.items() if replay is None]
     wanted = {(), *bench.given, *[(*rows[name]["helps"],) for name in judged]}
     for names in sorted(wanted):
         label = " + ".join(names) or "none"
@@ -174,7 +195,7 @@ def judge(
     bench: Bench,
     *,
     gone: Sequence[str] = (),
-    replay: int | None = None,
+    trials: Trials | None = None,
     seed: int = 0,
     folder: Path | None = None,
 ) -> dict[str, Any]:
@@ -183,7 +204,7 @@ def judge(
     Args:
         bench: The machine.
         gone: Names of effects that are not declared.
-        replay: Seed of a clean set in place of the recorded trials.
+        trials: In place of the recorded ones.
         seed: Of all draws.
         folder: Where the whole report goes.
     """
@@ -193,7 +214,7 @@ def judge(
     report = close_loop(
         model,
         bench.prior,
-        bench.trials if replay is None else bench.replay(replay),
+        bench.trials if trials is None else trials,
         effects=[*effects, *bench.nuisances],
         seed=seed,
         evaluate=False,  # held-out records are scored in free run, below
@@ -210,7 +231,7 @@ def judge(
         "cpu_seconds": seconds,
         "trial_simulations": count(),
     }
-    if replay is None:
+    if trials is None:
         chosen = [e for n in found.helps for e in effects if e.name == n]
         row["before"] = bench.score(found.before, [])
         row["after"] = bench.score(found.after, chosen)
@@ -237,7 +258,7 @@ def table(rows: dict[str, Any], unit: str) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
-        if name == "least squares":
+        if name == "least squares" or name.split(" ")[0] in REPLAYS:
             continue
         likely = {n: p for n, p in row["cause"].items() if p > 0.05 and row["alarm"]}
         causes = ", ".join(f"{n} {p:.2f}" for n, p in likely.items())
@@ -249,10 +270,53 @@ def table(rows: dict[str, Any], unit: str) -> str:
             f"{_errors(row.get('after'))} | {row['trial_simulations']:,} | "
             f"{row['cpu_seconds']:.0f} |"
         )
+    lines += _replays(rows)
+    if any(name.startswith("without ") for name in rows):
+        lines += ["", aliases(rows)]
     lines += ["", f"| least squares | fitted, {unit} | {head} |", "|---|---|---|"]
     for name, row in rows.get("least squares", {}).items():
         lines.append(f"| {name} | {row['fitted']:.3f} | {_errors(row['held'])} |")
     return "\n".join(lines)
+
+
+def _replays(rows: dict[str, Any]) -> list[str]:
+    """Return a line for each kind of replay: its verdicts, and how often."""
+    lines = []
+    for kind, what in REPLAYS.items():
+        own = {k: row for k, row in rows.items() if k.split(" ")[0] == kind}
+        if not own:
+            continue
+        verdicts = Counter(str(row["verdict"]) for row in own.values())
+        said = ", ".join(f"{v} ({n})" for v, n in verdicts.most_common())
+        seeds = sorted(int(k.split(" ")[-1]) for k in own)
+        count, seconds = (
+            np.median([row[key] for row in own.values()])
+            for key in ("trial_simulations", "cpu_seconds")
+        )
+        lines.append(
+            f"| {len(own)} replays of {what}, seeds {seeds[0]} to {seeds[-1]} | {said} "
+            f"| | | | {count:,.0f} | {seconds:.0f} |"
+        )
+    return lines
+
+
+def aliases(rows: dict[str, Any]) -> str:
+    """Return how often an effect was named that stands for one that was removed.
+
+    One counts that the verdict with the whole library does not rest on.
+
+    Args:
+        rows: Of :func:`run_stages`.
+    """
+    removed = {k: row for k, row in rows.items() if k.startswith("without ")}
+    real = {*rows["recorded"]["helps"]}
+    found, told = [], 0
+    for name, row in removed.items():
+        if new := [n for n in row["named"] if n not in real]:
+            found.append(f"{' + '.join(new)} ({name})")
+            told += bool(SHARE_LEFT.search(row["text"]))
+    said = f": {'; '.join(found)}; the share left said in {told}" if found else ""
+    return f"Aliases named: {len(found)} of {len(removed)} removals{said}."
 
 
 def _errors(errors: Errors | None) -> str:

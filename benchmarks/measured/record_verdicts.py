@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.criticism import Report
-from sbi_active.criticism.results import NONE
+from sbi_active.criticism.results import NONE, Evidence
 from sbi_active.criticism.under_misfit import ModelError
 
 __all__ = ["Found", "read_report"]
@@ -23,7 +23,7 @@ class Found:
     Attributes:
         row: Plain figures for the results.
         helps: Names of the effects that are said to predict better.
-        before: Center of theta of the bare model, shape (1, theta_dim), float64.
+        before: Best theta of the bare model, shape (1, theta_dim), float64.
         after: The same of theta and the strengths of the effects that help, (1, d).
         text: The report's first paragraph.
     """
@@ -69,8 +69,8 @@ def read_report(report: Report, theta_dim: int) -> Found:
     return Found(
         row=row,
         helps=helps,
-        before=_center(tracing.evidences[NONE].draws, theta_dim),
-        after=_center(after.draws, num),
+        before=_center(tracing.evidences[NONE], theta_dim),
+        after=_center(after, num),
         text=str(report).split("\n\n")[0],
     )
 
@@ -84,6 +84,7 @@ def _model(model: ModelError) -> dict[str, Any]:
     }
 
 
-def _center(draws: np.ndarray, columns: int) -> Tensor:
-    """Return the mean, at which held-out trials are predicted under misfit too."""
-    return torch.from_numpy(draws[:, :columns].mean(0, keepdims=True)).double()
+def _center(evidence: Evidence, columns: int) -> Tensor:
+    """Return the best fit where every model misses, as the library predicts by it."""
+    best = evidence.draws.mean(0) if evidence.best is None else evidence.best
+    return torch.from_numpy(best[None, :columns]).double()

@@ -238,13 +238,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--cases", type=int, default=10)
     parser.add_argument("--out", type=Path, default=PATH)
+    parser.add_argument("--bare", action="store_true", help="no hidden force")
     parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args(argv)
     done = {(int(r["case"]), r["hidden"]) for r in read(arguments.out)}
     last = arguments.first if arguments.summary else arguments.first + arguments.cases
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     for number in range(arguments.first, last):
-        for is_hidden in (False, True):
+        for is_hidden in (False,) if arguments.bare else (False, True):
             if (number, str(int(is_hidden))) in done:
                 continue
             row = score_case(number, is_hidden=is_hidden)

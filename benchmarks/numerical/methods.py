@@ -36,16 +36,17 @@ from torch import Tensor
 
 from benchmarks.numerical.run import (
     COLUMNS,
-    PUBLISHED,
     REPORTED,
     RESULTS,
     column,
+    exact_limits,
     make_task,
     read,
     reference,
     round_row,
     short,
 )
+from benchmarks.published import published
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.plots import as_table
@@ -59,10 +60,6 @@ NUM_FAITHFUL, NUM_DESIGN = 52_000, 15_700
 #: Parameters in a refinement, so that methods that spend all of them, at each executed
 #: action, spend what ASBI's, which stops by itself, does on average.
 HISTORIES = RefinementOptions(num_histories=600)
-PAPER = {
-    "paper, ALHI": ("", "940 +- 556", "46.7", "4.35"),
-    "paper, SeqBED": ("", "895 +- 264", "44.4", "2.92"),
-}
 
 
 def options_of(setting: str, method: str) -> CampaignOptions:
@@ -192,7 +189,8 @@ def main() -> None:
             is_summary=arguments.summary,
         )
         table.append(summary(method, rows))
-    table += [[k, *v, *[""] * 5] for k, v in (PUBLISHED | PAPER).items()]
+    beside = published("numerical") | exact_limits()
+    table += [[k, *v, *[""] * 5] for k, v in beside.items()]
     header = [f"{arguments.setting} (trials)", "median log p(truth), round 1 / 2 / .."]
     header += [f"RepErr({a:g})" for a in REPORTED]
     header += ["gap: median mean", "mean regret, round 1 / 2 / ..", "C2ST"]

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.published import published
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
@@ -41,14 +42,7 @@ SETTINGS: dict[str, CampaignOptions] = {
     ),
 }
 NUMERICAL = ("linear", "sinh", "square")
-#: Table 1 (mean and standard deviation of 10 trials) and figure 5 of the paper, and the
-#: exact posterior with exact greedy design and with random actions (200 trials).
-PUBLISHED = {
-    "paper, ASBI": ("-2.78 / - / - / 1.35", "34.5 +- 10.7", "1.95", "1.60"),
-    "paper, NSBI": ("", "127 +- 76", "6.35", "2.01"),
-    "exact limit": ("4.57 / 7.14 / 7.41 / 7.74", "0.39 +- 0.15", "0.0076", "0.485"),
-    "exact, random": ("-.51 / 2.91 / 4.17 / 5.14", "12.7 +- 73", "0.64", "1.04"),
-}
+NUM_EXACT = 200  # trials of the exact limit
 STAGES = ("simulation", "training", "design", "update")
 COLUMNS = [
     *["seed", "theta_true", "round", "action", "eig", "exact_eig", "regret"],
@@ -190,6 +184,20 @@ def short(value: object) -> object:
     return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value
 
 
+def exact_limits() -> dict[str, tuple[str, ...]]:
+    """Return rows of the exact posterior, its actions exact or at random."""
+    found = {}
+    for way in ("exact", "random"):
+        rows = [r for r in read(RESULTS / "exact.csv") if r["actions"] == way]
+        medians = [np.median(column(rows, f"log_prob_{r + 1}")) for r in range(4)]
+        errors = [column(rows, f"rep_err_{action:g}") for action in REPORTED]
+        found[f"exact posterior, {way} actions ({len(rows)})"] = (
+            " / ".join(f"{m:.2f}" for m in medians),
+            *(f"{error.mean():.3g} +- {error.std():.2g}" for error in errors),
+        )
+    return found
+
+
 def column(rows: list[dict[str, str]], key: str, round_: int | None = None) -> Any:
     """Return a column of one round, or of all, as an array."""
     kept = [r[key] for r in rows if round_ is None or int(r["round"]) == round_]
@@ -274,7 +282,8 @@ def main() -> None:
     header += ["median KL", "regret r1 / r2", "in 50, 90 % region", "(exact's own)"]
     header += [f"RepErr({a:g})" for a in REPORTED]
     if arguments.truth == "fixed" and arguments.task == "linear":
-        table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in PUBLISHED.items()]
+        beside = published("numerical") | exact_limits()
+        table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in beside.items()]
     print(as_table(table, header), end="\n\n")
     print("\n".join(lines))
 

@@ -34,7 +34,7 @@ def boxes(axes: Any, by_round: dict[str, list[np.ndarray]]) -> None:
     width = 0.8 / max(len(by_round), 1)
     for k, (method, values) in enumerate(by_round.items()):
         place = np.arange(len(values)) + 1 + (k - (len(by_round) - 1) / 2) * width
-        color = COLORS[method]
+        color = COLORS[method]  # pyright: ignore
         axes.boxplot(
             values,
             positions=place,

@@ -308,7 +308,7 @@ def cross_validated(
         ]
         log_p[out] = fitted.at_each(cells, seen)
     place = np.minimum((theta * NUM_CELLS).astype(int), NUM_CELLS - 1)
-    index = np.asarray(np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3))
+    index: Array = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)  # pyright: ignore
     own = np.take_along_axis(log_p, index[:, None], 1)[:, 0]
     score = [_told(power * log_p, power * own)[0].mean() for power in POWERS]
     power = float(POWERS[int(np.argmax(score))])
@@ -383,7 +383,7 @@ def _told(log_p: Array, own: Array) -> tuple[Array, Array]:
         log_p: At cells of the prior, shape (n, m).
         own: At the truth, shape (n,).
     """
-    total = logsumexp(log_p, 1)
+    total: Array = np.asarray(logsumexp(log_p, 1))
     mass = np.where(log_p > own[:, None], np.exp(log_p - total[:, None]), 0).sum(1)
     return own - total + np.log(log_p.shape[1]), mass
 

@@ -216,6 +216,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=[*CASES], default=[*CASES])
     parser.add_argument("--searches", nargs="+", default=["exhaustive", "gradient"])
     parser.add_argument("--first", type=int, default=0, help="seed")
+    parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
@@ -223,6 +224,9 @@ def main() -> None:
     if RESULT.exists():
         with RESULT.open() as file:
             rows = [*csv.DictReader(file)]
+    if arguments.summary:
+        print(table([r for r in rows if int(r["seed"]) >= arguments.first]))
+        return
     done = {(r["case"], r["search"], int(r["seed"])) for r in rows}
     with RESULT.open("a", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

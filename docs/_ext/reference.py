@@ -18,16 +18,14 @@ from sphinx.application import Sphinx
 import sbi_active
 
 PAGES = Path(__file__).parents[1] / "reference" / "api"
+EXAMPLES = PAGES.parent / "examples"
 PACKAGES = [n for n in (*sbi_active._HOMES, "pyro", "tasks") if n != "export"]
 #: Modules whose classes and functions users meet without importing them, by package.
 FURTHER = {
     "actions": {"sbi_active.actions.waveforms": ()},
     "criticism": {
         "sbi_active.criticism.results": (),
-        "sbi_active.criticism.effects.first_samples": (
-            "start_from_first_samples",
-            "zero_from_first_samples",
-        ),
+        "sbi_active.criticism.effects.first_samples": ("zero_from_first_samples",),
     },
     "design": {"sbi_active.export": ("to_inference_data",)},
     "inference": {"sbi_active.inference.beliefs.diagnostics": ()},
@@ -41,6 +39,15 @@ FURTHER = {
 STAR = re.compile(r"(?<![\\\w*`])\*(?=[a-z_]+\b(?!\*))")
 END = re.compile(r"(?<=[A-Za-z])_(?=\W|$)")  # of a column's prefix: no link
 FOREIGN = "Distribution,NPE_C,NLE_A,NRE_A,NeuralPosterior,RuntimeError,Warning,object"
+
+
+def examples(package: str) -> tuple[str, dict[str, str]]:
+    """Return what the examples beside the docstrings begin with, and each by name."""
+    path = EXAMPLES / f"{package}.txt"
+    if not path.exists():
+        return "", {}
+    setup, *blocks = path.read_text(encoding="utf-8").split("\n# ")
+    return setup, dict(block.split("\n", 1) for block in blocks)
 
 
 def public(module: ModuleType, names: tuple[str, ...] = ()) -> list[str]:
@@ -77,6 +84,9 @@ def page(package: str) -> str:
     home = importlib.import_module(f"sbi_active.{package}")
     lines = [f"# `sbi_active.{package}`", "", "```{eval-rst}"]
     lines += [inspect.getdoc(home) or "", "```", ""]
+    setup, blocks = examples(package)
+    if setup:
+        lines += ["Examples below begin with", "", "```pycon", setup.strip(), "```", ""]
     for module_name, names in groups(package):
         module = importlib.import_module(module_name)
         if module is not home:
@@ -84,6 +94,12 @@ def page(package: str) -> str:
         lines += ["```{eval-rst}", f".. py:currentmodule:: {module_name}", ""]
         for name in names:
             lines += [_directive(module_name, name, getattr(module, name)), ""]
+            if name in blocks:
+                lines += ["   Example::", ""]
+                lines += [
+                    f"      {line}".rstrip() for line in blocks[name].splitlines()
+                ]
+                lines += [""]
         lines += ["```", ""]
     return "\n".join(lines)
 

@@ -1,6 +1,7 @@
 """Write the tables of the committed rows, as the benchmarks' own commands print them.
 
-Nothing is run again: each command reads its CSV files. No figure of these is typed.
+Nothing is run again: each command reads its files. No figure of these is typed. Each
+section's tables are a file, which ``docs/benchmarks.md`` includes.
 """
 
 import contextlib
@@ -8,6 +9,7 @@ import io
 import re
 import runpy
 import sys
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from unittest import mock
@@ -15,12 +17,11 @@ from unittest import mock
 from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "reference" / "api" / "results.txt"
+PAGES = ROOT / "docs" / "reference" / "api" / "results"
 EMPTY = re.compile(r"nan( (/|\+-) nan)*")
-#: Title, its section in benchmarks.md or the page, and the commands.
+#: Sections of docs/benchmarks.md, and the commands that print their tables.
 TABLES = {
     "The paper's numerical model": (
-        "benchmarks.md#the-papers-numerical-model-beside-the-paper-and-the-exact-limit",
         "benchmarks.numerical.run --summary",
         "benchmarks.numerical.run --summary --trials 60 --settings default "
         "--methods asbi",
@@ -32,18 +33,43 @@ TABLES = {
         "--settings default default_500 --methods asbi",
         "benchmarks.numerical.run --summary --task oscillator --truth random "
         "--settings default default_500 --methods asbi",
+        "benchmarks.numerical.run --summary --task oscillator --truth random "
+        "--jitter 0.1 --settings default --methods asbi",
+    ),
+    "Table 1 of the paper": (
         "benchmarks.numerical.methods --summary --setting faithful",
         "benchmarks.numerical.methods --summary --setting default",
     ),
+    "Expected information gain": ("benchmarks.table information_gain/result.csv",),
+    "Beside pyro.contrib.oed": ("benchmarks.table information_gain/peers.csv",),
+    "Continuous and mixed actions": (
+        "benchmarks.search.run --summary",
+        "benchmarks.search.run --summary --cases mixed --first 40",
+    ),
+    "Source location finding": ("benchmarks.location_finding.summary",),
+    "The simulation engine": (
+        "benchmarks.table engine/result.json --only *overhead,*overhead,*median* "
+        "workers,*speedup*median faults,*",
+    ),
+    "What an adversary found": (
+        "benchmarks.robustness.run --summary",
+        "benchmarks.robustness.exact --summary",
+        "benchmarks.robustness.exact --summary --histories 200",
+        "benchmarks.robustness.outliers --summary",
+        "benchmarks.robustness.health --summary",
+    ),
+    "Campaigns on disk": (
+        "benchmarks.table cost/directory.json --only tell* load,* *near*",
+        "benchmarks.table robustness/results/units.json --only [!r]*",
+    ),
     "Box collision": (
-        "benchmarks.md#box-collision",
         "benchmarks.box_collision.run --summary",
         "benchmarks.box_collision.run --summary --table coverage --rounds 3",
         "benchmarks.box_collision.run --summary --setting learned "
         "--methods asbi nsbi alhi nlhi --trials 3",
+        "benchmarks.table box_collision/speed.json",
     ),
-    "The closed loop, effects known": (
-        "benchmarks.md#the-closed-loop-on-worlds-whose-truth-is-known",
+    "The closed loop, on worlds whose truth is known": (
         *(
             f"benchmarks.criticism.run --summary --table loop --world {world}"
             for world in "ABCD"
@@ -55,29 +81,36 @@ TABLES = {
             for world in "AB"
         ),
         "benchmarks.criticism.run --summary --table active --world A",
+        *(
+            f"benchmarks.criticism.run --summary --table priors --world A --scale {by}"
+            for by in ("3", "0.3333333")
+        ),
+        "benchmarks.criticism.run --summary --table loop --world C --kind clean "
+        "--independent",
+        "benchmarks.criticism.campaign --summary",
+        "benchmarks.criticism.campaign --summary --policy check",
     ),
     "Verdicts where every model is wrong": (
-        "benchmarks.md#verdicts-where-every-model-is-wrong",
-        "benchmarks.misfit.run --summary --group own --first 1100",
+        "benchmarks.misfit.run --summary",
         "benchmarks.misfit.start_states --summary",
     ),
-    "Forces that nobody declared": (
-        "benchmarks.md#forces-that-nobody-declared",
-        "benchmarks.forces.run --summary",
-    ),
+    "Forces that nobody declared": ("benchmarks.forces.run --summary",),
     "A chain of many parameters": (
-        "benchmarks.md#a-chain-of-many-parameters",
         "benchmarks.chain.run --summary",
+        "benchmarks.chain.run --campaign --summary",
     ),
-    "Bad networks and beliefs flagged": (
-        "benchmarks.md#bad-networks-and-beliefs-flagged",
-        "benchmarks.calibration.run --summary",
+    "Bad networks and beliefs flagged": ("benchmarks.calibration.run --summary",),
+    "Dear simulators": ("benchmarks.dear.run --table",),
+    "The cost of a round": (
+        "benchmarks.table cost/result.json",
+        "benchmarks.table cost/network.json",
+        "benchmarks.table cost/doors.json --only cpu_s*",
     ),
-    "Dear simulators": (
-        "benchmarks.md#dear-simulators",
-        "benchmarks.dear.run --table",
+    "Robust updates": ("benchmarks.chain.robust --summary",),
+    "sbi's own tests with the class swapped": (
+        "benchmarks.table sbi_suite/result.json --only date sbi original* swapped*",
     ),
-    "Pouring": ("pouring.md", "benchmarks.pouring.run --summary"),
+    "Pouring": ("benchmarks.pouring.run --summary",),
 }
 
 
@@ -162,22 +195,26 @@ def table(rows: list[list[str]]) -> list[str]:
     ]
 
 
-def page() -> str:
-    """Return all tables, each under the command that printed it."""
+def file_of(title: str) -> Path:
+    """Return the file of a section's tables."""
+    return PAGES / f"{re.sub('[^a-z]+', '-', title.lower()).strip('-')}.txt"
+
+
+def tables(commands: Iterable[str]) -> str:
+    """Return tables, each under the command that printed it."""
     lines: list[str] = []
-    for title, (place, *commands) in TABLES.items():
-        lines += [f"## {title}", "", f"What it is: [{title}](/{place}).", ""]
-        for command in commands:
-            lines += [f"```bash\npython -m {command}\n```", ""]
-            lines += [as_markdown(printed(command)), ""]
+    for command in commands:
+        lines += [f"```bash\npython -m {command}\n```", ""]
+        lines += [as_markdown(printed(command)), ""]
     return "\n".join(lines)
 
 
 def _generate(app: Sphinx) -> None:
-    PAGE.parent.mkdir(parents=True, exist_ok=True)
-    text = page()
-    if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
-        PAGE.write_text(text, encoding="utf-8")
+    PAGES.mkdir(parents=True, exist_ok=True)
+    for title, commands in TABLES.items():
+        path, text = file_of(title), tables(commands)
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.messages import warn
 from sbi_active.simulation.workers.meter import SimulationBudgetError
 
 FEWEST = 24  # simulations that a round is worth beginning with
@@ -46,7 +46,7 @@ def learned(learner: Any, state: CampaignState, trial: Trial) -> bool:
         learner.learn(state.trials[trial.index])
     except SimulationBudgetError as error:
         state.unscore(trial.index)
-        warnings.warn(
+        warn(
             f"trial {trial.index} is recorded and not in the belief: {error}",
             stacklevel=4,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import measured
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+from sbi_active.messages import warn
 
 LARGEST = torch.finfo(torch.float32).max
 
@@ -59,7 +59,7 @@ def told_trial(
         target.action if action is None else _action_told(action, actions.action_dim)
     )
     if not bool(actions.contains(executed)):
-        warnings.warn(
+        warn(
             f"the executed action {executed.tolist()} is not in {actions}; it is "
             "simulated where it was executed",
             stacklevel=5,
@@ -152,7 +152,7 @@ def _measured(x: Tensor) -> Tensor:
     infinite = x.isinf()
     if not bool(infinite.any()):
         return x
-    warnings.warn(
+    warn(
         f"{int(infinite.sum())} of {x.numel()} told numbers are infinite and count as "
         "not measured; pass NaN where a sensor gave nothing",
         stacklevel=7,

@@ -8,6 +8,7 @@ from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.first_samples import start_from_first_samples
 from sbi_active.criticism.effects.generic import generic_effects
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.identification.identify import identify
@@ -26,6 +27,7 @@ __all__ = [
     "generic_effects",
     "identify",
     "joint_prior",
+    "start_from_first_samples",
 ]
 
 __getattr__ = former_names(

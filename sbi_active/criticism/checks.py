@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,6 +24,7 @@ from sbi_active.criticism.effects.trial_conditions import (
     has_own_times,
 )
 from sbi_active.criticism.results import CATCH_ALLS, NONE
+from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.estimation import estimate_noise
@@ -180,7 +180,7 @@ def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
     """Warn of what was recorded and the simulator's function does not take."""
     for name in ("inputs", "start"):
         if getattr(trials, name) is not None and name not in model.conditions:
-            warnings.warn(
+            warn(
                 f"the trials have {name}, and the simulator's function takes no "
                 f"argument {name!r}: they are not used; write fn(theta, action, *, "
                 f"{name})",
@@ -195,7 +195,7 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
     if not bool(outside.any()):
         return
     places = outside.nonzero()[:, 0].tolist()
-    warnings.warn(
+    warn(
         f"the executed action {trials.action[places[0]].tolist()} of trial "
         f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
         "is simulated where it was executed",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from torch.distributions import Distribution
@@ -25,12 +24,11 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
+from sbi_active.criticism.misfit.missed import beside_misfit
 from sbi_active.criticism.misfit.record import detected, traced
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
-    SCATTER,
-    UNEXPLAINED,
     Detection,
     Evaluation,
     NextAction,
@@ -44,7 +42,6 @@ from sbi_active.criticism.screening.stand_ins import judged
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
-from sbi_active.criticism.steps.formulas import guess
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.tracing import trace
 from sbi_active.criticism.thinning import thinned_to_need
@@ -247,17 +244,11 @@ class Criticism:
                     tracing = trace(
                         self.rivals, detection, groups, actions=self.actions
                     )
-            if tracing.verdict in (UNEXPLAINED, SCATTER):
-                # It is no error of a sensor: a process that follows the action is.
-                self._misfit = find_misfit(
-                    self.rivals, groups, is_known=True, search=self._few
-                )
+            tracing, self._misfit = beside_misfit(
+                tracing, detection, self.rivals, groups, self._scored, search=self._few
+            )
             if self._misfit is not None:
                 self._residuals = None
-                self.rivals.fits.clear()
-                tracing = traced(self._misfit, self._scored)
-            elif tracing.verdict == UNEXPLAINED and not tracing.chosen:
-                tracing = replace(tracing, guesses=guess(self.rivals))
             self._tracing = tracing
         return self._tracing
 

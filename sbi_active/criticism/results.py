@@ -116,6 +116,7 @@ class Evidence:
         names: Of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
         best_chi_square: Smallest whitened residual sum of squares among the draws.
+        best: Theta and phi, (dim,), that predict other trials; None for the draws.
     """
 
     key: ModelKey
@@ -127,6 +128,7 @@ class Evidence:
     names: tuple[str, ...]
     draws: Array
     best_chi_square: float
+    best: Array | None = None
 
     @property
     def name(self) -> str:

@@ -51,7 +51,8 @@ class Misfit:
         sensor: Its standard deviation by channel, units of x, (c,).
         passes: Whether the chi-square of the verdict passes against the sensor.
         size: Of the residual process beside the verdict's model, in sensor deviations.
-        time_scale: Of that process, in the unit of the sample times.
+        time_scale: Of that process, in the unit of the sample times; NaN where x has
+            no time axis, and each number an error of its own.
         left_out: What was left out: "trials" or "parts of trials".
         weights: Of models by their errors on left-out parts, where probabilities are
             too sure; by name, largest first, without those that hardly count. A next

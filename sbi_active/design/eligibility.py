@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
+from sbi_active.messages import warn
 from sbi_active.simulation import MissingRowsWarning
 
 MANY = 1_024  # draws of a space without end, of which the permitted are candidates
@@ -153,7 +153,7 @@ def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
 def warn_missing(num_missing: int, num_simulations: int) -> None:
     """Warn once a design of simulations lost to faults."""
     if num_missing:
-        warnings.warn(
+        warn(
             f"{num_missing} of {num_simulations} simulations of the design are "
             "missing, by faults of the simulator; they were left out",
             MissingRowsWarning,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import torch
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.messages import warn
 from sbi_active.simulation import SimulatorModel
 
 __all__ = ["warn_of_idle"]
@@ -66,7 +66,7 @@ def warn_of_idle(
             idle.append(name)
     if idle:
         where = "the recorded trials" if trials is not None else "permitted actions"
-        warnings.warn(
+        warn(
             f"{', '.join(idle)} change nothing that is read in {len(action)} of "
             f"{where}: no such trial tells of them; leave them out, or read another "
             "sensor",

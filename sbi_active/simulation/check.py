@@ -15,6 +15,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
+from sbi_active.messages import explained
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.identifiability import (
     MAX_ACTIONS,
@@ -341,7 +342,8 @@ def _judge(
     if report.idle_actions:
         notes.append(f"changing {', '.join(report.idle_actions)} leaves x as it is")
     notes += [str(group) for group in report.undetermined]
-    return replace(report, defects=tuple(defects), warnings=tuple(notes))
+    said = {"defects": defects, "warnings": notes}
+    return replace(report, **{k: tuple(map(explained, v)) for k, v in said.items()})
 
 
 def _lost(action: Tensor, lost: Tensor) -> tuple[tuple[tuple[float, ...], float], ...]:

@@ -8,6 +8,8 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+from sbi_active.messages import Explained
+
 
 class Outcome(IntEnum):
     """What became of a row.
@@ -72,11 +74,11 @@ class Simulations:
         )
 
 
-class SimulationError(RuntimeError):
+class SimulationError(Explained, RuntimeError):
     """No row could be simulated, or the simulator could not be loaded in a worker."""
 
 
-class SimulationInterrupted(KeyboardInterrupt):
+class SimulationInterrupted(Explained, KeyboardInterrupt):
     """The user interrupted a simulation.
 
     Attributes:

@@ -1,5 +1,6 @@
 """Exact greedy design of the numerical model: the limit a myopic method can reach."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,7 @@ def greedy_design(
     *,
     num_rounds: int = 4,
     variant: str = "linear",
+    chosen: Sequence[int] | None = None,
     seed: int,
 ) -> GreedyDesign:
     """Run the exact greedy campaign on data simulated at the truth.
@@ -77,6 +79,7 @@ def greedy_design(
         actions: Candidates, shape (a,) or (a, 1).
         num_rounds: Number of rounds.
         variant: The curve g, as in `ExactPosterior`.
+        chosen: Index of each round's action, in place of the most informative one.
         seed: Non-negative seed of noise, ties and reproduction samples.
 
     Returns:
@@ -94,6 +97,7 @@ def greedy_design(
         rng = np.random.default_rng([seed, r])
         noise = rng.standard_normal()
         index, gain = greedy_action(posterior, candidates, seed=rng)
+        index = index if chosen is None else int(chosen[r])
         outcome = noise_free(truth, candidates[[index]], variant=variant).item()
         posterior = ExactPosterior(
             np.append(posterior.action, candidates[index]),

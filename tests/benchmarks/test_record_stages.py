@@ -8,7 +8,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 
 from benchmarks.measured import ball_and_hoop, cascaded_tanks
 from benchmarks.measured.hoop_least_squares import free_run, run_pieces
-from benchmarks.measured.record_stages import Bench, run_stages, table
+from benchmarks.measured.record_stages import Bench, aliases, run_stages, table
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import ball_and_hoop as hoop  # pyright: ignore
@@ -33,10 +33,11 @@ def line_bench():
         x = line(draws[:, :1], far.expand(len(draws), 1), bend=bend)
         return {"far": float((x.mean() - 4.0).abs())}
 
-    def replay(seed):
+    def replay(seed, names):
         generator = torch.Generator().manual_seed(seed)
         error = 0.01 * torch.randn(12, 1, generator=generator, dtype=torch.float64)
-        return Trials(PLACES, PLACES + error)
+        bend = 0.5 * PLACES**2 if names else 0.0
+        return Trials(PLACES, PLACES + bend + error)
 
     return Bench(
         model=SimulatorModel(line, noise=GaussianNoise(0.01)),
@@ -67,22 +68,39 @@ def line_bench():
 
 def test_stages_name_what_is_there_and_are_run_once(tmp_path, capsys):
     path = tmp_path / "out" / "rows.json"
-    rows = run_stages(line_bench(), path, clean=1)
-    assert [*rows] == ["recorded", "without bend", "clean 0", "least squares"]
+    rows = run_stages(line_bench(), path, clean=1, full=1)
+    replays = ["clean 2000", "full 2000"]
+    assert [*rows] == ["recorded", "without bend", *replays, "least squares"]
     recorded = rows["recorded"]
     assert recorded["verdict"] == "bend"
     assert recorded["before"]["far"] > 1
     assert recorded["after"]["far"] < 0.05
     assert "bend" not in rows["without bend"]["cause"]
-    assert rows["clean 0"]["verdict"] == "none"
+    assert rows["clean 2000"]["verdict"] == "none"
+    assert rows["full 2000"]["verdict"] == "bend"
     assert {*rows["least squares"]} == {"none", "bias", "bend"}
     assert json.loads(path.read_text()) == rows
     capsys.readouterr()
-    assert run_stages(line_bench(), path, clean=1) == rows
+    assert run_stages(line_bench(), path, clean=1, full=1) == rows
     assert capsys.readouterr().out == ""
     text = table(rows, "m")
     assert "| recorded | bend | bend 1.00 |" in text
     assert "before, m: far" in text
+    assert "| 1 replays of the bare model, seeds 2000 to 2000 | none (1) |" in text
+    assert aliases(rows) == "Aliases named: 0 of 1 removals."
+
+
+def test_an_alias_is_what_the_whole_library_does_not_name():
+    rows = {
+        "recorded": {"helps": ["drag"]},
+        "without drag": {"named": ["gain"], "text": "12 % of the\nexcess over"},
+        "without lag": {"named": ["drag"], "text": ""},
+        "without gain": {"named": ["bias", "drag"], "text": ""},
+    }
+    assert aliases(rows) == (
+        "Aliases named: 2 of 3 removals: gain (without drag); bias (without gain); "
+        "the share left said in 1."
+    )
 
 
 @pytest.mark.parametrize("module", [ball_and_hoop, cascaded_tanks])

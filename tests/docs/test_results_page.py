@@ -1,12 +1,18 @@
 """What benchmarks print becomes tables of the site, cell by cell."""
 
 import importlib.util
+import re
+import runpy
+import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
+#: Numbers of docs/benchmarks.md that were chosen and not measured: a level of a test,
+#: the range of a correlation.
+SETTINGS = {"0.01", "0.98"}
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +61,43 @@ def test_committed_rows_are_printed_and_their_absence_is_a_fault(results, monkey
     assert "| single: right family |" in results.as_markdown(text)
     with pytest.raises(ValueError, match="commit its rows"):
         results.printed("benchmarks.calibration.run --summary --first 1000000")
+
+
+def test_each_section_shows_its_tables(results):
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    included = re.findall(r"{include} reference/api/results/(.+)", text)
+    assert included == [
+        results.file_of(t).name
+        for t in re.findall("## (.+)", text)
+        if t in results.TABLES
+    ]
+    assert {*included} == {results.file_of(title).name for title in results.TABLES}
+
+
+def test_no_figure_is_typed_beside_the_tables():
+    """Settings stand in code or formulas; what was measured stands in tables alone."""
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    _, *sections = text.split("\n## ")
+    assert not [line for line in text.splitlines() if line.startswith("|")]
+    for section in sections:
+        prose = re.sub(r"```.*?```|`[^`]*`|\$[^$]*\$", "", section, flags=re.DOTALL)
+        figures = re.findall(r"(?<![\w.])\d*\.\d+|\d+ of \d+|\d+ x ", prose)
+        assert set(figures) <= SETTINGS, section.splitlines()[0]
+
+
+def test_a_file_is_a_table(results, monkeypatch, capsys, tmp_path):
+    (tmp_path / "rows.csv").write_text("a,b\n1,x|y\n")
+    (tmp_path / "runs.json").write_text('{"cpu": {"ours": 1.25}, "date": "today"}')
+    for arguments in (["rows.csv"], ["runs.json", "--only", "cpu*"]):
+        paths = [str(tmp_path / arguments[0]), *arguments[1:]]
+        monkeypatch.setattr(sys, "argv", ["table", *paths])
+        monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])
+        runpy.run_module("benchmarks.table", run_name="__main__")
+    assert capsys.readouterr().out.splitlines() == [
+        "| a | b |",
+        "| --- | --- |",
+        "| 1 | x\\|y |",
+        "| what | value |",
+        "| --- | --- |",
+        "| cpu, ours | 1.25 |",
+    ]

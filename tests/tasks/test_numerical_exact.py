@@ -369,3 +369,10 @@ def test_bad_parameters() -> None:
         greedy_design(torch.zeros(3, 2), ACTIONS, seed=0)
     with pytest.raises(ValueError, match="linear, sinh, square; got 'Linear'"):
         noise_free([[0.0, 0.0]], [0.0], variant="Linear")
+
+
+def test_greedy_design_with_given_actions():
+    made = greedy_design(THETA_TRUE, [-5, 0, 5], num_rounds=2, chosen=[1, 2], seed=3)
+    assert made.action.flatten().tolist() == [0, 5]
+    greedy = greedy_design(THETA_TRUE, [-5, 0, 5], num_rounds=2, seed=3)
+    assert made.gain[0] < greedy.gain[0]

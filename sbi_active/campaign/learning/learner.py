@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -43,6 +42,7 @@ from sbi_active.inference.beliefs.identifiability import note_combinations
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.trainers.base import ActiveInference
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 
@@ -202,7 +202,7 @@ class Learner:
     def _warned(self, index: int) -> Trial:
         trial = self._state.trials[index]
         for text in doubts([trial]):
-            warnings.warn(text, stacklevel=2)
+            warn(text, stacklevel=2)
         return trial
 
     def learn(self, trial: Trial) -> None:

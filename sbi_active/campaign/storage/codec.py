@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.messages import Explained
+
 #: Packages whose classes are stored by their attributes.
 TRUSTED = (
     "sbi_active.",
@@ -50,7 +52,7 @@ class Absent:
     """Stands for what a reader does not have, and for whatever hangs from it."""
 
 
-class NotStorableError(TypeError):
+class NotStorableError(Explained, TypeError):
     """Something in an object is neither of this library nor given again."""
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sbi_active.messages import Explained
 
-class DamagedCampaignError(OSError):
+
+class DamagedCampaignError(Explained, OSError):
     """A file of a campaign that does not hold what was written to it.
 
     Attributes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from sbi_active.campaign.storage.described import (
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.manifest import require_same_simulator
+from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
 if TYPE_CHECKING:
@@ -86,9 +86,7 @@ class StoredLearner:
             try:
                 self._belief = saved()
             except ValueError as error:
-                warnings.warn(
-                    f"the belief has to be computed again: {error}", stacklevel=3
-                )
+                warn(f"the belief has to be computed again: {error}", stacklevel=3)
                 self._state.is_stale = True
         return self._belief
 
@@ -139,7 +137,7 @@ def load(
     name = disk.restore(state)
     shape = torch.Size(manifest["x_shape"])
     for note in disk.notes:
-        warnings.warn(note, stacklevel=3)
+        warn(note, stacklevel=3)
     if simulator is None:
         without = {"simulator": Absent(), "prior": first_prior}
         saved = None if name is None else lambda: disk.belief(name, without)
@@ -179,7 +177,7 @@ def _belief(
     try:
         return disk.belief(name, known)
     except ValueError as error:
-        warnings.warn(f"the belief is computed again: {error}", stacklevel=4)
+        warn(f"the belief is computed again: {error}", stacklevel=4)
         learner.forget()
         return learner.prior
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from sbi_active.arrays import measured
 from sbi_active.callers import stack_level
+from sbi_active.messages import warn
 
 Role = Literal["fit", "held out"]
 
@@ -70,7 +70,7 @@ def without_inf(x: Tensor, names: Sequence[str]) -> Tensor:
     lost = x.isinf().flatten(1).any(-1).nonzero()[:, 0].tolist()
     if lost:
         which = ", ".join(names[int(i)] for i in lost)
-        warnings.warn(
+        warn(
             f"x is inf in trial{'s' * (len(lost) > 1)} {which}: taken as not measured, "
             "as NaN is",
             stacklevel=stack_level(),

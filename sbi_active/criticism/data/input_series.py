@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import padded
+from sbi_active.messages import warn
 
 Array = NDArray[Any]
 Hold = Literal["previous", "linear"]
@@ -312,7 +312,7 @@ def _require_one_origin(ends: list[tuple[float, float]], low: float) -> None:
             f"expected trials that begin at similar times; got trial {i} of {span:g} "
             f"that begins {after:g} after the earliest; {remedy}, and all in one unit"
         )
-    warnings.warn(
+    warn(
         f"trials {[i for i, *_ in late]} begin up to {after:g} after the earliest, and "
         f"hold their first inputs until then: {remedy} where a simulator starts there",
         stacklevel=stack_level(),

@@ -117,6 +117,11 @@ class Measurements:
         return len(self.x)
 
     @property
+    def is_sequence(self) -> bool:
+        """Whether any number follows another in time."""
+        return self.has_time and bool(np.isfinite(self.gap).any())
+
+    @property
     def step(self) -> float:
         """Median time between neighboring numbers; 1 without a time axis."""
         gaps = self.gap[np.isfinite(self.gap)]

@@ -8,7 +8,6 @@ A wide table has columns "action_\*" and "x_\*". A long one has besides them "tr
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import Columns, bare, find_columns
 from sbi_active.criticism.data.table_inputs import InputRows
 from sbi_active.criticism.data.table_rows import Rows, read_frame
+from sbi_active.messages import warn
 
 Array = NDArray[Any]
 
@@ -255,7 +255,7 @@ class _TrialRows(Rows):
             if len(at):
                 some = ", ".join(map(self.place, at[:SHOWN]))
                 more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""
-                warnings.warn(
+                warn(
                     f"{len(at)} of {len(rows)} cells of column {column} in "
                     f"{self.source} hold no number: {some}{more}; they count as not "
                     "measured",
@@ -279,7 +279,7 @@ class _TrialRows(Rows):
             fewer, word = order[:k], "smaller"
         which = ", ".join(self.names[some[i]] for i in sorted(fewer)[:SHOWN])
         factor = 10 ** abs(np.median(high) - np.median(low))
-        warnings.warn(
+        warn(
             f"{column} of {'trials' if self.columns.trial else 'rows'} {which} in "
             f"{self.source} is about {factor:.0f} times {word} than that of the "
             "others: check that all are in one unit",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.input_series import FAR, GAP
+from sbi_active.messages import warn
 
 Array = NDArray[Any]
 
@@ -68,7 +68,7 @@ class InputRows:
         """
         lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
         if len(lost):
-            warnings.warn(
+            warn(
                 f"{len(lost)} rows of {self.source} have a measurement and no input, "
                 f"the first in {self.place(lost[0])}; there the input before holds",
                 stacklevel=stack_level(),

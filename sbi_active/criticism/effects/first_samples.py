@@ -23,17 +23,22 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from torch import Tensor
 from torch.distributions import Independent, Normal
 
+from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.messages import warn
 
 Array = NDArray[Any]
 
 #: Standard errors in a deviation of the nuisance.
 WIDTH = 3.0
+#: Probability, over all trials, of warning of first samples that are a polynomial.
+BENT = 1e-3
 
 
 def start_from_first_samples(
@@ -67,6 +72,10 @@ def start_from_first_samples(
         A copy of the trials with ``start``, beside what was measured of it, and an
         effect of scope "trial" with an entry of phi for each name.
 
+    Warns:
+        UserWarning: If first samples leave the polynomial by more than the sensor's
+            error: a line, where speeds alone are named, does not know of gravity.
+
     Raises:
         ValueError: If there are no sample times, an entry of x is not there, a
             deviation is not positive, or a trial has too few first samples.
@@ -91,12 +100,26 @@ def start_from_first_samples(
     sds = _deviations(trials, sd, channels)
     found: dict[str, list[float]] = {key: [] for key in wanted}
     errors: dict[str, list[float]] = {key: [] for key in wanted}
+    bent = set()
     for i in range(len(trials)):
         for (key, (channel, order)), own in zip(wanted.items(), sds, strict=True):
             t, x = _first(trials, i, channel, within, degree)
-            value, error = _polynomial(t - (t[0] if at is None else at), x, degree)
+            t = t - (t[0] if at is None else at)
+            value, error = _polynomial(t, x, degree)
+            misfit = x - np.polynomial.Polynomial(value)(t)
+            p = chi2.sf(np.sum((misfit / own) ** 2), max(len(t) - degree - 1, 1))
+            if p < BENT / (len(trials) * len(wanted)):
+                bent.add(i)
             found[key].append(factorial(order) * value[order])
             errors[key].append(factorial(order) * own * error[order])
+    if bent:
+        warn(
+            f"the first samples of {trials.called(sorted(bent))} leave a polynomial of "
+            f"order {degree} by more than the sensor's error, so that their start is "
+            "wrong and hides what bends them, such as gravity: name a derivative of "
+            f"order {degree + 1} as well, or pass a shorter within",
+            stacklevel=stack_level(),
+        )
     if trials.start is not None and not isinstance(trials.start, dict):
         raise ValueError(
             "expected measured start states by name; got an array; pass "

@@ -41,6 +41,7 @@ class ImportanceSample:
         log_evidence: Nats.
         standard_error: Of log_evidence.
         effective_sample_size: 1 / sum of squared weights.
+        best: Where other trials are predicted from, shape (dim,); None takes the draws.
     """
 
     u: Array
@@ -48,6 +49,7 @@ class ImportanceSample:
     log_evidence: float
     standard_error: float
     effective_sample_size: float
+    best: Array | None = None
 
     def draws(self, num: int, rng: np.random.Generator) -> Array:
         """Return equally weighted draws in u, shape (num, dim)."""
@@ -83,6 +85,7 @@ def importance_sample(
     missed: float = MISSED,
     enough: float = ENOUGH,
     dismissed: float = -np.inf,
+    hopeless: float = -np.inf,
 ) -> ImportanceSample:
     r"""Return the evidence :math:`Z = E_q[p(x | z) p(z) / q(z)]`.
 
@@ -102,6 +105,8 @@ def importance_sample(
         enough: Effective sample size that ends the rounds.
         dismissed: Log evidence below which a model hardly counts, so that 20 effective
             particles end them.
+        hopeless: Log evidence below which nothing counts once the shape was looked at
+            for the last time, however few particles are effective.
 
     References:
         Cappe et al., Statistics and Computing 18 (2008); Cornuet et al., Scandinavian
@@ -126,6 +131,8 @@ def importance_sample(
         at_most = sample.log_evidence + 2 * sample.standard_error
         needed = min(enough, ENOUGH_BEHIND) if at_most < dismissed else enough
         if sample.effective_sample_size >= needed:
+            break
+        if i == LOOKS[-1] and at_most < hopeless:
             break
         few = sample.effective_sample_size < missed
         if local is not None and few and i in looks:

@@ -300,7 +300,8 @@ class RivalSet:
             if -np.inf < sample.log_evidence < best - FAR_BEHIND:
                 return sample, "linear"
         better, enough, too_few = ridges, ENOUGH, TOO_FEW
-        options: dict[str, Any] = {"dismissed": best - BEHIND}
+        given_up = best - HOPELESS if self.nuisances else -np.inf
+        options: dict[str, Any] = {"dismissed": best - BEHIND, "hopeless": given_up}
         if not self.is_smooth:
             better, enough, too_few = regressions, ENOUGH_ROUGH, TOO_FEW_ROUGH
             options |= {"looks": range(MAX_ROUNDS), "missed": np.inf}
@@ -317,8 +318,7 @@ class RivalSet:
         most = sample.log_evidence + TOLERATED * sample.standard_error
         if self.nuisances and most < best - SETTLED:
             return sample, "least squares"
-        # Where the simulator jumps, or each trial has its own unknowns, all particles
-        # are dear, and most often behind.
+        # All particles are dear here, and most often behind.
         for few in (True, False) if self.nuisances or not self.is_smooth else (False,):
             other = self._temper(rival, seed, few=few)
             both = np.hypot(sample.standard_error, other.standard_error)

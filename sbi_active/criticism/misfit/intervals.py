@@ -1,18 +1,19 @@
 r"""Intervals of parameters where every model is wrong.
 
 A posterior given one error model is too narrow: it takes what the simulator gets wrong
-for independent from trial to trial. The deviation is
+for independent from trial to trial. The variance is
 
 .. math::
-    s^2 = \max(s_{GLS}, s_J)^2 + (\hat u_{LSQ} - \hat u_{GLS})^2
-        + (\hat u_{LSQ} - \hat u_{LSQ}')^2
+    s^2 = t_f^2 \bigl(\max(s_{GLS}, s_J)^2 + (\hat u_{LSQ} - \hat u_{GLS})^2\bigr)
+        + \sum_m w_m (\hat u_m - \hat u)^2
 
 with that of generalized least squares given a residual process of which a part is
-shared by the trials, and the jackknife's over trials, :math:`s_J`: what weighting the
-same residuals differently moves a parameter by is an error of it too. So is what it
-moves by, to u', beside the further declared effects that predict new trials best:
-something undeclared may act as they do. The center is that of least squares, which
-predicts new trials better.
+shared by the trials, and the jackknife's over f trials, :math:`s_J`: what weighting the
+same residuals differently moves a parameter by is an error of it too. So is what it is
+in other models m, by how well they predict left-out trials: something undeclared may
+act as their effects do. :math:`t_f` is Student's quantile in units of the normal one,
+since few trials hardly tell how much they differ. The center is that of least squares,
+which predicts new trials better.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from sbi_active.criticism.misfit.left_out import LeftOut
 from sbi_active.criticism.misfit.linear import LinearModel
@@ -32,6 +34,8 @@ Array = NDArray[Any]
 #: Shares of the process that trials have in common, and the length over which they do,
 #: in deviations of the action.
 SHARES, LENGTHS = (0.5, 0.9), (0.7, 1e3)
+#: Upper end of the central interval that is printed.
+QUANTILE = 0.95
 #: Every so many of the sizes of the process.
 THINNED = 2
 
@@ -43,7 +47,7 @@ def covariance(
     errors: Errors,
     action: Array,
     *,
-    moved: Array | float = 0.0,
+    between: Array | float = 0.0,
 ) -> Array:
     """Return the covariance of a model's coordinates about its best fit, (d, d).
 
@@ -53,20 +57,25 @@ def covariance(
         left: Refits without each part of the trials.
         errors: Shared by all models.
         action: Of each trial, shape (t, action_dim).
-        moved: u' less u, shape (d,).
+        between: Variance of the coordinates from model to model, shape (d,).
     """
     found = shared_process(model, errors, action)
     mean, cov = (posterior.mean, posterior.cov) if found is None else found
     mean = np.clip(mean, model.low, model.high)
     jackknife, apart = left.jackknife(), model.u - mean
-    variance = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
-    moved = np.broadcast_to(moved, apart.shape)
-    variance = variance + moved**2
-    # Parameters move together as in any of the four, whose sum is hardly wider.
-    total = cov + jackknife + np.outer(apart, apart) + np.outer(moved, moved)
+    within = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
+    between = np.broadcast_to(between, apart.shape)
+    variance = _few(int(np.isfinite(left.square).sum())) ** 2 * within + between
+    # Parameters move together as in any of the three, whose sum is hardly wider.
+    total = cov + jackknife + np.outer(apart, apart) + np.diag(between)
     sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))  # that of the prior
     scale = sd / np.sqrt(np.maximum(np.diag(total), 1e-300))
     return total * np.outer(scale, scale)
+
+
+def _few(parts: int) -> float:
+    """Return Student's quantile for so many parts in units of the normal one."""
+    return float(stats.t.ppf(QUANTILE, max(parts - 1, 1)) / stats.norm.ppf(QUANTILE))
 
 
 def shared_process(

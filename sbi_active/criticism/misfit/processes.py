@@ -140,7 +140,9 @@ class Errors:
         span = max(float(span), m.step)
         low, high = SAMPLE * m.step, max(TRIAL * span, 2 * SAMPLE * m.step)
         num = 2 + round(np.log(high / low) / np.log(APART))
-        self.times = np.geomspace(low, high, num)
+        # Numbers that do not follow each other have errors of their own.
+        self.kernels = KERNELS if m.is_sequence else KERNELS[:1]
+        self.times = np.geomspace(low, high, num if m.is_sequence else 1)
         self.cells = [_in_units(cell, unit) for cell in cells]
         total = log_sum_exp(np.array([c.log_weight for c in self.cells]))
         self.log_cells = np.array([c.log_weight for c in self.cells]) - total
@@ -149,7 +151,7 @@ class Errors:
     @property
     def num_processes(self) -> int:
         """Errors with a process: kernels, time scales and sizes."""
-        return len(KERNELS) * len(self.times) * len(self.sizes)
+        return len(self.kernels) * len(self.times) * len(self.sizes)
 
     def grams(self, rows: Array) -> Grams:
         """Return the Gram matrices of rows (N, k), the sensor's errors first."""
@@ -223,7 +225,7 @@ class Errors:
         if not process:
             center = mean + model.center
             return Posterior(log_sensor, log_process, center, cov, 0.0, 1.0)
-        each = p.reshape(len(KERNELS), len(self.times), len(self.sizes), -1)
+        each = p.reshape(len(self.kernels), len(self.times), len(self.sizes), -1)
         sizes, times = each.sum((0, 1, 3)), each.sum((0, 2, 3))
         middle = int(np.searchsorted(np.cumsum(times), 0.5))
         return Posterior(
@@ -253,7 +255,7 @@ class Errors:
             time = m.time[places[0]]
             apart = np.abs(time[:, None] - time)
             bases = []
-            for kernel in KERNELS:
+            for kernel in self.kernels:
                 for tau in self.times:
                     values, vectors = np.linalg.eigh(kernel(apart / tau))
                     bases.append((np.clip(values, 0, None), vectors))

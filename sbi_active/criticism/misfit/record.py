@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.verdict import Misfit
-from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
     UNEXPLAINED,
     Detection,
@@ -122,14 +122,43 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
     )
 
 
+def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
+    """Return a verdict of other evidence with the intervals that hold under misfit.
+
+    Args:
+        tracing: Of numbers without a time axis, of which no declared effect predicts
+            left-out trials better: larger noise or something undeclared.
+        misfit: The models.
+    """
+    found = dict(tracing.evidences)
+    for name, own in found.items():
+        key = ModelKey(own.key.effects)
+        if key not in misfit.search.found:
+            continue
+        model = misfit.model(key)
+        u = _drawn(misfit.rivals, model, model.u, misfit.covariance(key))
+        draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
+        found[name] = replace(own, draws=draws)
+    return replace(tracing, evidences=found)
+
+
 def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
-    return keep_draws(misfit.rivals, model, model.u, misfit.covariance(key), log_z)
+    cov = misfit.covariance(key)
+    # Draws as wide as misfit asks leave the valleys of what bends: left-out trials are
+    # predicted from the best fit, and so are others.
+    return keep_draws(misfit.rivals, model, model.u, cov, log_z, best=model.u)
 
 
 def keep_draws(
-    rivals: RivalSet, model: LinearModel, center: Array, cov: Array, log_z: float
+    rivals: RivalSet,
+    model: LinearModel,
+    center: Array,
+    cov: Array,
+    log_z: float,
+    *,
+    best: Array | None = None,
 ) -> Evidence:
     """Return a linear model's record, and keep its draws as its posterior sample.
 
@@ -139,18 +168,15 @@ def keep_draws(
         center: Of its posterior, shape (d,).
         cov: Of its posterior, shape (d, d).
         log_z: Its evidence, nats.
+        best: Where other trials are predicted from, shape (d,); None takes the draws.
     """
     key = model.key
     if key in rivals.fits:
         return rivals.fits[key].evidence
     before = rivals.simulator.num_simulations if key.effects else 0
-    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(key)))
-    values, vectors = np.linalg.eigh(cov)
-    root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
-    u = np.clip(u, model.low, model.high)
+    u = _drawn(rivals, model, center, cov)
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
-    sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS))
+    sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS), best)
     rival = rivals.rival(key)
     evidence = Evidence(
         key=key,
@@ -162,19 +188,26 @@ def keep_draws(
         names=rivals.names_of(rival),
         draws=rival.coordinates.to_z(u)[:, : model.own],
         best_chi_square=model.chi_square[0],
+        best=None
+        if best is None
+        else rival.coordinates.to_z(best[None])[0, : model.own],
     )
     rivals.fits[key] = Fit(rival, sample, evidence)
     return evidence
 
 
+def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:
+    """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
+    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
+    values, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.clip(values, 0, None))
+    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
+    return np.clip(u, model.low, model.high)
+
+
 def _weights(misfit: Misfit) -> dict[ModelKey, float]:
     """Return the models that count, by their errors on left-out parts."""
-    found = misfit.search.found
-    weights = weights_by_error(
-        {key: candidate.left.square for key, candidate in found.items()},
-        {key: candidate.log_prior for key, candidate in found.items()},
-        derive_seed(misfit.rivals.seed, "weights"),
-    )
+    weights = misfit.weights()
     kept = [key for key, weight in weights.items() if weight >= COUNTS]
     return {key: weights[key] for key in kept[:MOST_COUNTED]}
 
@@ -194,7 +227,7 @@ def _found(
         sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
         passes=misfit.passes(choice.key),
         size=last.posterior.size,
-        time_scale=last.posterior.time_scale,
+        time_scale=last.posterior.time_scale if m.is_sequence else np.nan,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in weights.items()},
     )
@@ -224,7 +257,7 @@ def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials) -> Array:
     channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
     channel[m.position] = m.channel
     x = held_out.x.double().numpy().ravel()[prediction.position]
-    error = x - prediction.mean.mean(0)
+    error = x - prediction.middle
     return np.sqrt(_by_channel(error**2, channel[prediction.position]))
 
 

@@ -16,8 +16,9 @@ model without the effect and of the bare one. It is the smaller u of two sets: o
 helps, and of what is left of it where each must predict better with a probability of
 .9, since two that imitate each other both look dispensable. Where the model's
 chi-square passes against the sensor nothing remains, and it is the inclusion
-probability itself. The thresholds and the .85 are empirical: evidence alone, or
-prediction alone, names a stand-in as surely as a cause.
+probability itself. Without a time axis, where trials have few numbers, it is
+:math:`.85 (1 - u)^2` in either case. The thresholds, the .85 and the power are
+empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ Array = NDArray[Any]
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
+FEW = 2  # power of 1 - u where x has no time axis
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 
@@ -93,6 +95,8 @@ def choose(
     models: Mapping[ModelKey, Scored],
     names: Sequence[str],
     equivalent: Sequence[frozenset[str]] = (),
+    *,
+    timed: bool = True,
 ) -> Choice:
     """Return what helps, and the probability that it is the cause.
 
@@ -100,6 +104,7 @@ def choose(
         models: Fitted ones; with a set of effects, the sets with one effect less.
         names: Of all effects.
         equivalent: Groups of them that nothing separates, which share their mass.
+        timed: Whether x has a time axis.
     """
     keys = admitted(models)
     log_p = np.array([models[key].log_p for key in keys])
@@ -121,7 +126,9 @@ def choose(
         # Beside one that hardly helps an effect may be missed less than it is alone.
         found = [_remains(models, k, n) for k in (key, surer) if n in k.effects]
         remains[n] = min(found)
-        share = 1.0 if models[key].passes else CERTAIN * (1 - remains[n])
+        # Few numbers a trial are fitted to the sensor's error by much that is wrong.
+        share = CERTAIN * (1 - remains[n]) ** (1 if timed else FEW)
+        share = 1.0 if timed and models[key].passes else share
         cause[n] = inclusion[n] * share
     return Choice(key, probabilities, inclusion, cause, better, remains)
 

@@ -14,7 +14,9 @@ from sbi_active.criticism.rivals.noise_grid import measurement_sds
 Array = NDArray[Any]
 
 
-def sensor_error(rivals: RivalSet) -> tuple[Array, list[NoiseCell]] | None:
+def sensor_error(
+    rivals: RivalSet, *, needs_time: bool = True
+) -> tuple[Array, list[NoiseCell]] | None:
     """Return the sensor's deviation (N,), and its error with what is unknown of it.
 
     None where the size of the sensor's error is not declared, x has no time axis, or
@@ -22,9 +24,10 @@ def sensor_error(rivals: RivalSet) -> tuple[Array, list[NoiseCell]] | None:
 
     Args:
         rivals: The models, with the noise as it was declared.
+        needs_time: Whether x has to have a time axis.
     """
     noise, m = rivals.model.noise, rivals.measurements
-    if noise is None or not m.has_time or not np.isfinite(m.gap).any():
+    if noise is None or (needs_time and not m.is_sequence):
         return None
     measured = measurement_sds(noise, m)
     if measured is not None:

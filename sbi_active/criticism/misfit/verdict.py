@@ -22,10 +22,13 @@ from sbi_active.criticism.misfit.processes import Posterior
 from sbi_active.criticism.misfit.rule import PASSES, Choice, Scored, admitted, choose
 from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
-from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.misfit.weights import weights_by_error
+from sbi_active.criticism.results import UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
+from sbi_active.criticism.under_misfit import NAMED
 from sbi_active.inference.sampling.weights import log_sum_exp
+from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
@@ -76,16 +79,42 @@ class Misfit:
             found.left,
             self.search.errors,
             action,
-            moved=self._moved(key),
+            between=self._between(key),
         )
 
-    def _moved(self, key: ModelKey) -> Array:
-        """Return by how much the further effects that predict best move it, (d,)."""
+    def replaces(self, verdict: str) -> bool:
+        """Return whether it says more than a verdict of numbers without a time axis.
+
+        Numbers that scatter more than declared, each for itself, leave some effect that
+        predicts a few of them better: there it has to be the probable cause.
+        """
+        best = max(self.choice.cause.values(), default=0.0)
+        return best > NAMED or (verdict == UNEXPLAINED and best > 0)
+
+    def weights(self) -> dict[ModelKey, float]:
+        """Return how much each model counts by its errors on left-out parts."""
         found = self.search.found
-        larger = [k for k in found if {*key.effects} <= {*k.effects}]
-        best = min(larger, key=lambda k: found[k].left.mean_square)
-        moved = found[best].model.u[self.search.columns(best, key)]
-        return moved - found[key].model.u
+        return weights_by_error(
+            {key: candidate.left.square for key, candidate in found.items()},
+            {key: candidate.log_prior for key, candidate in found.items()},
+            derive_seed(self.rivals.seed, "weights"),
+        )
+
+    def _between(self, key: ModelKey) -> Array:
+        """Return the variance of a model's coordinates among those that predict, (d,).
+
+        By the square roots of the weights: errors of neighboring parts have causes in
+        common, and count for about half as many.
+        """
+        search, u = self.search, self.model(key).u
+        total, norm = np.zeros_like(u), np.zeros_like(u)
+        for other, weight in self.weights().items():
+            common = ModelKey(tuple(n for n in key.effects if n in other.effects))
+            own = search.columns(key, common)
+            its = self.model(other).u[search.columns(other, common)]
+            total[own] += np.sqrt(weight) * (its - u[own]) ** 2
+            norm[own] += np.sqrt(weight)
+        return total / np.maximum(norm, 1e-300)
 
     def selected_without(self, fold: int) -> ModelKey:
         """Return the model that is chosen without one part of the trials."""
@@ -139,7 +168,8 @@ def find_misfit(
         search: Fits the models; None makes one.
     """
     if search is None:
-        sensor = sensor_error(rivals)
+        # Where it is known not to be the sensor's error there is nothing to tell apart.
+        sensor = sensor_error(rivals, needs_time=not is_known)
         if sensor is None:
             return None
         unit, cells = sensor
@@ -183,7 +213,8 @@ def settled(
         top = max(admitted(scored), key=lambda key: scored[key].log_p)
         missing = _missing(search, top)
         if not missing:
-            return choose(scored, search.names, equivalent)
+            timed = search.rivals.measurements.is_sequence
+            return choose(scored, search.names, equivalent, timed=timed)
         for key in missing:
             search.fit_set(key)
 

@@ -15,6 +15,7 @@ from sbi_active.criticism.report import rendering
 from sbi_active.criticism.report.cautions import find_warnings
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import verdict_line
+from sbi_active.messages import explained
 
 
 class Report(Contents):
@@ -104,7 +105,7 @@ def build_report(
     channels = trials.channel_labels or parts["simulator"].channel_names
     return Report(
         **parts,
-        warnings=(*found, *warnings),
+        warnings=tuple(map(explained, (*found, *warnings))),
         exploratory=exploratory,
         num_trials=len(trials.fit),
         action_labels=tuple(labels),

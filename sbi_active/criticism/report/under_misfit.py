@@ -106,16 +106,24 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         ]
         held = [] if m.held_out is None else [_size(report, m.held_out)]
         rows.append((*cells, *held))
+    has_time = misfit.time_scale == misfit.time_scale  # NaN without a time axis
+    error = "a residual process of unknown size and time scale"
+    size = f"Beside the verdict's model the process has {misfit.size:.2g} times the "
+    size += "sensor's standard deviation"
+    if has_time:
+        size += f" and a time scale of {number(misfit.time_scale)}"
+    else:
+        error = "an error of unknown size in each number, beside the sensor's"
+        size = size.replace("the process", "that error")
     text = [
-        "Every model carries a residual process of unknown size and time scale, so "
+        f"Every model carries {error}, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "
         "error on left-out "
         f"{misfit.left_out} is within a tenth of the smallest; P is among them. Errors "
         "are root mean squares of models fitted without what they predict. The "
         f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
         "beyond it, as a share of the bare model's.",
-        f"Beside the verdict's model the process has {misfit.size:.2g} times the "
-        f"sensor's standard deviation and a time scale of {number(misfit.time_scale)}.",
+        f"{size}.",
     ]
     items = [
         f"{n}: probability of the cause {_share(misfit, n)}, of a better prediction of "

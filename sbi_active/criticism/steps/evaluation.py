@@ -78,7 +78,7 @@ def tail(prediction: Prediction, trials: Trials) -> float:
     x = trials.x.double().numpy().reshape(-1)[prediction.position]
     off = prediction.mean - prediction.mean.mean(0)
     cov = off.T @ off / (len(off) - 1) + np.diag((prediction.sd**2).mean(0))
-    error = x - prediction.mean.mean(0)
+    error = x - prediction.middle
     return float(chi2.sf(error @ np.linalg.solve(cov, error), len(error)))
 
 
@@ -126,7 +126,7 @@ def _predictions(
 def scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
     """Return one value a trial of each metric, and squares and counts for the RMSE."""
     x = trials.x.numpy().reshape(-1)[prediction.position]
-    middle = prediction.mean.mean(0)
+    middle = prediction.middle
     tail = 0.5 * (1 - COVERAGE)
     low, high = np.quantile(prediction.x, [tail, 1 - tail], axis=0)
     rows = []

@@ -5,7 +5,10 @@ r"""What a verdict rests on: its Bayes factor with each trial left out.
 
 from the weighted sample behind the evidence, which costs no simulation. Where a trial
 decides so much of the posterior that few draws are left, the posterior under a gross
-error of any one trial takes its place, since it reaches all of those without one.
+error of any one trial takes its place, since it reaches all of those without one; but
+not where the few draws already say enough: such an average exceeds what it estimates by
+a factor of e^5 with a probability of e^-5 at most (Markov's inequality), and a Bayes
+factor is most often hundreds of nats.
 """
 
 from __future__ import annotations
@@ -34,6 +37,8 @@ Array = NDArray[Any]
 
 #: Effective draws below which an evidence without a trial is computed anew.
 FEWEST = 20.0
+#: Nats by which few draws may overestimate an evidence without a trial.
+OVERESTIMATED = 5.0
 #: Odds against a gross error from which one trial may speak for an effect alone.
 DECISIVE = 150.0
 
@@ -56,7 +61,8 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
     log_b = log_evidence(rivals, key)[0] - log_evidence(rivals)[0]
     if own.has_noise_effect or rivals.simulator.is_stochastic or log_b < THRESHOLD:
         return ()
-    without = log_b + _change(rivals, key) - _change(rivals, ModelKey())
+    bare = _change(rivals, ModelKey())
+    without = log_b + _change(rivals, key, enough=bare - log_b + THRESHOLD) - bare
     index = rivals.trials.index.numpy()[rivals.one_outlier().trials]
     return (*index[without < THRESHOLD].tolist(),)
 
@@ -109,10 +115,19 @@ def withdrawn(tracing: Tracing) -> Tracing:
     )
 
 
-def _change(rivals: RivalSet, key: ModelKey) -> Array:
-    """Return the log evidence without each trial less that of all, shape (k,)."""
+def _change(
+    rivals: RivalSet, key: ModelKey, *, enough: Array | float = np.inf
+) -> Array:
+    """Return the log evidence without each trial less that of all, shape (k,).
+
+    Args:
+        rivals: The models.
+        key: Of one.
+        enough: From here on it need not be precise, shape (k,).
+    """
     change, effective = _reweighted(rivals, key)
-    if effective.min() < FEWEST:
+    least = change - rivals.fit(key).evidence.log_evidence - OVERESTIMATED
+    if ((effective < FEWEST) & (least < enough)).any():
         other, number = _reweighted(rivals, replace(key, error=OUTLIER))
         change = np.where(number > effective, other, change)
     return change - rivals.fit(key).evidence.log_evidence

@@ -39,6 +39,8 @@ class Prediction:
         position: Of each number in the flattened x, shape (N,).
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
         probability_valid: That it has one, given the draw, shape (n, t).
+        at_best: Noise-free prediction by the best fit, shape (N,), where every model
+            misses; None otherwise.
     """
 
     mean: Array
@@ -49,6 +51,12 @@ class Prediction:
     position: Array
     valid: Array
     probability_valid: Array
+    at_best: Array | None = None
+
+    @property
+    def middle(self) -> Array:
+        """By which the error is measured: of the best fit, or the mean, (N,)."""
+        return self.mean.mean(0) if self.at_best is None else self.at_best
 
     @property
     def log_density(self) -> Array:
@@ -104,6 +112,11 @@ def predict(
                 fresh = effect.sample(num_draws * len(target))
                 phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
     mean, unit, probability = simulator.predict(theta, phi)
+    at_best = None
+    if trials is not None and sample.best is not None and not rivals.nuisances:
+        at = rival.coordinates.split(sample.best[None])
+        at_best = simulator.predict(*at)[0][0]
+        at_best = np.where(np.isfinite(at_best), at_best, mean.mean(0))
     noise = rivals.noise_of(m)
     factor = simulator.noise_scale(phi, num_draws)
     factor = np.ones_like(mean) if factor is None else factor
@@ -151,6 +164,7 @@ def predict(
         m.position[~drops],
         rng.uniform(size=probability.shape) < probability,
         probability,
+        None if at_best is None else at_best[~drops],
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
@@ -16,6 +15,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.messages import warn
 from sbi_active.notebook import card, parameters
 from sbi_active.seeding import forked_generators
 
@@ -195,7 +195,7 @@ class ChainedBelief(Belief):
             self._log_normalizer = torch.tensor(acceptance).log()
         else:
             self._resample(previous)
-            warnings.warn(
+            warn(
                 f"only {acceptance:.2%} of the network's posterior lies within the "
                 "prior's support: the observation is unlike those simulated, or the "
                 "truth lies outside the prior. The belief is resampled from the one "

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
 from sbi_active.inference.beliefs.identifiability import Combinations
+from sbi_active.messages import explained, warn
 from sbi_active.notebook import badge, card, facts, items, number
 
 VERDICTS = {
@@ -70,6 +70,11 @@ class Diagnostics:
     tail_probability_of_trial: tuple[float, ...] = ()
     combinations: Combinations = Combinations()
     figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+
+    def __post_init__(self) -> None:
+        for name in ("warnings", "network_warnings"):
+            texts = tuple(map(explained, getattr(self, name)))
+            object.__setattr__(self, name, texts)
 
     def extended(self, **changes: Any) -> Diagnostics:
         """Return these with other values; names that are no field become figures."""
@@ -155,7 +160,7 @@ class Diagnostics:
         return self._as_dict(f".get({name!r})").get(name, default)
 
     def _as_dict(self, used: str) -> dict[str, Any]:
-        warnings.warn(
+        warn(
             f"diagnostics{used} is deprecated; use an attribute, or to_dict()",
             DeprecationWarning,
             stacklevel=3,

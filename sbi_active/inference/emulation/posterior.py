@@ -20,24 +20,17 @@ from sbi_active.inference.emulation.likelihood import (
     TrialLikelihood,
     correlation_root,
 )
+from sbi_active.inference.emulation.peaks import around, sample_posterior
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.process import GaussianProcess, num_features
 from sbi_active.inference.emulation.statistics import learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.regions import (
-    PriorProposal,
-    Region,
-    whole_space,
-)
+from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import (
-    Particles,
-    StudentProposal,
-    population_monte_carlo,
-)
+from sbi_active.inference.sampling.population import Particles
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -50,8 +43,6 @@ STAGE_SHARE = 0.35  # of the allowance
 FEWEST_ROWS = 12  # of a stage
 ENOUGH = 0.01  # nats: then no further simulation
 LARGE = 0.2  # nats that a belief is off
-NUM_PARTICLES = 3_000
-FEW_EFFECTIVE = 300  # of them: the density is off by their number to the power -1/2
 DEFENSIVE = 1e-5
 NUM_OUTER, NUM_INNER = 128, 600  # draws behind the gain of a summary
 REACH = 6.0  # deviations of the belief within which rows are near it
@@ -116,7 +107,6 @@ class PooledPosterior:
         at_start, start = len(self.pool), self.pool.num_missing
         reference = self.draws(before)
         labels = [self.best_summary(t, reference) for t in trials]
-        first, errors = None, np.full(1, np.inf)
         left = allowance
         for stage in range(NUM_STAGES + 1):
             fitted = tuple(
@@ -124,19 +114,15 @@ class PooledPosterior:
                 for t, label in zip(trials, labels, strict=True)
             )
             likelihood = PooledLikelihood(self.coordinates, fitted)
-            # What is not known yet may have its peak elsewhere.
-            sure = errors.sum() < LARGE
-            particles = self._sample(likelihood, first if sure else None)
+            particles = sample_posterior(likelihood, reference, self.rng)
             reference = particles.resample(NUM_REFERENCE, self.rng)
             errors = np.array([one.error(reference) for one in fitted])
             size = min(left, max(FEWEST_ROWS, int(STAGE_SHARE * allowance)))
             size = left if left - size < FEWEST_ROWS else size
             if size < FEWEST_ROWS or errors.sum() < ENOUGH or stage == NUM_STAGES:
                 break
-            first = StudentProposal.fit(
-                reference, 4, PriorProposal(self.coordinates), self.rng
-            )
-            self._simulate(trials, errors, first, size)
+            where = around(reference, self.coordinates, self.rng)
+            self._simulate(trials, errors, where, size)
             left -= size
         spent = len(self.pool) + self.pool.num_missing - at_start - start
         return self._belief(likelihood, particles, fitted, errors, spent), labels
@@ -243,32 +229,6 @@ class PooledPosterior:
             return None
         pairs = np.zeros((0, 2), dtype=bool)
         return TrialOutcome.fit(whole_space(z.shape[1]), 0, z, agrees, pairs)
-
-    def _sample(self, likelihood: PooledLikelihood, first: Any) -> Particles:
-        prior, best = PriorProposal(self.coordinates), None
-        # What is much narrower than what was before takes more, from the prior on.
-        for num, begin in ((NUM_PARTICLES, first), (3 * NUM_PARTICLES, None)):
-            particles, _ = population_monte_carlo(
-                likelihood.log_joint,
-                prior,
-                self.rng,
-                num_particles=num,
-                first=begin,
-                num_components=4 if best is None else 8,
-            )
-            size = particles.effective_sample_size
-            if best is None or size > best.effective_sample_size:
-                best = particles
-            if size > FEW_EFFECTIVE:
-                break
-        particles = best
-        assert particles is not None
-        if not np.isfinite(particles.log_normalizer):
-            raise UnexplainedOutcomeError(
-                "expected outcomes that some parameters may explain; got none with a "
-                "likelihood; correct the outcome, or leave the trial out"
-            )
-        return particles
 
     def _simulate(
         self, trials: Sequence[PooledTrial], errors: Array, where: Any, size: int

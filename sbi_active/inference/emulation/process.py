@@ -20,7 +20,9 @@ LENGTH_PRIOR = (math.log(2.5), 1.0)
 AMPLITUDE_PRIOR = (math.log(0.5), 1.5)
 NOISE_PRIOR = (math.log(0.3), 1.5)
 TREND = 3.0  # deviation of the trend's coefficients, outputs of unit size
-JITTER = 1e-7  # of the variance: a noise below 3e-4 of the range is not resolved
+JITTER = 1e-7  # of the variance: a noise below 3e-4 of it is not resolved
+ROUNDED = 1e-7  # of the largest output, which single precision does not tell
+SPARE = 3  # rows beyond the features before a trend is taken off
 ROWS_A_FEATURE = 2.0  # that a quadratic trend takes at least
 LIMIT = 6.0  # of the logarithms, beyond which a line search may not step
 MOST_FITTED = 250  # rows that hyperparameters are fitted to
@@ -38,6 +40,8 @@ class GaussianProcess:
     with h a linear or quadratic basis, :math:`\kappa` a squared exponential ("smooth")
     or Matern 5/2 ("rough"), and the hyperparameters at their most probable values. The
     variance is scaled so that left-out rows are missed by as much as it says.
+    Of outputs without noise a least-squares trend is taken off first: they may differ
+    by 10,000 deviations of the noise declared beside them, and are to be known to one.
 
     Attributes:
         u: Inputs, shape (n, D).
@@ -49,6 +53,7 @@ class GaussianProcess:
         weight: :math:`K^{-1} y`, shape (n, q).
         precision: :math:`K^{-1}`, shape (n, n).
         shift: Of the outputs, shape (q,).
+        taken_off: Coefficients of a trend that the process is beside, shape (p, q).
         scale: Of the outputs, shape (q,).
         inflation: Of the variance, shape (q,).
         left_out: Residuals of left-out rows, shape (n, q), in units of y.
@@ -68,6 +73,7 @@ class GaussianProcess:
     weight: Array
     precision: Array
     shift: Array
+    taken_off: Array
     scale: Array
     inflation: Array
     left_out: Array
@@ -91,8 +97,16 @@ class GaussianProcess:
         shift, scale = y.mean(0), y.std(0)
         size = np.abs(y).max(0)
         scale = np.where(scale > 1e-6 * size, scale, np.maximum(size, 1e-30))
-        values = (y - shift) / scale
         degree = 2 if len(u) >= ROWS_A_FEATURE * num_features(u.shape[1]) else 1
+        basis = _features(torch.from_numpy(u), degree).numpy()
+        taken_off, rest = np.zeros((basis.shape[1], y.shape[1])), y - shift
+        spare = len(u) - basis.shape[1]
+        if not noisy and spare >= SPARE:
+            taken_off = np.linalg.lstsq(basis, rest, rcond=None)[0]
+            rest = rest - basis @ taken_off
+            spread = np.sqrt((rest**2).sum(0) / spare)
+            scale = np.maximum(spread, np.maximum(ROUNDED * size, 1e-30))
+        values = rest / scale
         every = max(1, -(-len(u) // MOST_FITTED))
         free, evidence = _hyperparameters(
             u[::every], values[::every], degree, noisy=noisy, kind=kind
@@ -116,6 +130,7 @@ class GaussianProcess:
             weight=weight,
             precision=precision,
             shift=shift,
+            taken_off=taken_off,
             scale=scale,
             inflation=np.clip(missed, 1.0, INFLATION),
             left_out=left_out * scale,
@@ -133,7 +148,8 @@ class GaussianProcess:
         own = (trend**2).sum(1) + np.exp(2 * self.log_amplitude)
         variance = own - ((cross @ self.precision) * cross).sum(1)
         variance = np.maximum(variance, JITTER)[:, None] * self.inflation
-        return self.shift + (cross @ self.weight) * self.scale, variance * self.scale**2
+        mean = self.shift + trend @ self.taken_off + (cross @ self.weight) * self.scale
+        return mean, variance * self.scale**2
 
 
 def num_features(dim: int) -> int:

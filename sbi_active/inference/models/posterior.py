@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from copy import deepcopy
 from typing import Any
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
+from sbi_active.messages import warn
 
 
 class ActionPosterior:
@@ -202,7 +202,7 @@ class ActionPosterior:
         if not isinstance(network, MixtureDensityNetwork):
             return direct, condition  # sbi says what is wrong
         if not network.knows(condition):
-            warnings.warn(
+            warn(
                 "the network has never seen an outcome like this: no simulation it was "
                 "trained on lacks these numbers, so what it says is arbitrary",
                 stacklevel=3,

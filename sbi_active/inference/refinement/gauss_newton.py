@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.bridge import NormalMixture
@@ -26,11 +27,12 @@ from sbi_active.simulation.noise.whitening import whitened
 Array = NDArray[Any]
 
 STEP = 3e-3  # of differences, in deviations of the prior
-SCREENED = 48  # draws of the prior, of which the best begin a search
-STARTS = 4  # searches at a time
-MAX_STARTS = 16  # that a best mode must be found twice in, or is doubted
-EARLY, LATE = 4, 12  # iterations with updated and with fresh derivatives
-KEPT = 3  # starts of a round that go on after the early ones
+SCREENED = 192  # draws of the prior, of which the best begin a search; then twice these
+STARTS = 16  # searches at a time
+MAX_STARTS = 64
+TIMES = 3  # that the best mode is to be found, or there are more searches
+EXPLAINED = 1e-4  # tail probability of the best mode's residuals, below which too
+ITERATIONS = 12
 SAME = 2.0  # fall of the cost within which two searches found the same mode
 NEGLIGIBLE = 40.0  # rise of the cost beyond which a mode holds no mass
 WIDER = 1.1  # than the Laplace approximation
@@ -52,6 +54,7 @@ class WhitenedTrials:
         self.likelihood, self.coordinates = likelihood, coordinates
         self.dim = coordinates.dim
         self.searched = np.ones(self.dim, dtype=bool)
+        self.num_observed = int(likelihood.x.isfinite().sum())
         self.spread: Array | None = None
 
     def residual(self, u: Array) -> tuple[Array]:
@@ -111,8 +114,10 @@ def find_laplace(
 ) -> Laplace | None:
     """Return normal approximations at the modes; None where no search gets anywhere.
 
-    Searches begin at the best of some draws of the prior and at points near, again with
-    others until the best mode was found twice.
+    Searches begin at the best of some draws of the prior and at points near, and again
+    at the best of more draws until the best mode was found several times and explains
+    the outcomes: of motions that oscillate, many searches end in the same wrong place,
+    whose residuals tell.
 
     Args:
         trials: Of which the sum of squares is searched.
@@ -124,22 +129,22 @@ def find_laplace(
         is to be found.
     """
     c = trials.coordinates
-    found, costs, num, known = [], [], 0, None
+    found, costs, num, screened = [], [], 0, SCREENED
     while num < MAX_STARTS:
-        drawn = np.clip(c.sample(SCREENED, rng), c.low, c.high)
-        r, jac = trials.residual(drawn)[0], None
-        order = np.argsort((r**2).sum(1) + (drawn**2).sum(1))
+        drawn = np.clip(c.sample(screened, rng), c.low, c.high)
+        order = np.argsort((trials.residual(drawn)[0] ** 2).sum(1) + (drawn**2).sum(1))
         u = drawn[order[:STARTS]]
         if near is not None and num == 0:
             u = np.concatenate([np.clip(near, c.low, c.high), u])
-        num += len(u)
-        u, cost = descend(trials, u, _same, STEP, EARLY, secant=True)
-        u = u[np.argsort(cost)[:KEPT]]
-        u, cost = descend(trials, u, _same, STEP, LATE)
+        num, screened = num + len(u), 2 * screened
+        u, cost = descend(trials, u, _same, STEP, ITERATIONS)
         found.append(u)
         costs.append(cost)
         known = np.concatenate(costs)
-        if (known < known.min() + SAME).sum() >= 2:
+        best = np.concatenate(found)[known.argmin()]
+        square = float((trials.residual(best[None])[0] ** 2).sum())
+        explains = chi2.sf(square, trials.num_observed) > EXPLAINED
+        if explains and (known < known.min() + SAME).sum() >= TIMES:
             break
     u, cost = np.concatenate(found), np.concatenate(costs)
     if not np.isfinite(cost.min()):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -26,6 +25,7 @@ from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
@@ -124,7 +124,7 @@ def refine_exactly(
     )
     belief.histories = ExactRecord.of(histories, likelihood, coordinates, pool)
     if num_missing:
-        warnings.warn(
+        warn(
             f"{num_missing} of {num_simulations} simulations of the refinement are "
             "missing, by faults of the simulator; their draws were left out",
             MissingRowsWarning,

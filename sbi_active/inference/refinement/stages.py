@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -50,6 +49,7 @@ from sbi_active.inference.sampling.population import (
 )
 from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.unbounding import Unbounding
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.outcomes import MissingRowsWarning
@@ -373,7 +373,7 @@ class _Stages:
         belief.diagnostics = check_outcomes(diagnostics, fitted, stage.draws, histories)
         belief.histories = histories.record()
         if histories.num_missing:
-            warnings.warn(
+            warn(
                 f"{histories.num_missing} of {histories.num_simulations} simulations "
                 "of the refinement are missing, by faults of the simulator; the "
                 "histories they belong to were left out",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +13,10 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+from sbi_active.messages import Explained, warn
 
 
-class UnexplainedOutcomeError(ValueError):
+class UnexplainedOutcomeError(Explained, ValueError):
     """A trial gave a measurement where simulations give none."""
 
 
@@ -94,7 +94,7 @@ def round_rows(
         )
     if not (exclude_invalid and bool(invalid.any())):
         return rows
-    warnings.warn(
+    warn(
         f"dropping {int(invalid.sum())} of {len(x)} simulations without a measurement: "
         "information gain is then biased towards actions that fail. The default "
         "MixtureDensity network keeps them.",

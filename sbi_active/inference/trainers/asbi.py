@@ -38,6 +38,7 @@ from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
 from sbi_active.inference.trainers.base import Told
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
+from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators, kept_generators
 
 NUM_PROBES = 64  # draws of the prior, at one of which a network has a finite density
@@ -254,7 +255,7 @@ class ASBI(MixtureRounds, NPE_C):
         if fault:
             if not required:
                 return None
-            warnings.warn(
+            warn(
                 f"the network has never seen an outcome like {trial.x.tolist()}: "
                 f"{fault}, so the belief is left unchanged. Refine with the simulator, "
                 "simulate such outcomes as NaN, or leave the trial out where a fault "

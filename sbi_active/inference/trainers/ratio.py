@@ -19,6 +19,7 @@ from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNe
 from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
+from sbi_active.messages import warn
 
 HELD_OUT = 0.1  # share of the rows, sbi's default
 #: Keywords of SeqBED in the last version alone.
@@ -146,7 +147,7 @@ class SeqBED(AmortizedRounds, NRE_C):
         """Make it, or what the arguments meant in the last version."""
         classifier = args[1] if len(args) > 1 else kwargs.get("classifier")
         if isinstance(classifier, LFIRE) or LFIRE_KEYWORDS & {*kwargs}:
-            warnings.warn(
+            warn(
                 "sbi_active.SeqBED of logistic regressions goes in the next version: "
                 "use sbi_active.inference.SeqBED_LFIRE",
                 DeprecationWarning,
@@ -160,7 +161,7 @@ class SeqBED(AmortizedRounds, NRE_C):
     def arrange(self, theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the draws as they are, see :meth:`.ActiveInference.arrange`."""
         if self._is_default:  # this method is what the class of that name asked for
-            warnings.warn(
+            warn(
                 "SeqBED(prior) learns one ratio for all parameters, as SeqBED_C did in "
                 "the last version; for a logistic regression at each particle use "
                 "sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "

@@ -25,6 +25,7 @@ from sbi_active.inference.rounds.rows import (
     round_rows,
 )
 from sbi_active.inference.trainers.base import ActiveInference, Told
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 from sbi_active.threads import single_thread
@@ -262,7 +263,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         particles = model.particles
         action = model.nearest_action(trial.action)
         if not torch.equal(action, trial.action):
-            warnings.warn(
+            warn(
                 f"the executed action {trial.action.tolist()} was not simulated; the "
                 f"ratios are those at {action.tolist()}. Pass a simulator to update().",
                 stacklevel=5,

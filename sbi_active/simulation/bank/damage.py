@@ -7,6 +7,8 @@ import stat
 from pathlib import Path
 from typing import Any
 
+from sbi_active.messages import Explained
+
 #: Bytes of a header that are read at most; the settings in one have far fewer.
 LARGEST_TEXT = 256 * 2**20
 
@@ -14,7 +16,7 @@ LARGEST_TEXT = 256 * 2**20
 DEEPEST = 100
 
 
-class CorruptSegmentError(OSError):
+class CorruptSegmentError(Explained, OSError):
     """A file of a bank that does not hold what was written to it, or is not there.
 
     Attributes:

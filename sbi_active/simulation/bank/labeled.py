@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arrays import own_tensor
+from sbi_active.messages import warn
 from sbi_active.simulation.bank.log_density import log_density
 from sbi_active.simulation.workers.store import StoredRows
 
@@ -57,7 +57,7 @@ class LabeledStore:
         if self._proposal is not None:
             log_proposal = log_density(self._proposal, theta)
             if bool((log_proposal == -torch.inf).any()):
-                warnings.warn(
+                warn(
                     f"{int((log_proposal == -torch.inf).sum())} of {len(theta)} rows "
                     f"have density 0 under the proposal {self._label!r}: they were not "
                     "drawn from it",

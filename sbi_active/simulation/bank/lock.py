@@ -9,8 +9,10 @@ from pathlib import Path
 
 import filelock
 
+from sbi_active.messages import Explained
 
-class LockedError(OSError):
+
+class LockedError(Explained, OSError):
     """Somebody else is writing.
 
     Attributes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.log_density import log_density
@@ -166,7 +166,7 @@ def reuse(
         bank, rows, weights, "own" if proposals is None else "mixture", totals
     )
     if result.effective_sample_size < FEW:
-        warnings.warn(
+        warn(
             f"{len(rows)} rows of the bank are worth {result.effective_sample_size:.1f}"
             f" draws from the target, fewer than {FEW}: simulate more rows from it, "
             + ("or give proposals=" if proposals is None else "or from nearer to it"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Literal
 
@@ -13,6 +12,7 @@ from scipy.linalg import helmert
 from scipy.special import chdtri
 from torch import Tensor
 
+from sbi_active.messages import warn
 from sbi_active.simulation.noise.autocorrelated import (
     AutocorrelatedNoise,
     innovations,
@@ -138,7 +138,7 @@ def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
             "repeat a trial: without repeats nothing separates noise from the system"
         )
     if freedom == 1:
-        warnings.warn(
+        warn(
             "expected at least 3 repeats to estimate noise; got 2, from which the "
             "standard deviation is known to a factor of 30; repeat the trial again",
             UserWarning,

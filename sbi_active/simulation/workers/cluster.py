@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
@@ -19,6 +18,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 from joblib.parallel import get_active_backend
 from typing_extensions import override
 
+from sbi_active.messages import warn
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.pools import Pool, WorkerPool, pickled
 
@@ -159,7 +159,7 @@ class DaskPool(Pool):
         if time.monotonic() - self._last_seen < self.PATIENCE:
             return
         self._last_seen = None
-        warnings.warn(
+        warn(
             f"no workers at {self._client.scheduler.address} for {self.PATIENCE:g} s: "
             f"{len(self._waiting) + len(self._running)} calls of the simulator wait "
             "for one; start workers there, or interrupt, which keeps what is finished",

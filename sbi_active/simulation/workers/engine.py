@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from contextlib import closing
 from typing import Any
@@ -13,6 +12,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from sbi_active.arrays import own_tensor
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.model import takes_seeds
 from sbi_active.simulation.outcomes import (
@@ -226,7 +226,7 @@ def _warn(schedule: Schedule) -> None:
         counts = ", ".join(f"{k} {fault}" for fault, k in schedule.faults.items())
         row, text = min(schedule.tracebacks.items())
         last = text.strip().splitlines()[-1]
-        warnings.warn(
+        warn(
             f"{schedule.faults.total()} of {len(schedule.theta)} rows are missing: "
             f"{counts}; the first is row {row}: {last}. All tracebacks are in "
             "Simulations.tracebacks",

@@ -8,8 +8,10 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
+from sbi_active.messages import Explained
 
-class SimulationBudgetError(RuntimeError):
+
+class SimulationBudgetError(Explained, RuntimeError):
     """More simulations were asked for than are left; none of them was run."""
 
 

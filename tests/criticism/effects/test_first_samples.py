@@ -1,5 +1,7 @@
 """Nuisances that are centered on the first samples of each trial."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -157,3 +159,17 @@ def test_trials_without_times_or_names_are_refused():
     named = Trials([1.0], torch.zeros(1, 20), sample_times=TIMES, start=[[1.0]])
     with pytest.raises(ValueError, match="expected measured start states by name"):
         start_from_first_samples(named, {"place": 0}, within=0.5, sd=1.0)
+
+
+def test_a_line_that_hides_gravity_is_said():
+    times = torch.arange(10) / 30
+    noise = 0.01 * torch.randn(3, 10, generator=torch.Generator().manual_seed(0))
+    fall = 5 * times - 9.81 * times**2 / 2 + noise
+    trials = Trials([1.0, 2.0, 3.0], fall, sample_times=times, names=["a", "b", "c"])
+    speeds = {"y": 0, "vy": (0, 1)}
+    with pytest.warns(UserWarning, match="a, b, c leave a polynomial of order 1"):
+        start_from_first_samples(trials, speeds, within=0.4, sd=0.01)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # neither with the fall nor within two frames
+        start_from_first_samples(trials, {**speeds, "ay": (0, 2)}, within=0.4, sd=0.01)
+        start_from_first_samples(trials, speeds, within=0.05, sd=0.01)

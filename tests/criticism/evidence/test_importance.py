@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sbi_active.criticism.evidence.importance import (
+    ROUND,
     importance_sample,
     lower_factors,
 )
@@ -55,6 +56,16 @@ def test_a_model_far_behind_ends_with_fewer_particles():
         return len(importance_sample(rival, start(1.0), rng=rng, dismissed=dismissed).u)
 
     assert rows(1e3) < rows(-np.inf)
+
+
+@pytest.mark.parametrize(("above", "rounds"), [(40.0, 8), (-np.inf, 20)])
+def test_a_hopeless_model_ends_once_its_shape_was_looked_at(above, rounds):
+    """However few particles are effective; here more are asked for than any has."""
+    rng, hopeless = np.random.default_rng(1), exact().log_evidence + above
+    sample = importance_sample(
+        linear_rival(), start(1.0), rng=rng, enough=1e9, hopeless=hopeless
+    )
+    assert len(sample.u) == rounds * ROUND
 
 
 def test_a_likelihood_of_zero_has_no_evidence():

@@ -135,9 +135,13 @@ def test_held_out_trials_are_scored_for_every_admitted_model():
     after = report.tracing.misfit.of(report.tracing.model).held_out
     assert after[0] < 0.6 * bare[0]
     assert "On held-out trials" in str(report)
-    # The mean of the draws' predictions, and the prediction at their mean.
+    # Both by the best fit, whose parameters the evidence has.
     rmse = report.evaluation.table.set_index("metric").loc["rmse"]
-    assert rmse["before"] == pytest.approx(bare[0], rel=0.1)
+    assert rmse["before"] == pytest.approx(bare[0], rel=1e-6)
+    theta = torch.from_numpy(report.tracing.evidences["none"].best)[None]
+    x = MODEL.fn(theta.expand(2, -1), action[8:]).double()
+    error = (x - every.x[8:]).square().mean().sqrt()
+    assert float(error) == pytest.approx(bare[0], rel=1e-4)
 
 
 def test_a_sensor_beside_an_error_of_unknown_size_is_told_the_same_way():

@@ -1,0 +1,178 @@
+"""What is named when the effect that is there was removed: the servo and the balls.
+
+    python -m benchmarks.measured.removals --set servo
+    python -m benchmarks.measured.removals --set balls
+    python -m benchmarks.measured.removals --table
+
+The hoop and the tanks have such stages in their own commands
+(:mod:`benchmarks.measured.record_stages`). The servo is judged by its twelve powered
+trials, without load-dependent friction and none, one or two of the other three forms,
+and once without torque-dependent friction alone. Of each ball whose drops show drag, or
+something, all three forms of drag are removed. An *alias* is an
+effect that is named then. Each row is added to ``results/removals.json`` unless it is
+there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measured.record_stages import SHARE_LEFT
+from sbi_active.criticism import Criticism, Effect
+from sbi_active.tasks import ball_drops, servo_pendulum  # pyright: ignore
+from sbi_active.tasks.ball_drops import DRAG  # pyright: ignore
+from sbi_active.tasks.servo_pendulum.task import DATA as SERVO  # pyright: ignore
+
+__all__ = ["main", "removed", "table"]
+
+BALLS = Path("../shared/data/ball_drops")
+RESULT = Path(__file__).parent / "results" / "removals.json"
+#: Friction that the powered trials of the servo show, and another that helps.
+CAUSE, BESIDE = "load-dependent", "torque-dependent"
+#: Balls whose verdict with the whole library is a drag, or "unexplained".
+DROPPED = (
+    "blue_basketball",
+    "green_basketball",
+    "volleyball",
+    "whiffle_ball_1",
+    "whiffle_ball_2",
+    "yellow_whiffle_ball",
+    "orange_whiffle_ball",
+    "tennis_ball",
+)
+
+Job = tuple[str, str, Any, Any, Any, list[Effect]]
+
+
+def removed(
+    model: Any, prior: Any, trials: Any, effects: Sequence[Effect], *, seed: int = 0
+) -> dict[str, Any]:
+    """Return what is said of trials with a part of the library.
+
+    Args:
+        model: The bare simulator.
+        prior: Of its parameters.
+        trials: To fit.
+        effects: What is left of the library, with nuisances.
+        seed: Of all draws.
+    """
+    begin = time.process_time()
+    loop = Criticism(model, prior, trials, effects=effects, seed=seed)
+    report = loop.report(evaluate=False, plan=False)
+    tracing, text = loop.trace(), str(report).split("\n\n")[0]
+    misfit = tracing.misfit
+    named = tracing.chosen if misfit is None else misfit.named
+    return {
+        "verdict": tracing.verdict,
+        "named": [*named],
+        "helps": [*tracing.chosen],
+        "cause": {}
+        if misfit is None
+        else {k: float(v) for k, v in misfit.cause.items()},
+        "probabilities": {n: float(p) for n, p in tracing.probabilities.items()},
+        "share_said": SHARE_LEFT.search(text) is not None,
+        "text": text,
+        "cpu_seconds": time.process_time() - begin,
+        "trial_simulations": loop.rivals.simulator.num_simulations,
+    }
+
+
+def _servo(data: Path) -> Iterator[Job]:
+    task = servo_pendulum.ServoPendulumTask(data=data)
+    off = np.flatnonzero(task.recordings.motor_off)
+    trials = task.trials([i for i in range(len(task.recordings)) if i not in off])
+    effects = task.effects()
+    others = [e.name for e in effects if e.name != CAUSE]
+    sets = [(BESIDE,)]
+    for size in range(len(others)):  # not all: nothing would be left to name
+        sets += [(CAUSE, *more) for more in combinations(others, size)]
+    for gone in sets:
+        left = [e for e in effects if e.name not in gone]
+        yield "servo", " + ".join(gone), task.simulator, task.prior, trials, left
+
+
+def _balls(data: Path) -> Iterator[Job]:
+    drops = ball_drops.read_drops(data)
+    left = [e for e in ball_drops.make_effects() if e.family != DRAG]
+    for ball in DROPPED:
+        trials = ball_drops.trials_of([d for d in drops if d.ball == ball])
+        model, prior = ball_drops.make_simulator(), ball_drops.make_prior()
+        yield "balls", ball, model, prior, trials, left
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the rows in Markdown, and how many aliases were named in each set."""
+    head = "| removed | verdict | P(cause) | simulated trials | CPU s |"
+    lines: list[str] = []
+    for which, title in (("servo", "servo, from"), ("balls", "drag, from the")):
+        own = {k: row for k, row in rows.items() if k.startswith(f"{which}: ")}
+        if not own:
+            continue
+        lines += [head.replace("removed", f"{title} library"), "|---|---|---|---|---|"]
+        for key, row in own.items():
+            causes = ", ".join(f"{n} {p:.2f}" for n, p in row["cause"].items())
+            name = key.removeprefix(f"{which}: ").replace("_", " ")
+            verdict = row["verdict"]
+            if row["helps"] and not row["named"]:
+                verdict += f", {' + '.join(row['helps'])} helps"
+            lines.append(
+                f"| {name} | {verdict} | {causes} | {row['trial_simulations']:,} | "
+                f"{row['cpu_seconds']:.0f} |"
+            )
+        real = {CAUSE} if which == "servo" else set()
+        alias = [row for row in own.values() if {*row["named"]} - real]
+        told = sum(row["share_said"] for row in alias)
+        lines += [
+            "",
+            f"Aliases named: {len(alias)} of {len(own)} removals; the share left said "
+            f"in {told}.",
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the removals that are missing from the results, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--set", choices=["servo", "balls"])
+    parser.add_argument("--data", type=Path, help="of the set")
+    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args(argv)
+    rows: dict[str, Any] = {}
+    if arguments.out.is_file():
+        rows = json.loads(arguments.out.read_text())
+    if arguments.set and not arguments.table:
+        jobs, data = (_servo, SERVO) if arguments.set == "servo" else (_balls, BALLS)
+        try:
+            todo = [*jobs(arguments.data or data)]
+        except FileNotFoundError as error:
+            print(f"{error}, as in --data DIR", file=sys.stderr)
+            return 2
+        for which, name, *parts in todo:
+            key = f"{which}: {name}"
+            if key in rows:
+                continue
+            rows[key] = removed(*parts, seed=arguments.seed)
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
+            spent = rows[key]["cpu_seconds"]
+            print(f"{key}: {rows[key]['verdict']}, {spent:.0f} CPU s", flush=True)
+    print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""Print a committed CSV or JSON file as a table.
+
+    python -m benchmarks.table information_gain/peers.csv
+    python -m benchmarks.table cost/doors.json --only "cpu_s*"
+
+A file of rows keeps its columns, or those named by ``--columns``. Of nested values each
+number is a row, called by its path; ``--only`` keeps paths that match a pattern.
+"""
+
+import argparse
+import csv
+import json
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+LONGEST = 30  # characters of a text that calls a row; a longer one is a note
+
+
+def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+    """Yield each number or text of nested values with its path.
+
+    Example:
+        >>> [*leaves({"cpu": {"ours": 1.25}, "runs": [{"on": "disk", "s": 3}]})]
+        [('cpu, ours', '1.25'), ('runs, disk, s', '3')]
+    """
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from leaves(part, (*path, name))
+    elif isinstance(value, list):
+        for number, part in enumerate(value):
+            names = [str(number)]
+            if isinstance(part, dict):  # called by its words
+                words = {k: v for k, v in part.items() if isinstance(v, str)}
+                short = {k: v for k, v in words.items() if len(v) <= LONGEST}
+                names = [*short.values()] or names
+                part = {k: v for k, v in part.items() if k not in short}
+            yield from leaves(part, (*path, *names))
+    else:
+        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        yield ", ".join(path), shown
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("file", help="below benchmarks/")
+    parser.add_argument("--only", nargs="*", default=["*"], help="patterns of paths")
+    parser.add_argument("--columns", nargs="*", help="of a CSV file")
+    arguments = parser.parse_args()
+    path = HERE / arguments.file
+    if path.suffix == ".csv":
+        with path.open(newline="") as file:
+            rows = [*csv.DictReader(file)]
+        header = arguments.columns or [*rows[0]]
+        cells = [[row[name] for name in header] for row in rows]
+    else:
+        header = ["what", "value"]
+        cells = [
+            [name, value]
+            for name, value in leaves(json.loads(path.read_text()))
+            if any(fnmatch(name, pattern) for pattern in arguments.only)
+        ]
+    for row in (header, ["---"] * len(header), *cells):
+        print("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""A second look at verdicts whose model misses the trials by more than the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.record import traced, with_intervals
+from sbi_active.criticism.misfit.rule import PASSES
+from sbi_active.criticism.misfit.search import Search
+from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
+from sbi_active.criticism.results import (
+    SCATTER,
+    UNEXPLAINED,
+    Detection,
+    ModelKey,
+    Tracing,
+)
+from sbi_active.criticism.steps.formulas import guess
+
+
+def beside_misfit(
+    tracing: Tracing,
+    detection: Detection,
+    rivals: RivalSet,
+    equivalent: Sequence[frozenset[str]],
+    held_out: Trials | None,
+    *,
+    search: Search | None = None,
+) -> tuple[Tracing, Misfit | None]:
+    """Return a verdict by models with a residual process, where none explains.
+
+    Along a trajectory it takes the place of any other. Of numbers without a time axis
+    it does so where it says more; else it gives the intervals.
+
+    Args:
+        tracing: The verdict by the sensor's error, or one of unknown size.
+        detection: Which it follows.
+        rivals: The models.
+        equivalent: Groups of effects that nothing separates.
+        held_out: Trials on which models are scored; None for none.
+        search: Has fitted the models; None makes one.
+
+    Returns:
+        The verdict, and the models if it is theirs.
+    """
+    misfit, timed = None, rivals.measurements.is_sequence
+    if _is_missed(tracing, detection, rivals):
+        # It is no error of a sensor: a process that follows the action is.
+        misfit = find_misfit(rivals, equivalent, is_known=True, search=search)
+    is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
+    if is_bare and (misfit is None or not timed):
+        tracing = replace(tracing, guesses=guess(rivals))
+    if misfit is None:
+        return tracing, None
+    if not timed and not misfit.replaces(tracing.verdict):
+        return with_intervals(tracing, misfit), None
+    rivals.fits.clear()
+    found = traced(misfit, held_out)
+    if found.verdict == UNEXPLAINED and not timed:
+        found = replace(found, guesses=tracing.guesses)
+    return found, misfit
+
+
+def _is_missed(tracing: Tracing, detection: Detection, rivals: RivalSet) -> bool:
+    """Return whether the model of a verdict misses the trials nevertheless."""
+    if tracing.verdict in (UNEXPLAINED, SCATTER):
+        return True
+    if not tracing.chosen or rivals.measurements.is_sequence:
+        return False
+    if any(e.hook == "noise" for e in rivals.effects.values()):  # that it may be
+        return False
+    evidence = rivals.fit(ModelKey(tracing.chosen)).evidence
+    return detection.refutes(evidence, PASSES)

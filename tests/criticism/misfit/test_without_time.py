@@ -1,0 +1,85 @@
+"""Numbers that do not follow each other in time, beside what nobody declared."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Independent, Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials
+
+SENSOR, NUM_TRIALS = 0.05, 16
+THETA, QUADRATIC, HIDDEN = (1.0, 0.5), 0.8, 0.4
+PRIOR = Independent(Normal(torch.zeros(2), 2 * torch.ones(2)), 1)
+EFFECTS = [
+    Effect.keyword("quadratic", prior=Normal(0.0, 1.0)),
+    Effect.keyword("step", prior=Normal(0.0, 1.0)),
+]
+
+
+def line(
+    theta: Tensor,
+    action: Tensor,
+    *,
+    quadratic: Tensor | float = 0.0,
+    step: Tensor | float = 0.0,
+    hidden: Tensor | float = 0.0,
+) -> Tensor:
+    """Return one number a trial, (n, 1)."""
+    a = action[:, 0].to(theta)
+    x = theta[:, 0] + theta[:, 1] * a + quadratic * a**2 + step * (a > 0)
+    return (x + hidden * torch.sin(4 * a))[:, None]
+
+
+def trials(*, quadratic: float = 0.0, hidden: float = 0.0) -> Trials:
+    action = torch.linspace(-2, 2, NUM_TRIALS)[:, None]
+    theta = torch.tensor(THETA).expand(NUM_TRIALS, -1)
+    x = line(theta, action, quadratic=quadratic, hidden=hidden)
+    generator = torch.Generator().manual_seed(3)
+    return Trials(action, x + SENSOR * torch.randn(x.shape, generator=generator))
+
+
+def loop(own: Trials, **options) -> Criticism:
+    model = SimulatorModel(line, noise=GaussianNoise(SENSOR), batched=True)
+    return Criticism(model, PRIOR, own, effects=EFFECTS, seed=0, summaries=0, **options)
+
+
+@pytest.fixture(scope="module")
+def beside():
+    """Trials with a quadratic term, beside a wave that nobody declared."""
+    return loop(trials(quadratic=QUADRATIC, hidden=HIDDEN))
+
+
+def test_the_cause_is_named(beside):
+    tracing = beside.trace()
+    assert tracing.verdict == "quadratic"
+    assert tracing.misfit.cause["quadratic"] > 0.5
+    assert not tracing.misfit.passes
+    assert 2 < tracing.misfit.size < 20
+    assert math.isnan(tracing.misfit.time_scale)
+
+
+def test_intervals_hold_what_nobody_declared(beside):
+    report = beside.report(evaluate=False, plan=False)
+    found = report.parameters.set_index("parameter")
+    for name, truth in zip(
+        ["theta_1", "theta_2", "quadratic"], (*THETA, QUADRATIC), strict=True
+    ):
+        mean, sd = found.loc[name, ["after", "after_sd"]]
+        assert abs(mean - truth) < 3 * sd
+        assert sd > 0.4 * HIDDEN / NUM_TRIALS**0.5
+
+
+def test_the_report_speaks_of_no_time(beside):
+    text = " ".join(str(beside.report(evaluate=False, plan=False)).split())
+    assert "an error of unknown size in each number, beside the sensor's" in text
+    assert "time scale" not in text
+
+
+def test_a_model_that_fits_is_no_misfit():
+    found = loop(trials(quadratic=QUADRATIC))
+    assert found.trace().verdict == "quadratic"
+    assert found.misfit() is None
+    assert found.trace().misfit is None

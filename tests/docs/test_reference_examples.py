@@ -1,0 +1,63 @@
+"""Every public name has an example that runs: its docstring's, or one beside it."""
+
+import doctest
+import importlib
+import importlib.util
+import inspect
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+#: Names that need an extra, and what it brings.
+OPTIONAL = {
+    "BayesianOptimization": "botorch",
+    "from_sysid": "absl",
+    "belief_to_parameters": "absl",
+}
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+pytest.importorskip("sphinx")
+
+spec = importlib.util.spec_from_file_location(
+    "reference", ROOT / "docs" / "_ext" / "reference.py"
+)
+assert spec is not None
+assert spec.loader is not None
+reference = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(reference)
+
+
+DEAR = {"pyro": pytest.mark.slow}  # NUTS
+
+
+@pytest.mark.parametrize(
+    "package",
+    [pytest.param(p, marks=DEAR.get(p, ())) for p in reference.PACKAGES],
+)
+def test_examples_run(package):
+    setup, blocks = reference.examples(package)
+    names: dict = {}
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    parser = doctest.DocTestParser()
+    for name, text in {"setup": setup, **blocks}.items():
+        if name in OPTIONAL and importlib.util.find_spec(OPTIONAL[name]) is None:
+            continue
+        case = parser.get_doctest(text, names, f"{package}.{name}", None, 0)
+        failed = runner.run(case, clear_globs=False)
+        names = case.globs
+        assert not failed.failed, f"{package}.{name}"
+
+
+@pytest.mark.parametrize("package", reference.PACKAGES)
+def test_every_name_has_one(package):
+    _, blocks = reference.examples(package)
+    without = [
+        name
+        for module, names in reference.groups(package)
+        for name in names
+        if ">>>"
+        not in (inspect.getdoc(getattr(importlib.import_module(module), name)) or "")
+        or name == "TASKS"
+    ]
+    assert sorted(blocks) == sorted(without)
+    assert all(">>> " in block for block in blocks.values())

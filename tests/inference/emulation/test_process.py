@@ -1,0 +1,41 @@
+"""Gaussian processes on few simulations."""
+
+import numpy as np
+import pytest
+
+from sbi_active.inference.emulation.process import GaussianProcess
+
+
+def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
+    rng = np.random.default_rng(0)
+    slope = np.array([[1.5e4, -3.0], [5.0, 2.0]])
+    u, new = rng.uniform(-1, 1, (20, 2)), rng.uniform(-1, 1, (50, 2))
+
+    def f(u):
+        return (u @ slope + [7.0, 1.0] + np.sin(3 * u)).astype(np.float32)
+
+    process = GaussianProcess.fit(u, f(u).astype(float), noisy=False)
+    mean, variance = process.predict(new)
+    assert np.abs(mean - f(new)).max() < 0.5
+    assert np.sqrt(variance).max() < 0.7
+    assert np.abs(process.left_out).max() < 0.5
+
+
+def test_what_is_no_trend_is_interpolated_with_its_error():
+    rng = np.random.default_rng(1)
+    u, new = rng.uniform(-1, 1, (30, 1)), rng.uniform(-1, 1, (200, 1))
+    process = GaussianProcess.fit(u, np.sin(9 * u), noisy=False)
+    mean, variance = process.predict(new)
+    off = (mean - np.sin(9 * new)) / np.sqrt(variance)
+    assert np.abs(mean - np.sin(9 * new)).max() < 0.05
+    assert np.abs(off).max() < 5
+    far = process.predict(np.array([[4.0]]))
+    assert float(np.sqrt(far[1][0, 0])) > 0.5
+
+
+def test_learned_noise_is_that_of_the_outputs():
+    rng = np.random.default_rng(2)
+    u = rng.uniform(-1, 1, (200, 2))
+    y = 3 * u[:, :1] + 0.2 * rng.standard_normal((200, 1))
+    process = GaussianProcess.fit(u, y, noisy=True)
+    assert float(process.noise_sd[0]) == pytest.approx(0.2, rel=0.2)
