@@ -142,9 +142,12 @@ def test_campaigns(run, capsys):
 
 def test_pouring(run, capsys):
     pytest.importorskip("pybullet")
-    (page,) = run("docs/pouring.md")
+    page, material = run("docs/pouring.md")
     assert page.image.shape == (22_500,)
-    assert "'mesh coverage': torch.Size([1, 36])" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "'mesh coverage': torch.Size([1, 36])" in printed
+    assert material.task.material == "gravel"
+    assert material.real.shape == (22_500,)
 
 
 @pytest.mark.slow

@@ -17,8 +17,7 @@ from sbi_active.plots import save
 __all__ = ["log_prob_figure", "selected_figure"]
 
 RESULTS = Path(__file__).parent / "results"
-METHODS = ("asbi", "nsbi", "alhi", "nlhi")
-COLORS = dict(zip(METHODS, ("C0", "C1", "C2", "C7"), strict=True))
+COLORS: dict[str, str] = {"asbi": "C0", "nsbi": "C1", "alhi": "C2", "nlhi": "C7"}
 CLIPPED = -7.0  # the paper's Figure 11 too shows no less
 
 
@@ -59,7 +58,7 @@ def log_prob_figure(results: Path = RESULTS) -> Any:
     figure, both = subplots(2)
     for target, axes in zip(("1", "2"), both, strict=True):
         by_round = {}
-        for method in METHODS:
+        for method in COLORS:
             rows = read(results / f"target_{target}_{method}.csv")
             if rows:
                 last = max(int(r["round"]) for r in rows)
@@ -74,10 +73,13 @@ def log_prob_figure(results: Path = RESULTS) -> Any:
 
 def selected_figure(results: Path = RESULTS) -> Any:
     """Return the share of actions by round, ASBI: the paper's Figure 12."""
+    from matplotlib import colormaps
+
+    colors = colormaps["tab20"]
     figure, both = subplots(2)
-    for target, axes in zip(("1", "2"), both, strict=True):
-        rows = read(results / f"target_{target}_asbi.csv")
-        names = sorted({label(r) for r in rows})
+    every = [read(results / f"target_{target}_asbi.csv") for target in ("1", "2")]
+    names = sorted({label(r) for rows in every for r in rows})
+    for target, rows, axes in zip(("1", "2"), every, both, strict=True):
         rounds = sorted({int(r["round"]) for r in rows})
         below = np.zeros(len(rounds))
         for k, name in enumerate(names):
@@ -89,13 +91,26 @@ def selected_figure(results: Path = RESULTS) -> Any:
             )
             hatch = "//" if name.endswith("PCA") else None
             axes.bar(
-                rounds, share, bottom=below, label=name, color=f"C{k % 10}", hatch=hatch
+                rounds,
+                share,
+                bottom=below,
+                label=name,
+                color=colors(k % 20),
+                hatch=hatch,
             )
             below += share
         axes.set_title(f"target {target}, ASBI")
         axes.set_xlabel("round")
         axes.set_ylabel("share of trials")
-        axes.legend(fontsize=6, title="h cm, p cm, v rad/s", title_fontsize=6)
+    bars, words = both[0].get_legend_handles_labels()
+    figure.legend(
+        bars,
+        words,
+        loc="outside right upper",
+        fontsize=7,
+        title="h cm, p cm, v rad/s",
+        title_fontsize=7,
+    )
     return figure
 
 

@@ -26,9 +26,7 @@ from torch import Tensor
 
 from benchmarks.pouring.bank import read_parts
 from benchmarks.pouring.learned import (
-    NUM_ALL,
     NUM_COMPONENTS,
-    NUM_OUTER,
     PARTS,
     Earlier,
     looked_at,
@@ -44,6 +42,7 @@ from sbi_active.tasks import get_task
 __all__ = ["ByNetwork", "kept_networks"]
 
 HIDDEN, NUM_ITERATIONS, BATCH = (64, 64), 1_000, 30  # the paper's, section 5.4
+NUM_OUTER, NUM_ALL = 40, 100  # draws behind a gain; the paper's M is 100
 AT_ONCE = 2_000  # rows of a network's input
 
 
