@@ -17,7 +17,7 @@ helps, and of what is left of it where each must predict better with a probabili
 .9, since two that imitate each other both look dispensable. Where the model's
 chi-square passes against the sensor nothing remains, and it is the inclusion
 probability itself. Without a time axis, where trials have few numbers, it is
-:math:`.85 (1 - u)^2` in either case. The thresholds, the .85 and the power are
+:math:`.85 (1 - u)^4` in either case. The thresholds, the .85 and the power are
 empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
@@ -40,7 +40,7 @@ Array = NDArray[Any]
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-FEW = 2  # power of 1 - u where x has no time axis
+FEW = 4  # power of 1 - u where x has no time axis
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 

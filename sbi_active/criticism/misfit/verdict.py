@@ -19,7 +19,14 @@ from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.left_out import leave_out
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Posterior
-from sbi_active.criticism.misfit.rule import PASSES, Choice, Scored, admitted, choose
+from sbi_active.criticism.misfit.rule import (
+    PASSES,
+    SURE,
+    Choice,
+    Scored,
+    admitted,
+    choose,
+)
 from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
@@ -86,10 +93,15 @@ class Misfit:
         """Return whether it says more than a verdict of numbers without a time axis.
 
         Numbers that scatter more than declared, each for itself, leave some effect that
-        predicts a few of them better: there it has to be the probable cause.
+        predicts a few of them better: there it has to be the probable cause, and to
+        predict the rest surely better.
         """
-        best = max(self.choice.cause.values(), default=0.0)
-        return best > NAMED or (verdict == UNEXPLAINED and best > 0)
+        choice = self.choice
+        if verdict == UNEXPLAINED:
+            return bool(choice.key.effects)
+        return any(
+            p > NAMED and choice.better[n] > SURE for n, p in choice.cause.items()
+        )
 
     def weights(self) -> dict[ModelKey, float]:
         """Return how much each model counts by its errors on left-out parts."""
