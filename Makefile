@@ -21,6 +21,7 @@ check: $(INSTALLED)  ## Lint and types.
 docs: $(DOCS)  ## Build the site, without network, and check its links and names.
 	$(BIN)/python -m sphinx -b html -W --keep-going docs $(SITE)
 	$(BIN)/python docs/_ext/check_site.py $(SITE)
+	$(BIN)/python -m pytest -q -n0 tests/docs/test_reference_examples.py
 
 docs-serve: docs  ## Show the site at http://localhost:8000.
 	$(BIN)/python -m http.server --directory $(SITE) --bind 127.0.0.1 8000
