@@ -308,8 +308,8 @@ def cross_validated(
         ]
         log_p[out] = fitted.at_each(cells, seen)
     place = np.minimum((theta * NUM_CELLS).astype(int), NUM_CELLS - 1)
-    index: Array = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)  # pyright: ignore
-    own = np.take_along_axis(log_p, index[:, None], 1)[:, 0]
+    index = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)
+    own = log_p[np.arange(len(log_p)), index]
     score = [_told(power * log_p, power * own)[0].mean() for power in POWERS]
     power = float(POWERS[int(np.argmax(score))])
     told, mass = _told(power * log_p, power * own)

@@ -207,7 +207,7 @@ def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> A
 
 def _weights(misfit: Misfit) -> dict[ModelKey, float]:
     """Return the models that count, by their errors on left-out parts."""
-    weights = misfit.weights()
+    weights = misfit.weights
     kept = [key for key, weight in weights.items() if weight >= COUNTS]
     return {key: weights[key] for key in kept[:MOST_COUNTED]}
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -103,8 +104,9 @@ class Misfit:
             p > NAMED and choice.better[n] > SURE for n, p in choice.cause.items()
         )
 
+    @cached_property
     def weights(self) -> dict[ModelKey, float]:
-        """Return how much each model counts by its errors on left-out parts."""
+        """How much each model counts by its errors on left-out parts."""
         found = self.search.found
         return weights_by_error(
             {key: candidate.left.square for key, candidate in found.items()},
@@ -120,7 +122,7 @@ class Misfit:
         """
         search, u = self.search, self.model(key).u
         total, norm = np.zeros_like(u), np.zeros_like(u)
-        for other, weight in self.weights().items():
+        for other, weight in self.weights.items():
             common = ModelKey(tuple(n for n in key.effects if n in other.effects))
             own = search.columns(key, common)
             its = self.model(other).u[search.columns(other, common)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.numbers import number, probability, stated
@@ -106,15 +107,12 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         ]
         held = [] if m.held_out is None else [_size(report, m.held_out)]
         rows.append((*cells, *held))
-    has_time = misfit.time_scale == misfit.time_scale  # NaN without a time axis
-    error = "a residual process of unknown size and time scale"
-    size = f"Beside the verdict's model the process has {misfit.size:.2g} times the "
-    size += "sensor's standard deviation"
-    if has_time:
-        size += f" and a time scale of {number(misfit.time_scale)}"
-    else:
+    if isnan(misfit.time_scale):  # x has no time axis
         error = "an error of unknown size in each number, beside the sensor's"
-        size = size.replace("the process", "that error")
+        name, scale = "that error", ""
+    else:
+        error = "a residual process of unknown size and time scale"
+        name, scale = "the process", f" and a time scale of {number(misfit.time_scale)}"
     text = [
         f"Every model carries {error}, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "
@@ -123,7 +121,8 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         "are root mean squares of models fitted without what they predict. The "
         f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
         "beyond it, as a share of the bare model's.",
-        f"{size}.",
+        f"Beside the verdict's model {name} has {misfit.size:.2g} times the "
+        f"sensor's standard deviation{scale}.",
     ]
     items = [
         f"{n}: probability of the cause {_share(misfit, n)}, of a better prediction of "
