@@ -8,6 +8,7 @@ from dataclasses import replace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.record import traced, with_intervals
+from sbi_active.criticism.misfit.refuted import widened
 from sbi_active.criticism.misfit.rule import PASSES
 from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
@@ -33,7 +34,8 @@ def beside_misfit(
     """Return a verdict by models with a residual process, where none explains.
 
     Along a trajectory it takes the place of any other. Of numbers without a time axis
-    it does so where it says more; else it gives the intervals.
+    it is asked for several effects as well, which fit much that nobody declared; it
+    takes the place where it says more, and else gives the intervals.
 
     Args:
         tracing: The verdict by the sensor's error, or one of unknown size.
@@ -47,14 +49,15 @@ def beside_misfit(
         The verdict, and the models if it is theirs.
     """
     misfit, timed = None, rivals.measurements.is_sequence
-    if _is_missed(tracing, detection, rivals):
+    several = detection.alarm and len(tracing.chosen) > 1 and not timed
+    if _is_missed(tracing, detection, rivals) or several:
         # It is no error of a sensor: a process that follows the action is.
         misfit = find_misfit(rivals, equivalent, is_known=True, search=search)
     is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
     if is_bare and (misfit is None or not timed):
         tracing = replace(tracing, guesses=guess(rivals))
     if misfit is None:
-        return tracing, None
+        return (widened(tracing, rivals.seed) if detection.alarm else tracing), None
     if not timed and not misfit.replaces(tracing.verdict):
         return with_intervals(tracing, misfit), None
     rivals.fits.clear()

@@ -1,7 +1,9 @@
 r"""What helps, and what is the cause, when every model is wrong.
 
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
-   smallest; the most probable of them by the shared evidence is the top.
+   smallest, or is not larger on a new trial with a probability of .9: one trial far
+   from the others may hold most of a mean square. The most probable of them by the
+   shared evidence is the top.
 2. An effect of the top *helps* if it is more likely there than not, and predicts a
    left-out trial better with a probability of .8, or the error is twice as large
    without it; others are dropped, those first without which it is smallest.
@@ -14,10 +16,11 @@ r"""What helps, and what is the cause, when every model is wrong.
 from mean squared errors M on left-out trials in sensor variances: of the model, of the
 model without the effect and of the bare one. It is the smaller u of two sets: of what
 helps, and of what is left of it where each must predict better with a probability of
-.9, since two that imitate each other both look dispensable. Where the model's
-chi-square passes against the sensor nothing remains, and it is the inclusion
-probability itself. Without a time axis, where trials have few numbers, it is
-:math:`.85 (1 - u)^4` in either case. The thresholds, the .85 and the power are
+.9, since two that imitate each other both look dispensable. Where the chi-square of a
+model of k effects passes against the sensor nothing remains, and the factor is
+:math:`.85^{k - 1}`: one hardly imitates something undeclared to the sensor's error,
+several do. Without a time axis, where trials have few numbers, it is
+:math:`.85 (1 - u)^3` in either case. The thresholds, the .85 and the power are
 empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
@@ -40,7 +43,7 @@ Array = NDArray[Any]
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-FEW = 4  # power of 1 - u where x has no time axis
+FEW = 3  # power of 1 - u where x has no time axis
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 
@@ -128,7 +131,8 @@ def choose(
         remains[n] = min(found)
         # Few numbers a trial are fitted to the sensor's error by much that is wrong.
         share = CERTAIN * (1 - remains[n]) ** (1 if timed else FEW)
-        share = 1.0 if timed and models[key].passes else share
+        if timed and models[key].passes:  # several may imitate what nobody declared
+            share = CERTAIN ** (len(key.effects) - 1)
         cause[n] = inclusion[n] * share
     return Choice(key, probabilities, inclusion, cause, better, remains)
 
@@ -168,8 +172,13 @@ def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> flo
 
 def admitted(models: Mapping[ModelKey, Scored]) -> list[ModelKey]:
     """Return the models that predict left-out trials about as well as the best."""
-    least = min(scored.error for scored in models.values())
-    return [key for key, m in models.items() if m.error <= ADMITTED**2 * least]
+    best = min(models.values(), key=lambda m: m.error)
+    return [
+        key
+        for key, m in models.items()
+        if m.error <= ADMITTED**2 * best.error
+        or predicts_better(best.square, m.square) < SURE
+    ]
 
 
 def predicts_better(one: Array, other: Array) -> float:

@@ -28,7 +28,7 @@ from sbi_active.criticism.misfit.rule import (
     admitted,
     choose,
 )
-from sbi_active.criticism.misfit.search import Candidate, Search
+from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import UNEXPLAINED, ModelKey
@@ -173,14 +173,18 @@ def find_misfit(
     """Return the models and what helps; None where one fits to the sensor's error.
 
     So it is where no model gains a Bayes factor of 20 by a residual process, or where
-    one trial alone asks for it, which may have a gross error.
+    one trial alone asks for it, which may have a gross error. A set of several effects
+    that fits proves little: so many imitate what nobody declared. It is judged as if
+    it missed, and so by what left-out trials say of each of its effects.
 
     Args:
         rivals: The models, whose noise is the sensor's.
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
-        search: Fits the models; None makes one.
+        search: Fits the models, forces of the dictionary among them, whose sets are
+            judged elsewhere; None makes one.
     """
+    has_forces = search is not None
     if search is None:
         # Where it is known not to be the sensor's error there is nothing to tell apart.
         sensor = sensor_error(rivals, needs_time=not is_known)
@@ -194,8 +198,11 @@ def find_misfit(
     if not is_known and not _misses(search):
         return None
     search.fit_larger()
-    if not is_known and (not _misses(search) or _is_one_trial(search)):
-        return None
+    if not is_known:
+        misses = _misses(search)
+        most = MAX_EFFECTS if misses else 1
+        if (has_forces and not misses) or _is_one_trial(search, most):
+            return None
 
     def score(c: Candidate) -> Scored:
         return Scored(c.log_p, c.left.square, passes(c.model))
@@ -246,10 +253,20 @@ def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
     return sorted(missing, key=lambda k: len(k.effects))
 
 
-def _misses(search: Search, use: NDArray[np.bool_] | None = None) -> bool:
-    """Return whether even the best model gains by a residual process."""
+def _misses(
+    search: Search, use: NDArray[np.bool_] | None = None, most: int = MAX_EFFECTS
+) -> bool:
+    """Return whether even the best model gains by a residual process.
+
+    Args:
+        search: Has fitted the models.
+        use: Parts of the trials that count; None for all.
+        most: Effects of the models that count.
+    """
     best_sensor = best_process = -np.inf
-    for c in search.found.values():
+    for key, c in search.found.items():
+        if len(key.effects) > most:
+            continue
         p: Posterior = c.posterior
         if use is not None:
             p = search.errors.posterior(c.model, c.grams, use)
@@ -258,18 +275,17 @@ def _misses(search: Search, use: NDArray[np.bool_] | None = None) -> bool:
     return best_process - best_sensor > THRESHOLD
 
 
-def _is_one_trial(search: Search) -> bool:
-    """Return whether the models fit all trials but one."""
+def _is_one_trial(search: Search, most: int) -> bool:
+    """Return whether the models of so many effects fit all trials but one."""
     errors = search.errors
     if not errors.is_by_trial:
         return False
-    best = max(
-        search.found.values(), key=lambda c: c.log_prior + c.posterior.log_sensor
-    )
+    models = [c for k, c in search.found.items() if len(k.effects) <= most]
+    best = max(models, key=lambda c: c.log_prior + c.posterior.log_sensor)
     square = np.bincount(errors.fold, best.model.residual**2, errors.num_folds)
     for fold in np.argsort(-square)[:NUM_SUSPECTS]:
         use = np.ones(errors.num_folds, bool)
         use[fold] = False
-        if not _misses(search, use):
+        if not _misses(search, use, most):
             return True
     return False

@@ -124,7 +124,7 @@ def trace(
         verdict = _verdict(p, equivalent, alarm=detection.alarm)
         if verdict == process and rest > alone:
             beside = found
-    p = _beside_imitations(p) if rivals.look is not None else p
+    p = _beside_imitations(p)
     near = equivalent_effects(rivals, None) if compare else ()
     aliases = ()
     if compare and detection.alarm:

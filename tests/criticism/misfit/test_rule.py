@@ -35,6 +35,28 @@ def test_a_model_that_fits_to_the_sensor_leaves_nothing():
     assert choose(several, "a").cause["a"] == pytest.approx(1.0)
 
 
+def test_a_set_that_fits_to_the_sensor_may_imitate_what_nobody_declared():
+    several = models(none=(0.0, 101.0), a=(5.0, 40.0), b=(5.0, 50.0))
+    several[ModelKey(("a", "b"))] = scored(40.0, 1.0, passes=True)
+    found = choose(several, "ab")
+    assert found.cause == pytest.approx({"a": 0.85, "b": 0.85}, abs=1e-6)
+
+
+def test_one_trial_far_from_the_others_does_not_rule_a_model_out():
+    """The likelier model has the larger mean square, by one trial of eight."""
+    even, far = 4 * WIGGLE, 4 * WIGGLE[::-1].copy()
+    far[0] = 60.0
+    several = models(none=(0.0, 101.0), b=(0.0, 4.0)) | {
+        ModelKey(("b",)): Scored(0.0, even, False),
+        ModelKey(("a",)): Scored(30.0, far, False),
+    }
+    assert far.mean() > 2 * even.mean()
+    assert predicts_better(even, far) < 0.9
+    assert choose(several, "ab").key == ModelKey(("a",))
+    worse = {**several, ModelKey(("a",)): Scored(30.0, 2 * even, False)}
+    assert choose(worse, "ab").key == ModelKey(("b",))
+
+
 def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
     """A fast effect has the evidence, a slow one beside it the prediction."""
     found = choose(

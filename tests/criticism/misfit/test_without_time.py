@@ -33,10 +33,10 @@ def line(
     return (x + hidden * torch.sin(4 * a))[:, None]
 
 
-def trials(*, quadratic: float = 0.0, hidden: float = 0.0) -> Trials:
+def trials(*, quadratic: float = 0.0, step: float = 0.0, hidden: float = 0.0) -> Trials:
     action = torch.linspace(-2, 2, NUM_TRIALS)[:, None]
     theta = torch.tensor(THETA).expand(NUM_TRIALS, -1)
-    x = line(theta, action, quadratic=quadratic, hidden=hidden)
+    x = line(theta, action, quadratic=quadratic, step=step, hidden=hidden)
     generator = torch.Generator().manual_seed(3)
     return Trials(action, x + SENSOR * torch.randn(x.shape, generator=generator))
 
@@ -83,3 +83,22 @@ def test_a_model_that_fits_is_no_misfit():
     assert found.trace().verdict == "quadratic"
     assert found.misfit() is None
     assert found.trace().misfit is None
+
+
+def test_several_effects_are_asked_what_left_out_trials_say_of_them():
+    found = loop(trials(quadratic=QUADRATIC, step=1.0))
+    tracing = found.trace()
+    assert tracing.verdict == "quadratic + step"
+    assert found.misfit() is not None
+    assert all(0.5 < tracing.misfit.cause[n] <= 0.85 for n in tracing.chosen)
+    draws = tracing.evidences["quadratic"].draws  # without the step, which matters
+    mean, sd = draws.mean(0), draws.std(0)
+    assert (abs(mean - (*THETA, QUADRATIC)) < 2 * sd).all()
+
+
+def test_a_model_that_one_effect_refutes_has_intervals_that_know_of_it():
+    tracing = loop(trials(quadratic=QUADRATIC)).trace()
+    draws = tracing.evidences["none"].draws
+    mean, sd = draws.mean(0), draws.std(0)
+    assert abs(mean[0] - THETA[0]) > 10 * SENSOR  # the quadratic's mean is in it
+    assert (abs(mean - THETA) < 2 * sd).all()

@@ -326,6 +326,8 @@ def test_the_edge_is_that_of_phi_among_all_effects_that_were_added():
     world = World(
         fn=parabola,
         num=12,
+        declared=False,  # where left-out trials are not asked first
+        repeats=4,
         missing=lambda a: 0.5 + 1.7 * a**2,
         effects=(bias(0.5), effect),
     )

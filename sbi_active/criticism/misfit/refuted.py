@@ -1,0 +1,49 @@
+"""Intervals of models that the trials refute, beside one that explains them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sbi_active.criticism.results import Evidence, ModelKey, Tracing
+from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.seeding import derive_seed
+
+
+def widened(tracing: Tracing, seed: int) -> Tracing:
+    r"""Return a verdict whose refuted models have draws that know of it.
+
+    The posterior of a model that misses the trials is as narrow as the sensor allows,
+    about a wrong place. Draws of one that is behind the verdict's by a Bayes factor of
+    20 are spread by the root of the ratio of both chi-squares (Birge), and moved by
+    what separates both models' means, :math:`(\bar u_v - \bar u)\, n` with a standard
+    normal n for each draw: the verdict's effects, left out, shift what is left.
+
+    Args:
+        tracing: With effects as the verdict.
+        seed: Of the draws.
+
+    References:
+        Birge, Physical Review 40 (1932), for the ratio.
+    """
+    best = tracing.evidences.get(str(ModelKey(tracing.chosen)))
+    if not tracing.chosen or best is None:
+        return tracing
+    found = {
+        name: _widened(own, best, derive_seed(seed, "refuted", name))
+        for name, own in tracing.evidences.items()
+    }
+    return replace(tracing, evidences=found)
+
+
+def _widened(own: Evidence, best: Evidence, seed: int) -> Evidence:
+    if own.log_evidence > best.log_evidence - THRESHOLD or own.key.error is not None:
+        return own
+    ratio = own.best_chi_square / max(best.best_chi_square, 1.0)
+    mean = own.draws.mean(0)
+    known = dict(zip(best.names, best.draws.mean(0), strict=True))
+    apart = np.array([known.get(n, m) for n, m in zip(own.names, mean, strict=True)])
+    normal = np.random.default_rng(seed).normal(size=(len(own.draws), 1))
+    spread = np.sqrt(max(ratio, 1.0)) * (own.draws - mean)
+    return replace(own, draws=mean + spread + normal * (apart - mean))

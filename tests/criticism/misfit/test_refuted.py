@@ -1,0 +1,75 @@
+"""Draws of models that the trials refute."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sbi_active.criticism.misfit.refuted import widened
+from sbi_active.criticism.results import Evidence, ModelKey, Tracing
+
+RNG = np.random.default_rng(0)
+
+
+def evidence(key, names, center, log_z, square):
+    draws = np.array(center) + 0.01 * RNG.normal(size=(4_000, len(names)))
+    return Evidence(
+        key=key,
+        log_evidence=log_z,
+        standard_error=0.0,
+        effective_sample_size=4_000.0,
+        engine="least squares",
+        num_simulations=0,
+        names=names,
+        draws=draws,
+        best_chi_square=square,
+    )
+
+
+def tracing(*found, chosen=("a",)):
+    return Tracing(
+        verdict=" + ".join(chosen),
+        chosen=chosen,
+        probabilities={},
+        inclusion={},
+        credible_set=(),
+        equivalent=(),
+        near=(),
+        aliases=(),
+        estimates=(),
+        evidences={e.name: e for e in found},
+        robust=True,
+    )
+
+
+BARE = evidence(ModelKey(), ("theta",), [2.0], -100.0, 400.0)
+BEST = evidence(ModelKey(("a",)), ("theta", "a"), [1.0, 0.3], 0.0, 25.0)
+OTHER = evidence(ModelKey(("b",)), ("theta", "b"), [1.5, 0.7], -50.0, 100.0)
+
+
+def test_a_refuted_model_is_spread_as_far_as_what_explains_moves_it():
+    found = widened(tracing(BARE, BEST, OTHER), 0).evidences
+    assert found["none"].draws.mean() == pytest.approx(2.0, abs=0.05)
+    # Four times as wide by the chi-squares, and a deviation of one apart.
+    assert found["none"].draws.std() == pytest.approx(1.0, rel=0.05)
+    # What the best model does not have is as far as before.
+    assert found["b"].draws.std(0) == pytest.approx([0.5, 0.02], rel=0.06)
+    assert found["a"] is BEST
+
+
+def test_what_explains_about_as_well_keeps_its_draws():
+    close = replace(OTHER, log_evidence=-1.0)
+    assert widened(tracing(BEST, close), 0).evidences["b"] is close
+
+
+def test_without_an_effect_nothing_explains():
+    before = tracing(BARE, BEST, chosen=())
+    assert widened(before, 0) is before
+
+
+def test_the_seed_decides_the_draws():
+    one, same, other = (
+        widened(tracing(BARE, BEST), seed).evidences["none"].draws for seed in (1, 1, 2)
+    )
+    assert (one == same).all()
+    assert not (one == other).all()
