@@ -135,12 +135,20 @@ class Search:
                 bases = [ModelKey(), *bases]
             scores = self._scores(bases, size)
             most = NUM_PAIRS if size == 2 else NUM_LARGER
-            for key in sorted(scores, key=scores.__getitem__)[::-1][:most]:
+            best = sorted(scores, key=scores.__getitem__)[::-1][:most]
+            for key in dict.fromkeys([*best, *self._sampled(size)]):
                 self.fit_set(key)
             before = max(self.found[k].log_p for k in bases if k.effects or size == 2)
             new = [c.log_p for k, c in self.found.items() if len(k.effects) == size]
             if not new or max(new) < before:
                 break
+
+    def _sampled(self, size: int) -> list[ModelKey]:
+        """Return the sets that sampled evidence puts in front, where there is any."""
+        fits = self.rivals.fits
+        keys = [k for k in fits if len(k.effects) == size and k.error is None]
+        keys = [k for k in keys if {*k.effects} <= {*self.names}]
+        return sorted(keys, key=lambda k: -fits[k].evidence.log_evidence)[:NUM_BASES]
 
     def fit_set(self, key: ModelKey) -> Candidate:
         """Fit one set of effects from its parts, once."""
@@ -209,7 +217,10 @@ class Search:
         starts, columns = [], rival.columns()
         for parent in parents:
             model, own = self.found[parent].model, self._rival(parent)
-            for k in range(-1, NUM_DRAWN if not parent.effects else 0):
+            new = {*key.effects} - {*parent.effects}
+            # What acts nowhere at the end of its prior has no slope to follow there.
+            is_far = not parent.effects or not all(map(self._has_null, new))
+            for k in range(-1, NUM_DRAWN if is_far else 0):
                 u = drawn[max(k, 0)].copy()
                 rest = np.ones(rival.dim, dtype=bool)
                 for name in key.effects:
@@ -221,6 +232,8 @@ class Search:
                         u[place] = self._near_null(name)
                 u[rest] = model.u[self._shared(parent)]
                 starts.append(u)
+        if key in self.rivals.fits:  # what is flat at its null was found by sampling
+            starts.append(self.rivals.fits[key].likeliest[0])
         c = rival.coordinates
         u = np.clip(np.array(starts), c.low, c.high)
         scale = max(min(self.found[p].model.rms for p in parents), 1.0)
@@ -333,6 +346,9 @@ class Search:
             u = np.where(null[0] > 0, high, low)
         step = np.where(u + TRIED > high, -TRIED, TRIED)
         return np.clip(u, low, high), step
+
+    def _has_null(self, name: str) -> bool:
+        return bool(self.rivals.effects[name].null_phi(1).isfinite().all())
 
     def _near_null(self, name: str) -> Array:
         null, step = self._null(name)

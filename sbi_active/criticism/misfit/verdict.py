@@ -31,7 +31,7 @@ from sbi_active.criticism.misfit.rule import (
 from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
-from sbi_active.criticism.results import UNEXPLAINED, ModelKey
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.criticism.under_misfit import NAMED
@@ -94,15 +94,18 @@ class Misfit:
         """Return whether it says more than a verdict of numbers without a time axis.
 
         Numbers that scatter more than declared, each for itself, leave some effect that
-        predicts a few of them better: there it has to be the probable cause, and to
-        predict the rest surely better.
+        predicts a few of them better: there it needs a Bayes factor of 20 beside the
+        same error of unknown size, and to predict the rest surely better. Several
+        effects give way to a probable cause alone.
         """
-        choice = self.choice
+        choice, found = self.choice, self.search.found
         if verdict == UNEXPLAINED:
             return bool(choice.key.effects)
-        return any(
-            p > NAMED and choice.better[n] > SURE for n, p in choice.cause.items()
-        )
+        surely = [n for n in choice.key.effects if choice.better[n] > SURE]
+        if verdict == SCATTER:
+            gain = found[choice.key].log_p - found[ModelKey()].log_p
+            return gain > THRESHOLD and surely == [*choice.key.effects]
+        return any(choice.cause[n] > NAMED for n in surely)
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:
