@@ -240,7 +240,7 @@ def _nuts(
         # Coordinates are about standard normal: no masses are to be learned.
         kernel = NUTS(
             potential_fn=potential,
-            step_size=1.0,
+            step_size=1.0,  # pyright: ignore
             adapt_mass_matrix=False,
             target_accept_prob=ACCEPTED,
             max_tree_depth=MAX_TREE_DEPTH,
