@@ -6,7 +6,8 @@
 Ten trials at random actions. In "gross" one of them, drawn by the seed, is off by 100
 deviations of the noise; "clean" has none. Both methods take the word of the same kind
 of network (no refinement), trained under their own belief in each round. Rows are added
-to results/robust.csv, and those that are there are not run again.
+to robust.csv in --out, and those that are there are not run again. Seeds from 2000 on
+judge.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -40,6 +42,7 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
     inference = METHODS[method](task.prior)
     chosen = task.actions.sample((NUM_TRIALS,), seed=derive_seed(seed, "trials"))
     belief, flagged, others, r_hat = task.prior, 0.0, [], 1.0
+    ess, divergences = float("inf"), 0
     start = time.process_time()
     for i, action in enumerate(chosen):
         own = derive_seed(seed, "round", i)
@@ -59,6 +62,8 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
             )
             found = inference.denoised[-1]
             r_hat = max(r_hat, found.r_hat)
+            ess = min(ess, found.effective_sample_size)
+            divergences += found.num_divergences
             if is_off:
                 flagged = float(found.probability[0])
             else:
@@ -73,6 +78,8 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
         "probability_outlier": flagged,
         "probability_others": max(others, default=0.0),
         "largest_r_hat": r_hat,
+        "least_effective": ess,
+        "divergences": divergences,
         "cpu_s": time.process_time() - start,
     }
 
@@ -81,10 +88,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs=2, default=[2000, 2010])
     parser.add_argument("--summary", action="store_true", help="run nothing")
+    parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    path = RESULTS / "robust.csv"
+    path = options.out / "robust.csv"
     path.parent.mkdir(exist_ok=True)
     known: set[tuple[Any, ...]] = set()
     if path.exists():
@@ -117,11 +125,14 @@ def summary(rows: pd.DataFrame) -> str:
                 f"{own['probability_outlier'].median():.2f}",
                 f"{own['probability_others'].max():.2f}",
                 f"{r_hat.median():.2f} ({r_hat.max():.2f})",
+                f"{own['least_effective'].min():.0f}",
+                f"{own['divergences'].sum():.0f}",
                 *(f"{cost[m]:.0f}" for m in METHODS),
             ]
         )
     header = ["case", "seeds", "median gain", "least to most, nats", "P(outlier)"]
     header += ["largest P of others", "largest r_hat: median (most)"]
+    header += ["least effective draws", "divergences"]
     return as_table(lines, [*header, *(f"CPU s, {m}" for m in METHODS)])
 
 

@@ -2,23 +2,25 @@
 
     python -m benchmarks.exports.run
 
+    python -m benchmarks.exports.run --write DIR   # for benchmarks/exports/calls.py
+
 Run it in an environment of each: ArviZ 1.x needs Python 3.12. It prints a line a call
-with the warnings raised in it; ArviZ's own dependencies raise some.
+with the warnings raised in it; ArviZ's own dependencies raise some. ArviZ 0.23 reads
+and writes Zarr of the second generation alone, which needs older company:
+``zarr==2.18.7 numcodecs==0.15.1 xarray==2025.1.2``.
 """
 
 from __future__ import annotations
 
-import sys
-import tempfile
+import argparse
 import warnings
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-import matplotlib
 import torch
-import xarray as xr
 from sbi.utils import BoxUniform
 
+from benchmarks.exports.calls import run
 from sbi_active import (
     BoxActions,
     Campaign,
@@ -27,15 +29,13 @@ from sbi_active import (
     GaussianNoise,
     MixtureDensity,
     SimulatorModel,
+    to_datatree,
     to_inference_data,
 )
-from sbi_active.arviz_versions import az
 from sbi_active.criticism import Trials, close_loop, generic_effects
 
-IS_NEW = int(az.__version__.split(".")[0]) >= 1
 
-
-def export_campaign() -> Any:
+def export_campaign(export: Any) -> Any:
     """Return the export of a campaign of four trials."""
     model = SimulatorModel(
         lambda theta, action: theta * action,
@@ -58,10 +58,10 @@ def export_campaign() -> Any:
         campaign.ask()
         campaign.tell([0.5, 0.4])
     campaign.update()
-    return to_inference_data(campaign)
+    return export(campaign)
 
 
-def export_rivals() -> dict[str, Any]:
+def export_rivals(export: Any) -> dict[str, Any]:
     """Return the exports of two rivals of a report, with and without a bias."""
     model = SimulatorModel(
         lambda theta, action: theta * action,
@@ -81,49 +81,24 @@ def export_rivals() -> dict[str, Any]:
         evaluate=False,
     )
     names = ("none", str(report.tracing.key))
-    return {name: to_inference_data(report, model=name) for name in names}
+    return {name: export(report, model=name) for name in names}
 
 
 def main() -> None:
-    """Print a line a call."""
-    matplotlib.use("Agg")
+    """Print a line a call, or write the exports."""
+    parser = argparse.ArgumentParser(description="Ten calls of ArviZ.")
+    parser.add_argument("--write", type=Path, help="folder; calls.py reads it anywhere")
+    folder = parser.parse_args().write
+    export: Any = to_inference_data if folder is None else to_datatree
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        data, rivals = export_campaign(), export_rivals()
-    directory = tempfile.mkdtemp()
-    read_nc: Any = xr.open_datatree if IS_NEW else az.from_netcdf
-    read_zarr: Any = xr.open_datatree if IS_NEW else az.from_zarr
-    ppc: Any = getattr(az, "plot_ppc_dist" if IS_NEW else "plot_ppc")
-    theta: dict[str, Any] = {"var_names": ["theta"]}
-    calls: dict[str, Callable[[], Any]] = {
-        "summary": lambda: az.summary(data),
-        "rhat": lambda: az.rhat(data),
-        "ess": lambda: az.ess(data),
-        "plot_pair": lambda: az.plot_pair(data, **theta),
-        "plot_trace": lambda: az.plot_trace(data, **theta),
-        "plot_ppc": lambda: ppc(data),
-        "loo": lambda: az.loo(data),
-        "compare": lambda: az.compare(rivals),
-        "netcdf": lambda: (
-            data.to_netcdf(f"{directory}/a.nc"),
-            read_nc(f"{directory}/a.nc"),
-        ),
-        "zarr": lambda: (
-            data.to_zarr(f"{directory}/a.zarr"),
-            read_zarr(f"{directory}/a.zarr"),
-        ),
-    }
-    print(f"Python {sys.version.split()[0]}, ArviZ {az.__version__}")
-    for name, call in calls.items():
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            try:
-                call()
-                outcome = "runs"
-            except Exception as error:
-                outcome = f"{type(error).__name__}: {error}"
-        texts = {str(w.message).splitlines()[0][:90] for w in caught}
-        print(f"{name:10s} {outcome[:90]}; warnings: {'; '.join(texts) or 'none'}")
+        data, rivals = export_campaign(export), export_rivals(export)
+    if folder is None:
+        print(run(data, rivals))
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, tree in {"campaign": data, **rivals}.items():
+        tree.to_netcdf(folder / f"{name}.nc", engine="h5netcdf")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 r"""Error models :math:`p(x_o | x)` as short Pyro programs.
 
 All numbers are in deviations of the predictive, channel by channel. Indicators of
-misspecification are discrete and summed out, so that NUTS sees a smooth density; their
-probabilities are recovered from the draws. Nothing is relaxed.
+misspecification are discrete and summed out; their probabilities are recovered from the
+draws. Every error here is normal given its own deviation :math:`\sigma`, and
+``log_deviation`` is the density of :math:`\log \sigma`, over which NUTS runs.
 
 References:
     Ward, Cannon, Beaumont, Fasiolo & Schmon, "Robust neural posterior estimation and
@@ -12,11 +13,27 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
+
+ROUNDED = 0.1  # of the log of a known deviation, whose density would be a spike
+
+
+class ErrorModel(Protocol):
+    """The error of an outcome, in deviations of the predictive."""
+
+    def log_deviation(self, log_sd: Tensor) -> Tensor:
+        """Return the log density of the log deviation of a channel's error, (n,)."""
+        ...
+
+    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return the probability of misspecification a channel, (n, q) -> (n, q)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -33,7 +50,7 @@ class SpikeAndSlab:
     """
 
     probability: float = 0.1
-    spike: float = 0.02
+    spike: float = 0.005
     slab: float = 10.0
 
     def __call__(self, x: Tensor, x_o: Tensor) -> None:
@@ -44,6 +61,12 @@ class SpikeAndSlab:
     def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
         """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
         return self._parts(x, x_o).softmax(0)[1]
+
+    def log_deviation(self, log_sd: Tensor) -> Tensor:
+        """Return the log density of the log deviation of a channel's error, (n,)."""
+        right = _known(self.spike, log_sd) + np.log(1 - self.probability)
+        wrong = _student(3.0, self.slab, log_sd) + np.log(self.probability)
+        return torch.logaddexp(right, wrong)
 
     def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
         rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
@@ -76,6 +99,10 @@ class StudentError:
         """Return whether errors are gross at denoised outcomes (n, q), shape (n, q)."""
         return ((x_o - x).abs() > self.gross * self.scale).to(x)
 
+    def log_deviation(self, log_sd: Tensor) -> Tensor:
+        """Return the log density of the log deviation of a channel's error, (n,)."""
+        return _student(self.df, self.scale, log_sd)
+
 
 @dataclass(frozen=True)
 class ChannelBias:
@@ -92,7 +119,7 @@ class ChannelBias:
 
     probability: float = 0.1
     bias: float = 5.0
-    spike: float = 0.02
+    spike: float = 0.005
 
     def __call__(self, x: Tensor, x_o: Tensor) -> None:
         """Condition on an outcome; x of shape (..., q)."""
@@ -102,8 +129,24 @@ class ChannelBias:
         """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
         return self._parts(x, x_o).softmax(0)[1]
 
+    def log_deviation(self, log_sd: Tensor) -> Tensor:
+        """Return the log density of the log deviation of a channel's error, (n,)."""
+        wide = (self.spike**2 + self.bias**2) ** 0.5
+        right = _known(self.spike, log_sd) + np.log(1 - self.probability)
+        return torch.logaddexp(right, _known(wide, log_sd) + np.log(self.probability))
+
     def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
         rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
         wide = (self.spike**2 + self.bias**2) ** 0.5
         parts = [dist.Normal(x, sd).log_prob(x_o) for sd in (self.spike, wide)]
         return torch.stack([rho[0] + parts[0], rho[1] + parts[1]])
+
+
+def _known(sd: float, log_sd: Tensor) -> Tensor:
+    return dist.Normal(float(np.log(sd)), ROUNDED).log_prob(log_sd)
+
+
+def _student(df: float, scale: float, log_sd: Tensor) -> Tensor:
+    """Return the log density of log(scale) + log(v) / 2, v inverse gamma."""
+    v = torch.exp(2 * (log_sd - float(np.log(scale))))
+    return dist.InverseGamma(0.5 * df, 0.5 * df).log_prob(v) + v.log() + np.log(2.0)

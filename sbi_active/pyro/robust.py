@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief, named, require_support
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.trainers.asbi import ASBI
 from sbi_active.pyro.denoising import Denoised, denoise
@@ -123,14 +124,17 @@ class RobustASBI(ASBI):
         """Return the belief after a real trial, and make it the current one.
 
         Args:
-            x_o: The outcome, without NaN.
+            x_o: The outcome. NaN is information where simulations of this round lacked
+                those numbers too; else their sensor failed, and they are drawn from
+                what the predictive says given the others.
             action: The executed action.
             simulator: For the predictive; required.
             refinement: Not used; anything but None is an error.
             seed: Of everything random; None draws one from torch's global generator.
 
         Raises:
-            ValueError: If there is no simulator, or a refinement is asked for.
+            ValueError: If there is no simulator, a refinement is asked for, or fewer
+                than 20 of 1,000 simulations have the numbers that the outcome has.
             RuntimeError: If nothing was trained in this round.
         """
         if simulator is None or refinement is not None:
@@ -150,13 +154,17 @@ class RobustASBI(ASBI):
             theta = previous.sample(torch.Size([NUM_PREDICTIVE]))
         actions = trial.action.expand(NUM_PREDICTIVE, -1)
         rows = simulate(simulator, theta, actions, seed=derive_seed(seed, "rows"))
-        flat = rows.x.reshape(len(rows.x), -1)
-        flat = flat[flat.isfinite().all(1)]
-        denoised = denoise(
-            trial.x.reshape(-1), flat, self.error_model, seed=derive_seed(seed, "nuts")
-        )
+        flat, x_o = rows.x.reshape(len(rows.x), -1), trial.x.reshape(-1)
+        missing = x_o.isnan()
+        known = bool(missing.any()) and _knows(network, trial.x, trial.action)
+        # A number that simulations lack too is information; else its sensor failed.
+        lacking = missing if known else torch.zeros_like(missing)
+        rows_alike = (flat.isnan() == lacking).all(1) & ~flat.isinf().any(1)
+        flat = torch.where(lacking, 0.0, flat[rows_alike])
+        denoised = denoise(x_o, flat, self.error_model, seed=derive_seed(seed, "nuts"))
         pick = torch.linspace(0, len(denoised.x) - 1, NUM_AVERAGED).long()
-        x = denoised.x[pick].float().reshape(NUM_AVERAGED, *trial.x.shape)
+        x = torch.where(lacking, torch.nan, denoised.x[pick].float())
+        x = x.reshape(NUM_AVERAGED, *trial.x.shape)
         condition = pack(x, trial.action.expand(NUM_AVERAGED, -1)).to(self._device)
         prior = require_support(self._prior)
         belief = RobustBelief(deepcopy(network), condition, prior, denoised)
@@ -165,3 +173,10 @@ class RobustASBI(ASBI):
         self.denoised.append(denoised)
         self._forget_round()
         return belief
+
+
+def _knows(network: Any, x: Tensor, action: Tensor) -> bool:
+    """Return whether a network was trained on outcomes that lack the same numbers."""
+    if not isinstance(network, MixtureDensityNetwork):
+        return False  # sbi's networks take no NaN
+    return network.knows(pack(x[None], action[None]))

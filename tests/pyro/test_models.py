@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_active import Campaign, CampaignOptions, DiscreteActions
+from sbi_active import Campaign, CampaignOptions, DiscreteActions, MixtureDensity
 from sbi_active.inference import refine
 from sbi_active.pyro import RobustASBI, from_pyro
 from sbi_active.seeding import forked_generators
@@ -128,3 +128,34 @@ def test_a_robust_update_needs_a_simulator():
     problem = from_pyro(growth, torch.ones(1))
     with pytest.raises(ValueError, match="pass the simulator alone"):
         RobustASBI(problem.prior).update(torch.zeros(1), action=torch.ones(1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "x", [[0.3, 0.3], [1e3, -1e3], [0.3, math.nan], [math.nan, math.nan]]
+)
+def test_a_first_trial_of_any_kind_leaves_a_belief(x):
+    """Right, wrong in every channel, a dead sensor, and no outcome at all."""
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        mean = theta * action
+        return mean.expand(-1, 2) + 0.1 * torch.randn(len(theta), 2)
+
+    prior = dist.Uniform(-torch.ones(1), torch.ones(1)).to_event(1)
+    inference = RobustASBI(prior, MixtureDensity(num_iterations=300))
+    with forked_generators(0):
+        theta, action = prior.sample((2_000,)), torch.rand(2_000, 1)
+        rows = simulator(theta, action)
+        inference.append_simulations(theta, rows, action=action).train()
+    belief = inference.update(
+        torch.tensor(x), action=torch.ones(1), simulator=simulator, seed=0
+    )
+    draws = belief.sample((1_000,))
+    probability = inference.denoised[-1].probability.nan_to_num(0.0)
+    if x[0] == 0.3:
+        assert float(draws.mean()) == pytest.approx(0.3, abs=0.1)
+        assert bool((probability < 0.2).all())
+    else:
+        assert float(draws.std()) > 0.4  # the prior's is .58
+    if x[0] == 1e3:
+        assert bool((probability > 0.99).all())
