@@ -59,7 +59,7 @@ SHARED = 0.5
 #: Share of outcomes that are taken to tell nothing.
 DOUBT = 0.1
 LOG_SQUARE = -1.27, np.pi**2 / 2  # mean and variance of log chi^2 of one degree
-MOST_SQUARED = 4  # parameters whose squares the noise's variance may depend on
+MOST_SQUARED = 4  # parameters whose squares trends and variances may have
 LEAST_TOLD = 0.03  # share of a parameter's variance that a statistic is kept for
 SLOPE = 0.5  # deviation a priori of coefficients of the noise's log variance
 
@@ -141,8 +141,9 @@ class ImageLikelihood:
         )
         if num_wanted is not None:
             statistic, own = _that_tell(statistic, own, z[seen][:, :num_wanted])
+        degree = 1 if z.shape[1] > MOST_SQUARED else None
         processes = tuple(
-            GaussianProcess.fit(z[seen], own[:, [j]], noisy=True)
+            GaussianProcess.fit(z[seen], own[:, [j]], noisy=True, degree=degree)
             for j in range(own.shape[1])
         )
         left_out = np.concatenate([p.left_out for p in processes], 1)
@@ -339,9 +340,10 @@ def repeated(
 
 def _that_tell(statistic: Statistic, own: Array, z: Array) -> tuple[Statistic, Array]:
     """Return the statistics that tell of their parameter, at least the best."""
+    if statistic.weight is None:  # few numbers, which stay as they are
+        return statistic, own
     told = 1 - ((z - own) ** 2).mean(0) / z.var(0)
     keep = told >= min(LEAST_TOLD, told.max())
-    assert statistic.weight is not None  # of few parameters and many numbers
     fewer = replace(
         statistic, weight=statistic.weight[:, keep], offset=statistic.offset[keep]
     )
