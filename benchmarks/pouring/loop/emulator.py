@@ -5,12 +5,14 @@ much is in view as where little is: how many particles' worth is covered in six 
 along y, within 3 cm of the middle along x and beyond, and how much volume there is,
 with heights as they are and squared. They are taken with the picture shifted by five
 distances along y, between which the camera's offset interpolates; its gain multiplies
-the volume, and the rest is a Gaussian process for each action, over theta and the
-strengths of the effects.
+the volume, and the rest is a Gaussian process over theta and the strengths of the
+effects: one for each action, or one of all, with height and rate as inputs, where pours
+at other heights and rates are learned from too.
 
-What left-out pours miss of it, chaos and error together, is the noise: numbers are
-whitened by its root, and larger still by the factor that leaves one in twenty left-out
-pours beyond the chi-square's 95 % point.
+What left-out pours miss of it, chaos and error together, is the noise, of the half of
+them that have the weaker effects, as one effect alone is weaker than seven at a time:
+numbers are whitened by its root, and larger still by the factor that leaves one in
+twenty of these pours beyond the chi-square's 95 % point.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ SHIFTS = (-10, -5, 0, 5, 10)  # pixels along y
 NUM_BANDS = 6
 CORE = 15  # pixels from the middle along x
 COVERED = 0.5  # mm
+HIGHEST = 8.0  # sides of a particle: what is above hangs in the bucket
 OFFSET = 3 / 8  # of a count before its root (Anscombe, Biometrika 1948)
 NUM_NUMBERS = NUM_BANDS + 4
 VOLUME = (NUM_BANDS + 2, NUM_BANDS + 3)  # place of what the gain multiplies
@@ -53,6 +56,7 @@ def pictures_numbers(images: Tensor, side: float) -> Array:
         side: Of a particle, mm, that counts are in units of.
     """
     x = images.reshape(-1, NUM_PIXELS, NUM_PIXELS).numpy().astype(np.float64)
+    x = np.where(x > HIGHEST * side, 0, x)
     pixels = (side / (1e3 * PIXEL)) ** 2
     found = np.empty((len(x), len(SHIFTS), NUM_NUMBERS))
     middle = NUM_PIXELS // 2
@@ -98,7 +102,9 @@ class Emulator:
     Attributes:
         world: It.
         scales: Of each poured effect's strength, by keyword.
-        processes: One an action, of the numbers at all shifts.
+        processes: One an action, of the numbers at all shifts; the same for all where
+            they share it.
+        places: What the processes take besides, shape (a, 2), or (a, 0).
         roots: Whitening of the numbers at each action, shape (a, 10, 10).
         widened: Factor on the noise, by action.
     """
@@ -106,14 +112,30 @@ class Emulator:
     world: World
     scales: dict[str, float]
     processes: tuple[GaussianProcess, ...]
+    places: Array
     roots: Array
     widened: Array
 
     @staticmethod
     def fit(
-        world: World, theta: Tensor, action: Tensor, effects: dict[str, Array], x: Array
+        world: World,
+        theta: Tensor,
+        action: Tensor,
+        effects: dict[str, Array],
+        x: Array,
+        *,
+        joint: bool = False,
     ) -> Emulator:
-        """Learn from pours: theta (n, d), effects by keyword (n,), x (n, 5, 10)."""
+        """Learn from pours.
+
+        Args:
+            world: Its actions are the trials'.
+            theta: Shape (n, d).
+            action: Shape (n, 3); the world's, unless ``joint``.
+            effects: By keyword, each of shape (n,).
+            x: Numbers, shape (n, 5, 10).
+            joint: One process for all actions, of one place along y.
+        """
         scales = {
             effect.apply.names[0]: float(effect.declared_draws().std())  # type: ignore[attr-defined]
             for effect in poured_effects(world)
@@ -122,22 +144,35 @@ class Emulator:
         inputs = np.concatenate(
             [2 * theta.double().numpy() - 1, np.stack(strengths, 1)], 1
         )
+        size = np.square(strengths).sum(0)
+        places = np.zeros((len(world.actions), 0))
+        groups = [(action == own).all(1).numpy() for own in world.actions]
+        if joint:
+            places = in_units(world.actions)
+            inputs = np.concatenate([inputs, in_units(action)], 1)
+            groups = [np.ones(len(inputs), dtype=bool)]
         processes, roots, widened = [], [], []
-        for own in world.actions:
-            mine = (action == own).all(1).numpy()
+        for mine in groups:
             process = GaussianProcess.fit(
                 inputs[mine], x[mine].reshape(mine.sum(), -1), noisy=True, degree=1
             )
             shape = (-1, len(SHIFTS), NUM_NUMBERS)
             missed = process.left_out.reshape(shape)[:, SHIFTS.index(0)]
+            missed = missed[size[mine] <= np.median(size[mine])]
             root = np.sqrt((missed**2).mean(0))[:, None] * correlation_root(missed)
             square = (np.linalg.solve(root, missed.T) ** 2).sum(0)
             limit = chi2.ppf(LIMIT, NUM_NUMBERS)
             processes.append(process)
             roots.append(root)
             widened.append(max(1.0, float(np.sqrt(np.quantile(square, LIMIT) / limit))))
+        again = len(world.actions) // len(groups)
         return Emulator(
-            world, scales, tuple(processes), np.stack(roots), np.array(widened)
+            world,
+            scales,
+            tuple(processes * again),
+            places,
+            np.stack(roots * again),
+            np.array(widened * again),
         )
 
     def white(self, x: Array, number: int) -> Array:
@@ -174,7 +209,10 @@ class Emulator:
             mine = np.nonzero(near.numpy() == number)[0]
             if not len(mine):
                 continue
-            mean = process.predict(inputs[mine])[0]
+            place = np.broadcast_to(
+                self.places[number], (len(mine), len(self.places.T))
+            )
+            mean = process.mean(np.concatenate([inputs[mine], place], 1))
             mean = mean.reshape(len(mine), len(SHIFTS), NUM_NUMBERS)
             x = (weight[mine][..., None] * mean).sum(1)
             x[:, VOLUME[0]] *= gain[mine]
@@ -233,6 +271,11 @@ class Emulator:
                 )
             )
         return found
+
+
+def in_units(action: Tensor) -> Array:
+    """Return height and rate of actions (n, 3) in units of one, shape (n, 2)."""
+    return (action[:, [0, 2]].double().numpy() - [35.0, 0.9]) / [20.0, 0.7]
 
 
 def side_of(world: World) -> float:

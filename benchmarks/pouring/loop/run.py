@@ -43,7 +43,8 @@ RESULTS = Path(__file__).parents[1] / "results"
 KINDS = ("hidden", "clean", "material")
 WORLD_OF = {"hidden": "cubes", "clean": "cubes", "material": "material"}
 CASES = {"hidden": 10, "clean": 10, "material": 6}
-FIRST = {"hidden": 2_400, "clean": 2_450, "material": 2_500}  # seeds
+FIRST = {"hidden": 2_600, "clean": 2_650, "material": 2_500}  # seeds
+BARE = ("prior", "compared")  # parts without effects, of material.bank
 NUM_FITTED, NUM_HELD_OUT = 2, 1  # pours of an action
 STRONG = 1.0, 2.5  # of the prior's deviation
 COLUMNS = [
@@ -55,17 +56,37 @@ COLUMNS = [
 
 @cache
 def emulator(bank: Path, name: str) -> Emulator:
-    """Return the emulator of a world from its bank."""
+    """Return the emulator of a world from its bank.
+
+    Args:
+        bank: Folder of the worlds' pours, with those of the campaigns on a material in
+            its ``prior`` and ``compared``.
+        name: Of the world.
+    """
     world = get_world(name)
     rows = read_bank(bank, name)
-    particles = world.task.pours.particles
+    theta, action, poses = [rows.theta], [rows.action], [rows.poses]
+    effects = {key: [value] for key, value in rows.effects.items()}
+    for part in BARE if name == "material" else ():
+        more = read_bank(bank, part)
+        here = more.action[:, 1] == 0
+        theta.append(more.theta[here])
+        action.append(more.action[here])
+        poses.append(more.poses[here.numpy()])
+        for values in effects.values():
+            values.append(np.zeros(int(here.sum())))
+    particles, every = world.task.pours.particles, np.concatenate(poses)
     x = np.concatenate(
         [
-            pictures_numbers(images_of(poses, particles), side_of(world))
-            for poses in np.array_split(rows.poses, max(1, len(rows) // 100))
+            pictures_numbers(images_of(some, particles), side_of(world))
+            for some in np.array_split(every, max(1, len(every) // 100))
         ]
     )
-    return Emulator.fit(world, rows.theta, rows.action, rows.effects, x)
+    strengths = {key: np.concatenate(values) for key, values in effects.items()}
+    joint = name == "material"
+    return Emulator.fit(
+        world, torch.cat(theta), torch.cat(action), strengths, x, joint=joint
+    )
 
 
 def truth_of(world: World, kind: str, case: int) -> tuple[Tensor, str, float]:

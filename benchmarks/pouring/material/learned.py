@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from benchmarks.pouring.likelihood import (
     doubted,
     observed,
 )
-from benchmarks.pouring.power import NUM_FOLDS, best_power, told_by
+from benchmarks.pouring.power import best_power, told_by
 from sbi_active.inference.emulation.process import GaussianProcess
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, intersection_volume
@@ -46,13 +47,14 @@ __all__ = ["ByPlace", "Overlap", "PointBelief", "compared_pours", "kept", "learn
 Array = NDArray[Any]
 
 NUM_PARAMETERS = 8
-LOG_NUM_POINTS = 15
+LOG_NUM_POINTS = 14
+NUM_FOLDS = 3
 NUM_DRAWS = 1_000  # of the prior, that left-out pours are judged on
 PARTS = ("prior", "compared")
 
 
 class PointBelief:
-    """A belief as weights on 32,768 points that fill the prior evenly.
+    """A belief as weights on 16,384 points that fill the prior evenly.
 
     Args:
         log_weight: Up to a constant, shape (n,).
@@ -240,8 +242,12 @@ class Overlap:
 
     def mean(self, belief: PointBelief) -> float:
         """Return the expectation under a belief: InterVol of all its draws."""
-        volume = self.process.predict(2 * belief.points() - 1)[0][:, 0]
-        return float(belief.weight @ volume)
+        return float(belief.weight @ self.at_points)
+
+    @cached_property
+    def at_points(self) -> Array:
+        """What it is at the points of a belief, shape (n,)."""
+        return self.process.predict(2 * PointBelief.points() - 1)[0][:, 0]
 
 
 def compared_pours(folder: Path, real: Tensor) -> Overlap:
