@@ -117,6 +117,7 @@ def fill(
         start = time.process_time()
         poses = pours.poses(rows.theta, rows.action, rows.seeds, **rows.effects)
         spent = time.process_time() - start
+        effects: dict[str, Any] = {EFFECT + k: v for k, v in rows.effects.items()}
         whole = path.with_suffix(f".{os.getpid()}.part")
         with whole.open("wb") as file:
             np.savez(
@@ -125,7 +126,7 @@ def fill(
                 action=rows.action.numpy(),
                 poses=poses,
                 cpu_seconds=spent,
-                **{EFFECT + name: value for name, value in rows.effects.items()},
+                **effects,
             )
         whole.replace(path)
 

@@ -78,7 +78,7 @@ def residual_figure(bank: Path, kind: str, case: int, number: int) -> Any:
     here = (action == get_world(WORLD_OF[kind]).actions[number]).all(1)
     real = blocks(images[here])
     chosen = tuple(tracing.chosen)
-    models = [("bare model", "none", ())]
+    models: list[tuple[str, str, tuple[str, ...]]] = [("bare model", "none", ())]
     if chosen:
         models.append((f"with {report.verdict}", " + ".join(chosen), chosen))
     panels = [("of the set", real.mean(0), "height")]

@@ -104,7 +104,7 @@ def truth_of(world: World, kind: str, case: int) -> tuple[Tensor, str, float]:
     return theta, effect.name, sign * size * float(draws.square().mean().sqrt())
 
 
-def pour_set(kind: str, case: int) -> tuple[Tensor, Tensor, list[str], dict[str, Any]]:
+def pour_set(kind: str, case: int) -> tuple[Tensor, Tensor, list[Any], dict[str, Any]]:
     """Return actions (n, 3), images (n, 22500), roles and the truth of a set."""
     world = get_world(WORLD_OF[kind])
     num = NUM_FITTED + NUM_HELD_OUT

@@ -66,7 +66,8 @@ class PointBelief:
     @staticmethod
     def points() -> Array:
         """Return the points, of Sobol's sequence, shape (n, 8)."""
-        return qmc.Sobol(NUM_PARAMETERS, seed=0).random_base2(LOG_NUM_POINTS)
+        sobol = qmc.Sobol(NUM_PARAMETERS, seed=0)  # pyright: ignore[reportCallIssue]
+        return sobol.random_base2(LOG_NUM_POINTS)
 
     @classmethod
     def uniform(cls) -> PointBelief:
@@ -194,7 +195,7 @@ def learn(folder: Path) -> ByPlace:
     found: list[dict[float, Learned]] = [{}, {}]
     for place in PLACES:
         mine = action[:, 1] == place
-        is_empty = ~mesh[mine].any(1)
+        is_empty = np.asarray(~mesh[mine].any(1))
         mean, axes = components(small[mine], NUM_COMPONENTS)
         both = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
         for delta, summary in enumerate(both):
