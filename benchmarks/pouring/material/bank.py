@@ -1,7 +1,7 @@
 """Pours of the eight-parameter model, behind campaigns on a material.
 
-    python -m benchmarks.pouring.material.bank FOLDER --part prior --rows 800
-    python -m benchmarks.pouring.material.bank FOLDER --part compared --rows 200
+    python -m benchmarks.pouring.material.bank FOLDER --part prior --rows 300
+    python -m benchmarks.pouring.material.bank FOLDER --part compared --rows 150
     python -m benchmarks.pouring.material.bank FOLDER --report
 
 Rows of ``prior`` are shared out by where the bucket stands: half of them at p = 0, two
@@ -56,7 +56,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Pours of the eight-parameter model.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--part", choices=[*PARTS], default="prior")
-    parser.add_argument("--rows", type=int, default=800)
+    parser.add_argument("--rows", type=int, default=300)
     parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
     parser.add_argument("--report", action="store_true", help="simulate nothing")
     arguments = parser.parse_args()
