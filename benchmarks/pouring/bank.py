@@ -20,7 +20,9 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +32,10 @@ from torch import Tensor
 
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring import Pours
 
 ROWS_A_FILE = 50
+EFFECT = "effect_"  # before the names of effects in a file
 PARTS = ("prior", "likely", "repeats")
 AT_A_THETA = 5  # pours, of part "repeats"
 #: Actions that designed campaigns choose most.
@@ -47,18 +51,40 @@ class Rows:
         action: Shape (n, 3).
         poses: Shape (n, particles, 7), float32.
         cpu_seconds: Of all of them.
+        effects: What they had besides, by keyword, each of shape (n,); most often none.
     """
 
     theta: Tensor
     action: Tensor
     poses: np.ndarray
     cpu_seconds: float
+    effects: dict[str, np.ndarray]
 
     def __len__(self) -> int:
         return len(self.theta)
 
 
-def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
+@dataclass(frozen=True)
+class Drawn:
+    """What a file of rows is poured with.
+
+    Attributes:
+        theta: Shape (n, d).
+        action: Shape (n, 3).
+        seeds: Shape (n,).
+        effects: By keyword, each of shape (n,).
+    """
+
+    theta: Tensor
+    action: Tensor
+    seeds: Tensor
+    effects: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+Draw = Callable[[str, int], Drawn]  # of a part and the number of a file
+
+
+def draw(task: Any, part: str, number: int) -> Drawn:
     """Return parameters, actions and seeds of a file of rows."""
     seed = derive_seed(0, "pouring bank", part, number)
     with forked_generators(seed):
@@ -73,12 +99,13 @@ def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
         some = torch.where(torch.arange(num)[:, None] < num // 2, action[:num], again)
         theta = theta[:num].repeat_interleave(AT_A_THETA, 0)
         action = some.repeat_interleave(AT_A_THETA, 0)
-    return theta, action, row_seeds(seed, ROWS_A_FILE)
+    return Drawn(theta, action, row_seeds(seed, ROWS_A_FILE))
 
 
-def fill(folder: Path, part: str, num: int, share: tuple[int, int]) -> None:
+def fill(
+    folder: Path, part: str, num: int, share: tuple[int, int], pours: Pours, drawn: Draw
+) -> None:
     """Simulate the files that are missing."""
-    task: Any = get_task("pouring")
     folder = folder / part
     folder.mkdir(parents=True, exist_ok=True)
     mine, of = share
@@ -86,18 +113,20 @@ def fill(folder: Path, part: str, num: int, share: tuple[int, int]) -> None:
         path = folder / f"{number:05d}.npz"
         if path.exists():
             continue
-        theta, action, seeds = draw(task, part, number)
+        rows = drawn(part, number)
         start = time.process_time()
-        poses = task.pours.poses(theta, action, seeds)
+        poses = pours.poses(rows.theta, rows.action, rows.seeds, **rows.effects)
         spent = time.process_time() - start
+        effects: dict[str, Any] = {EFFECT + k: v for k, v in rows.effects.items()}
         whole = path.with_suffix(f".{os.getpid()}.part")
         with whole.open("wb") as file:
             np.savez(
                 file,
-                theta=theta.numpy(),
-                action=action.numpy(),
+                theta=rows.theta.numpy(),
+                action=rows.action.numpy(),
                 poses=poses,
                 cpu_seconds=spent,
+                **effects,
             )
         whole.replace(path)
 
@@ -122,6 +151,11 @@ def read(folder: Path, part: str = "prior", *, most: int | None = None) -> Rows:
         torch.from_numpy(np.concatenate([f["action"] for f in files])),
         np.concatenate([f["poses"] for f in files]),
         sum(float(f["cpu_seconds"]) for f in files),
+        {
+            name.removeprefix(EFFECT): np.concatenate([f[name] for f in files])
+            for name in files[0].files
+            if name.startswith(EFFECT)
+        },
     )
 
 
@@ -134,6 +168,7 @@ def read_parts(folder: Path, parts: tuple[str, ...]) -> Rows:
         torch.cat([rows.action for rows in found]),
         np.concatenate([rows.poses for rows in found]),
         sum(rows.cpu_seconds for rows in found),
+        {},
     )
 
 
@@ -155,7 +190,15 @@ def main() -> None:
     torch.set_num_threads(1)
     if not arguments.report:
         mine, of = map(int, arguments.share.split("/"))
-        fill(arguments.folder, arguments.part, arguments.rows, (mine, of))
+        task: Any = get_task("pouring")
+        fill(
+            arguments.folder,
+            arguments.part,
+            arguments.rows,
+            (mine, of),
+            task.pours,
+            partial(draw, task),
+        )
     print(report(arguments.folder, arguments.part))
 
 

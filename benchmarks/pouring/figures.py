@@ -29,11 +29,11 @@ def subplots(num: int) -> tuple[Any, Any]:
     return figure, figure.subplots(1, num, squeeze=False)[0]
 
 
-def boxes(axes: Any, by_round: dict[str, list[np.ndarray]]) -> None:
-    """Draw one box a method and round, side by side."""
+def boxes(axes: Any, by_round: dict[str, list[np.ndarray]], *, first: int = 1) -> None:
+    """Draw one box a method and round, side by side, from a first round on."""
     width = 0.8 / max(len(by_round), 1)
     for k, (method, values) in enumerate(by_round.items()):
-        place = np.arange(len(values)) + 1 + (k - (len(by_round) - 1) / 2) * width
+        place = np.arange(len(values)) + first + (k - (len(by_round) - 1) / 2) * width
         color = COLORS[method]  # pyright: ignore
         axes.boxplot(
             values,

@@ -17,11 +17,11 @@ from benchmarks.pouring.bank import Rows, read_parts
 from benchmarks.pouring.likelihood import (
     ImageLikelihood,
     components,
-    cross_validated,
     doubted,
     observed,
     thumbnails,
 )
+from benchmarks.pouring.power import cross_validated
 from benchmarks.pouring.reference import abc_log_prob
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task

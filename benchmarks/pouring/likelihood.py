@@ -45,23 +45,22 @@ from sbi_active.inference.emulation.statistics import Statistic, learned_statist
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import whole_space
 
-__all__ = ["ImageLikelihood", "components", "cross_validated", "grid", "thumbnails"]
+__all__ = ["ImageLikelihood", "components", "doubted", "observed", "thumbnails"]
 
 Array = NDArray[Any]
 
 SIDE = 150  # pixels of an image
 BLOCK = 5  # pixels that a thumbnail averages over
 BLUR = 1.0  # standard deviation, pixels of a thumbnail
-NUM_FOLDS = 5
-NUM_CELLS = 10  # along each parameter, of the grid that left-out pours are judged on
 FEWEST = 24  # pours with a cube in view, to learn a density from
 LEAST = -9.0  # log probability of what no pour of an action did
-POWERS = np.linspace(0, 1.2, 13)
 #: Share of the noise's variance that repeats of an action have in common.
 SHARED = 0.5
 #: Share of outcomes that are taken to tell nothing.
 DOUBT = 0.1
 LOG_SQUARE = -1.27, np.pi**2 / 2  # mean and variance of log chi^2 of one degree
+MOST_SQUARED = 4  # parameters whose squares trends and variances may have
+LEAST_TOLD = 0.03  # share of a parameter's variance that a statistic is kept for
 SLOPE = 0.5  # deviation a priori of coefficients of the noise's log variance
 
 
@@ -79,12 +78,6 @@ def components(pictures: Array, num: int) -> tuple[Array, Array]:
     _, size, axes = np.linalg.svd(pictures - mean, full_matrices=False)
     kept = min(num, int((size > 1e-6 * max(size[0], 1e-30)).sum()))
     return mean, axes[:kept].T
-
-
-def grid(num: int) -> Array:
-    """Return the middles of num^3 cells of [0, 1]^3, the last axis fastest."""
-    line = (np.arange(num) + 0.5) / num
-    return np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -118,12 +111,23 @@ class ImageLikelihood:
     shared: float = SHARED
 
     @staticmethod
-    def fit(theta: Array, summary: Array, is_empty: Array) -> ImageLikelihood:
-        """Learn from pours: theta (n, 3), summaries (n, q), whether empty (n,)."""
+    def fit(
+        theta: Array, summary: Array, is_empty: Array, *, num_wanted: int | None = None
+    ) -> ImageLikelihood:
+        """Learn from pours.
+
+        Args:
+            theta: Parameters, and then what else is known of a pour, within [0, 1],
+                shape (n, d).
+            summary: Shape (n, q).
+            is_empty: Whether no cube is in view, shape (n,).
+            num_wanted: Entries of theta that statistics are learned for, of which those
+                are kept that left-out pours tell; None takes all, and keeps all.
+        """
         z = 2 * theta - 1
         empty = filled = None
         if is_empty.any() and not is_empty.all():
-            pairs, space = np.zeros((0, 2), dtype=bool), whole_space(3)
+            pairs, space = np.zeros((0, 2), dtype=bool), whole_space(z.shape[1])
             empty = TrialOutcome.fit(space, 0, z, is_empty, pairs)
             filled = TrialOutcome.fit(space, 0, z, ~is_empty, pairs)
         seen = ~is_empty
@@ -132,9 +136,14 @@ class ImageLikelihood:
             return ImageLikelihood(
                 None, (), none, none, none, np.eye(1), 5.0, empty, filled
             )
-        statistic, own = learned_statistic(summary[seen], z[seen], seed=0)
+        statistic, own = learned_statistic(
+            summary[seen], z[seen][:, :num_wanted], seed=0
+        )
+        if num_wanted is not None:
+            statistic, own = _that_tell(statistic, own, z[seen][:, :num_wanted])
+        degree = 1 if z.shape[1] > MOST_SQUARED else None
         processes = tuple(
-            GaussianProcess.fit(z[seen], own[:, [j]], noisy=True)
+            GaussianProcess.fit(z[seen], own[:, [j]], noisy=True, degree=degree)
             for j in range(own.shape[1])
         )
         left_out = np.concatenate([p.left_out for p in processes], 1)
@@ -284,39 +293,6 @@ class ImageLikelihood:
         return own - np.asarray(logsumexp(every, axis=1)) + np.log(len(theta))
 
 
-def cross_validated(
-    theta: Array, summary: Array, is_empty: Array
-) -> tuple[ImageLikelihood, Array, Array]:
-    """Return the likelihood with its power, and how left-out pours are told by it.
-
-    Args:
-        theta: Shape (n, 3).
-        summary: Shape (n, q).
-        is_empty: Whether no cube is in view, shape (n,).
-
-    Returns:
-        The likelihood; the log posterior density of each left-out pour's theta from the
-        prior, (n,); and the mass of what is denser than it, (n,).
-    """
-    cells, n = grid(NUM_CELLS), len(theta)
-    log_p = np.zeros((n, len(cells)))
-    for k in range(NUM_FOLDS):
-        out = np.arange(n) % NUM_FOLDS == k
-        fitted = ImageLikelihood.fit(theta[~out], summary[~out], is_empty[~out])
-        seen = [
-            observed(fitted, summary[i], bool(is_empty[i])) for i in np.nonzero(out)[0]
-        ]
-        log_p[out] = fitted.at_each(cells, seen)
-    place = np.minimum((theta * NUM_CELLS).astype(int), NUM_CELLS - 1)
-    index = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)
-    own = log_p[np.arange(len(log_p)), index]
-    score = [_told(power * log_p, power * own)[0].mean() for power in POWERS]
-    power = float(POWERS[int(np.argmax(score))])
-    told, mass = _told(power * log_p, power * own)
-    whole = ImageLikelihood.fit(theta, summary, is_empty)
-    return replace(whole, power=power), told, mass
-
-
 def observed(likelihood: ImageLikelihood, summary: Array, is_empty: bool) -> Any:
     """Return what :meth:`ImageLikelihood.at` takes of a summary (q,)."""
     if is_empty or likelihood.statistic is None:
@@ -362,8 +338,22 @@ def repeated(
     return mean, np.sqrt(alone + common)
 
 
+def _that_tell(statistic: Statistic, own: Array, z: Array) -> tuple[Statistic, Array]:
+    """Return the statistics that tell of their parameter, at least the best."""
+    if statistic.weight is None:  # few numbers, which stay as they are
+        return statistic, own
+    told = 1 - ((z - own) ** 2).mean(0) / z.var(0)
+    keep = told >= min(LEAST_TOLD, told.max())
+    fewer = replace(
+        statistic, weight=statistic.weight[:, keep], offset=statistic.offset[keep]
+    )
+    return fewer, own[:, keep]
+
+
 def _quadratic(z: Array) -> Array:
-    """Return linear and quadratic terms, (n, 3) -> (n, p)."""
+    """Return linear and, of few parameters, quadratic terms, (n, d) -> (n, p)."""
+    if z.shape[1] > MOST_SQUARED:
+        return z
     row, column = np.triu_indices(z.shape[1])
     return np.concatenate([z, z[:, row] * z[:, column]], 1)
 
@@ -374,18 +364,6 @@ def _log_variance(features: Array, residual: Array) -> Array:
     target = np.log(residual**2 + 1e-6 * (residual**2).mean(0)) - mean
     gram = features.T @ features / variance + np.eye(features.shape[1]) / SLOPE**2
     return np.linalg.solve(gram, features.T @ (target - target.mean(0)) / variance)
-
-
-def _told(log_p: Array, own: Array) -> tuple[Array, Array]:
-    """Return log density of the truth, and the mass of what is denser, (n,).
-
-    Args:
-        log_p: At cells of the prior, shape (n, m).
-        own: At the truth, shape (n,).
-    """
-    total: Array = np.asarray(logsumexp(log_p, 1))
-    mass = np.where(log_p > own[:, None], np.exp(log_p - total[:, None]), 0).sum(1)
-    return own - total + np.log(log_p.shape[1]), mass
 
 
 def _student(square: Array, q: int) -> tuple[float, float]:

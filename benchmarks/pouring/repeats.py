@@ -21,7 +21,8 @@ import numpy as np
 from benchmarks.pouring.bank import AT_A_THETA
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.learned import ByAction, Learned, kept
-from benchmarks.pouring.likelihood import doubted, grid
+from benchmarks.pouring.likelihood import doubted
+from benchmarks.pouring.power import grid
 from sbi_active.plots import as_table
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of

@@ -110,7 +110,11 @@ TABLES = {
     "sbi's own tests with the class swapped": (
         "benchmarks.table sbi_suite/result.json --only date sbi original* swapped*",
     ),
-    "Pouring": ("benchmarks.pouring.run --summary",),
+    "Pouring": (
+        "benchmarks.pouring.run --summary",
+        "benchmarks.pouring.material.run --summary",
+        "benchmarks.pouring.loop.run --summary",
+    ),
 }
 
 

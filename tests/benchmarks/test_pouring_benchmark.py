@@ -12,13 +12,12 @@ from benchmarks.pouring.figures import log_prob_figure, selected_figure
 from benchmarks.pouring.likelihood import (
     ImageLikelihood,
     components,
-    cross_validated,
     doubted,
-    grid,
     observed,
     repeated,
     thumbnails,
 )
+from benchmarks.pouring.power import cross_validated, grid
 from benchmarks.pouring.reference import abc_log_prob
 from sbi_active.tasks import get_task  # pyright: ignore
 
@@ -161,15 +160,16 @@ def test_noise_that_grows_with_theta_is_seen():
 def test_a_bank_of_repeats_pours_each_theta_again():
     pytest.importorskip("pybullet")
     task = get_task("pouring")
-    theta, action, seeds = draw(task, "repeats", 0)
+    rows = draw(task, "repeats", 0)
+    theta, action, seeds = rows.theta, rows.action, rows.seeds
     assert len(seeds.unique()) == ROWS_A_FILE
     for k in range(0, ROWS_A_FILE, AT_A_THETA):
         assert len(theta[k : k + AT_A_THETA].unique(dim=0)) == 1
         assert len(action[k : k + AT_A_THETA].unique(dim=0)) == 1
     assert len(theta.unique(dim=0)) == ROWS_A_FILE // AT_A_THETA
-    _, action, _ = draw(task, "likely", 0)
+    action = draw(task, "likely", 0).action
     assert len(action.unique(dim=0)) == len(LIKELY)
-    first, again = draw(task, "prior", 0)[0], draw(task, "prior", 0)[0]
+    first, again = draw(task, "prior", 0).theta, draw(task, "prior", 0).theta
     assert torch.equal(first, again)
     assert len(first.unique(dim=0)) == ROWS_A_FILE
 

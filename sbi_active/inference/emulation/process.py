@@ -85,7 +85,14 @@ class GaussianProcess:
         return self.scale * np.sqrt(self.noise_variance * self.inflation)
 
     @staticmethod
-    def fit(u: Array, y: Array, *, noisy: bool, kind: Kind = "smooth") -> Any:
+    def fit(
+        u: Array,
+        y: Array,
+        *,
+        noisy: bool,
+        kind: Kind = "smooth",
+        degree: Literal[1, 2] | None = None,
+    ) -> Any:
         """Return the process of inputs (n, D) and outputs (n, q), n >= 2.
 
         Args:
@@ -93,11 +100,15 @@ class GaussianProcess:
             y: Outputs.
             noisy: Whether y has noise, whose variance is then learned.
             kind: Of the kernel.
+            degree: Of the trend; None takes a quadratic one where rows are twice its
+                features, which of many inputs and much noise is too many.
         """
         shift, scale = y.mean(0), y.std(0)
         size = np.abs(y).max(0)
         scale = np.where(scale > 1e-6 * size, scale, np.maximum(size, 1e-30))
-        degree = 2 if len(u) >= ROWS_A_FEATURE * num_features(u.shape[1]) else 1
+        if degree is None:
+            enough = len(u) >= ROWS_A_FEATURE * num_features(u.shape[1])
+            degree = 2 if enough else 1
         basis = _features(torch.from_numpy(u), degree).numpy()
         taken_off, rest = np.zeros((basis.shape[1], y.shape[1])), y - shift
         spare = len(u) - basis.shape[1]
@@ -139,17 +150,26 @@ class GaussianProcess:
 
     def predict(self, u: Array) -> tuple[Array, Array]:
         """Return mean and variance without noise at inputs (m, D), both (m, q)."""
-        last = [self.log_amplitude, 0.0]
-        free = torch.from_numpy(np.concatenate([self.log_length, last]))
-        cross = _kernel(
-            torch.from_numpy(u), torch.from_numpy(self.u), free, self.degree, self.kind
-        ).numpy()
-        trend = _features(torch.from_numpy(u), self.degree).numpy()
+        cross, trend = self._beside(u)
         own = (trend**2).sum(1) + np.exp(2 * self.log_amplitude)
         variance = own - ((cross @ self.precision) * cross).sum(1)
         variance = np.maximum(variance, JITTER)[:, None] * self.inflation
         mean = self.shift + trend @ self.taken_off + (cross @ self.weight) * self.scale
         return mean, variance * self.scale**2
+
+    def mean(self, u: Array) -> Array:
+        """Return the mean alone, which costs less, (m, D) -> (m, q)."""
+        cross, trend = self._beside(u)
+        return self.shift + trend @ self.taken_off + (cross @ self.weight) * self.scale
+
+    def _beside(self, u: Array) -> tuple[Array, Array]:
+        """Return the kernel with the rows (m, n), and the trend's features (m, p)."""
+        last = [self.log_amplitude, 0.0]
+        free = torch.from_numpy(np.concatenate([self.log_length, last]))
+        cross = _kernel(
+            torch.from_numpy(u), torch.from_numpy(self.u), free, self.degree, self.kind
+        ).numpy()
+        return cross, _features(torch.from_numpy(u), self.degree).numpy()
 
 
 def num_features(dim: int) -> int:

@@ -21,6 +21,9 @@ LOG_PRECISION_RANGE = (-10.0, 16.0)
 #: Where components of local frames are, one of the global frame starts with a twentieth
 #: of the weight of each.
 GLOBAL_LOGIT = -3.0
+#: From where on batched matrices are faster than products and sums, whose room grows
+#: with the square.
+FEW_DIMENSIONS = 12
 
 
 class MixtureDensityNetwork(ConditionalDensityEstimator):
@@ -245,8 +248,11 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         """Return the log density of v, shape (..., n, K or 1, d), up to a constant."""
         logits, mean, log_diagonal, upper = self._mixture(seen)
         error = v - mean
-        # For few dimensions a product and a sum are faster than batched matrices.
-        z = log_diagonal.exp() * error + (upper * error[..., None, :]).sum(-1)
+        if self._dim <= FEW_DIMENSIONS:  # a product and a sum are faster
+            above = (upper * error[..., None, :]).sum(-1)
+        else:
+            above = torch.einsum("nkij,...nkj->...nki", upper, error)
+        z = log_diagonal.exp() * error + above
         component = log_diagonal.sum(-1) - 0.5 * z.square().sum(-1)
         return (logits + component + log_det).logsumexp(-1) - logits.logsumexp(-1)
 

@@ -17,6 +17,7 @@ def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
     process = GaussianProcess.fit(u, f(u).astype(float), noisy=False)
     mean, variance = process.predict(new)
     assert np.abs(mean - f(new)).max() < 0.5
+    assert np.array_equal(process.mean(new), mean)
     assert np.sqrt(variance).max() < 0.7
     assert np.abs(process.left_out).max() < 0.5
 
@@ -39,3 +40,16 @@ def test_learned_noise_is_that_of_the_outputs():
     y = 3 * u[:, :1] + 0.2 * rng.standard_normal((200, 1))
     process = GaussianProcess.fit(u, y, noisy=True)
     assert float(process.noise_sd[0]) == pytest.approx(0.2, rel=0.2)
+
+
+def test_a_trend_of_fewer_features_misses_left_out_rows_by_less():
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-1, 1, (150, 10))
+    y = 3 * u[:, :1] + 0.5 * rng.standard_normal((150, 1))
+    given, linear = (
+        GaussianProcess.fit(u, y, noisy=True, degree=degree) for degree in (None, 1)
+    )
+    assert (given.degree, linear.degree) == (2, 1)
+    missed = [np.sqrt((p.left_out**2).mean()) for p in (given, linear)]
+    assert missed[1] == pytest.approx(0.5, rel=0.15)
+    assert missed[0] > 1.2 * missed[1]

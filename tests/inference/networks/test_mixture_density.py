@@ -31,6 +31,20 @@ def test_samples_have_the_density():
     assert abs(ratio.mean() - 1) < 4 * error
 
 
+def test_densities_of_many_dimensions_are_those_of_few(monkeypatch):
+    """Above a dimension they go through matrices, and nothing else changes."""
+    theta = torch.randn(100, 14)
+    net = MixtureDensity(hidden_features=(16,))(theta, torch.randn(100, 4))
+    condition, x = torch.randn(5, 4), theta[:7, None].expand(-1, 5, -1)
+    found = net.log_prob(x, condition)
+    monkeypatch.setattr(
+        "sbi_active.inference.networks.mixture_network.FEW_DIMENSIONS", 14
+    )
+    assert torch.allclose(net.log_prob(x, condition), found, rtol=1e-4, atol=1e-4)
+    assert found.shape == (7, 5)
+    assert found.std() > 0.1
+
+
 def test_one_dimensional_density_integrates_to_one():
     net, _ = network(dim=1)
     grid = torch.linspace(4, 6, 200_001)[:, None, None]

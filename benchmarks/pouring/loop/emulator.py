@@ -1,0 +1,283 @@
+r"""Few numbers of a depth image, and how they follow from parameters and effects.
+
+A picture is ten numbers, roots of counts, so that their chaos is about as large where
+much is in view as where little is: how many particles' worth is covered in six bands
+along y, within 3 cm of the middle along x and beyond, and how much volume there is,
+with heights as they are and squared. They are taken with the picture shifted by five
+distances along y, between which the camera's offset interpolates; its gain multiplies
+the volume, and the rest is a Gaussian process over theta and the strengths of the
+effects: one for each action, or one of all, with height and rate as inputs, where pours
+at other heights and rates are learned from too.
+
+What left-out pours miss of it, chaos and error together, is the noise, of the half of
+them that have the weaker effects, as one effect alone is weaker than seven at a time:
+numbers are whitened by its root, and larger still by the factor that leaves one in
+twenty of these pours beyond the chi-square's 95 % point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from torch import Tensor
+
+from benchmarks.pouring.loop.worlds import World, poured_effects
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect
+from sbi_active.inference.emulation.likelihood import correlation_root
+from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.tasks.pouring.raster import NUM_PIXELS, PIXEL
+
+__all__ = ["SHIFTS", "Emulator", "pictures_numbers"]
+
+Array = NDArray[Any]
+
+SHIFTS = (-10, -5, 0, 5, 10)  # pixels along y
+NUM_BANDS = 6
+CORE = 15  # pixels from the middle along x
+COVERED = 0.5  # mm
+HIGHEST = 8.0  # sides of a particle: what is above hangs in the bucket
+OFFSET = 3 / 8  # of a count before its root (Anscombe, Biometrika 1948)
+NUM_NUMBERS = NUM_BANDS + 4
+VOLUME = (NUM_BANDS + 2, NUM_BANDS + 3)  # place of what the gain multiplies
+LIMIT = 0.95  # of the chi-square of left-out pours
+
+
+def pictures_numbers(images: Tensor, side: float) -> Array:
+    """Return the numbers of images (n, 22500) at all shifts, shape (n, 5, 10).
+
+    Args:
+        images: Heights in mm.
+        side: Of a particle, mm, that counts are in units of.
+    """
+    x = images.reshape(-1, NUM_PIXELS, NUM_PIXELS).numpy().astype(np.float64)
+    x = np.where(x > HIGHEST * side, 0, x)
+    pixels = (side / (1e3 * PIXEL)) ** 2
+    found = np.empty((len(x), len(SHIFTS), NUM_NUMBERS))
+    middle = NUM_PIXELS // 2
+    for k, shift in enumerate(SHIFTS):
+        moved = np.zeros_like(x)
+        if shift >= 0:
+            moved[:, :, shift:] = x[:, :, : NUM_PIXELS - shift]
+        else:
+            moved[:, :, :shift] = x[:, :, -shift:]
+        covered = moved > COVERED
+        along = covered.sum(1).reshape(len(x), NUM_BANDS, -1).sum(2)
+        total = covered.sum((1, 2))
+        core = covered[:, middle - CORE : middle + CORE].sum((1, 2))
+        counts = np.stack(
+            [
+                *along.T,
+                core,
+                total - core,
+                moved.sum((1, 2)) / side,
+                (moved**2).sum((1, 2)) / side**2,
+            ],
+            1,
+        )
+        found[:, k] = np.sqrt(counts / pixels + OFFSET)
+    return found
+
+
+def interpolation(offset: Array) -> Array:
+    """Return weights of the shifts at offsets of the camera, m, (n,) -> (n, 5)."""
+    place = np.clip(offset / PIXEL, SHIFTS[0], SHIFTS[-1])
+    weight = np.ones((len(place), len(SHIFTS)))
+    for k, own in enumerate(SHIFTS):
+        for other in SHIFTS:
+            if other != own:
+                weight[:, k] *= (place - other) / (own - other)
+    return weight
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """What the numbers of a world are at its actions.
+
+    Attributes:
+        world: It.
+        scales: Of each poured effect's strength, by keyword.
+        processes: One an action, of the numbers at all shifts; the same for all where
+            they share it.
+        places: What the processes take besides, shape (a, 2), or (a, 0).
+        roots: Whitening of the numbers at each action, shape (a, 10, 10).
+        widened: Factor on the noise, by action.
+    """
+
+    world: World
+    scales: dict[str, float]
+    processes: tuple[GaussianProcess, ...]
+    places: Array
+    roots: Array
+    widened: Array
+
+    @staticmethod
+    def fit(
+        world: World,
+        theta: Tensor,
+        action: Tensor,
+        effects: dict[str, Array],
+        x: Array,
+        *,
+        joint: bool = False,
+    ) -> Emulator:
+        """Learn from pours.
+
+        Args:
+            world: Its actions are the trials'.
+            theta: Shape (n, d).
+            action: Shape (n, 3); the world's, unless ``joint``.
+            effects: By keyword, each of shape (n,).
+            x: Numbers, shape (n, 5, 10).
+            joint: One process for all actions, of one place along y.
+        """
+        scales = {
+            effect.apply.names[0]: float(effect.declared_draws().std())  # type: ignore[attr-defined]
+            for effect in poured_effects(world)
+        }
+        strengths = [effects[name] / scale for name, scale in scales.items()]
+        inputs = np.concatenate(
+            [2 * theta.double().numpy() - 1, np.stack(strengths, 1)], 1
+        )
+        size = np.square(strengths).sum(0)
+        places = np.zeros((len(world.actions), 0))
+        groups = [(action == own).all(1).numpy() for own in world.actions]
+        if joint:
+            places = in_units(world.actions)
+            inputs = np.concatenate([inputs, in_units(action)], 1)
+            groups = [np.ones(len(inputs), dtype=bool)]
+        processes, roots, widened = [], [], []
+        for mine in groups:
+            process = GaussianProcess.fit(
+                inputs[mine], x[mine].reshape(mine.sum(), -1), noisy=True, degree=1
+            )
+            shape = (-1, len(SHIFTS), NUM_NUMBERS)
+            missed = process.left_out.reshape(shape)[:, SHIFTS.index(0)]
+            missed = missed[size[mine] <= np.median(size[mine])]
+            root = np.sqrt((missed**2).mean(0))[:, None] * correlation_root(missed)
+            square = (np.linalg.solve(root, missed.T) ** 2).sum(0)
+            limit = chi2.ppf(LIMIT, NUM_NUMBERS)
+            processes.append(process)
+            roots.append(root)
+            widened.append(max(1.0, float(np.sqrt(np.quantile(square, LIMIT) / limit))))
+        again = len(world.actions) // len(groups)
+        return Emulator(
+            world,
+            scales,
+            tuple(processes * again),
+            places,
+            np.stack(roots * again),
+            np.array(widened * again),
+        )
+
+    def white(self, x: Array, number: int) -> Array:
+        """Return numbers (n, 10) at an action in units of their noise."""
+        return np.linalg.solve(self.widened[number] * self.roots[number], x.T).T
+
+    def observed(self, images: Tensor, number: int) -> Tensor:
+        """Return what the loop compares of images (n, 22500) at an action, (n, 10)."""
+        x = pictures_numbers(images, side_of(self.world))[:, SHIFTS.index(0)]
+        return torch.from_numpy(self.white(x, number)).float()
+
+    def __call__(self, theta: Tensor, action: Tensor, **phi: Any) -> Tensor:
+        """Return whitened numbers, shape (n, 10), without their noise."""
+        num = len(theta)
+        strength = {
+            name: np.broadcast_to(np.asarray(value, float).reshape(-1), num)
+            for name, value in phi.items()
+        }
+        none = np.zeros(num)
+        inputs = np.concatenate(
+            [
+                2 * theta.detach().double().numpy() - 1,
+                np.stack(
+                    [strength.get(k, none) / s for k, s in self.scales.items()], 1
+                ),
+            ],
+            1,
+        )
+        weight = interpolation(strength.get("camera_offset", none))
+        gain = np.sqrt(np.maximum(1 + strength.get("camera_gain", none), 1e-3))
+        found = np.empty((num, NUM_NUMBERS))
+        near = torch.cdist(action.double(), self.world.actions.double()).argmin(1)
+        for number, process in enumerate(self.processes):
+            mine = np.nonzero(near.numpy() == number)[0]
+            if not len(mine):
+                continue
+            place = np.broadcast_to(
+                self.places[number], (len(mine), len(self.places.T))
+            )
+            mean = process.mean(np.concatenate([inputs[mine], place], 1))
+            mean = mean.reshape(len(mine), len(SHIFTS), NUM_NUMBERS)
+            x = (weight[mine][..., None] * mean).sum(1)
+            x[:, VOLUME[0]] *= gain[mine]
+            x[:, VOLUME[1]] *= gain[mine] ** 2
+            found[mine] = self.white(x, number)
+        return torch.from_numpy(found)
+
+    def model(self) -> SimulatorModel:
+        """Return the simulator of the loop, with noise of unit size."""
+
+        def numbers(
+            theta: Tensor,
+            action: Tensor,
+            *,
+            linear_damping: Any = 0.0,
+            angular_damping: Any = 0.0,
+            tilt: Any = 0.0,
+            bucket_y: Any = 0.0,
+            bucket_height: Any = 0.0,
+            cohesion: Any = 0.0,
+            lag: Any = 0.0,
+            camera_offset: Any = 0.0,
+            camera_gain: Any = 0.0,
+        ) -> Tensor:
+            return self(
+                theta,
+                action,
+                linear_damping=linear_damping,
+                angular_damping=angular_damping,
+                tilt=tilt,
+                bucket_y=bucket_y,
+                bucket_height=bucket_height,
+                cohesion=cohesion,
+                lag=lag,
+                camera_offset=camera_offset,
+                camera_gain=camera_gain,
+            )
+
+        names = list(self.world.task.pours.parameter_names)
+        return SimulatorModel(numbers, noise=GaussianNoise(1.0), parameter_names=names)
+
+    def effects(self) -> list[Effect]:
+        """Return the task's effects, as arguments of :meth:`model`."""
+        found = []
+        for effect in self.world.task.effects():
+            keyword = effect.name.replace(" ", "_")
+            if effect.hook == "dynamics":
+                keyword = effect.apply.names[0]
+            found.append(
+                Effect.keyword(
+                    effect.name,
+                    keyword,
+                    prior=effect.prior,
+                    units=effect.units,
+                    family=effect.family,
+                )
+            )
+        return found
+
+
+def in_units(action: Tensor) -> Array:
+    """Return height and rate of actions (n, 3) in units of one, shape (n, 2)."""
+    return (action[:, [0, 2]].double().numpy() - [35.0, 0.9]) / [20.0, 0.7]
+
+
+def side_of(world: World) -> float:
+    """Return the mean side of the model's particles, mm."""
+    return float(2e3 * world.task.pours.particles.half.mean())

@@ -1,0 +1,125 @@
+"""The residual of a set over the picture, before and after an effect is added.
+
+    python -m benchmarks.pouring.loop.picture --bank FOLDER --case 2 docs/pouring
+    python -m benchmarks.pouring.loop.picture --bank FOLDER --kind material docs/pouring
+
+The loop compares few numbers; here the simulator itself pours draws of the posterior of
+the bare model, and of the verdict's, and the mean picture is taken off that of the set,
+in units of the chaos of both, in squares of 1 cm.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.pouring.loop.run import (
+    FIRST,
+    KINDS,
+    WORLD_OF,
+    criticized,
+    pour_set,
+    poured,
+)
+from benchmarks.pouring.loop.worlds import get_world
+from sbi_active.plots import save
+from sbi_active.seeding import derive_seed
+
+__all__ = ["blocks", "residual_figure", "standardized"]
+
+NUM_POURS = 12
+BLOCK = 5  # pixels, 1 cm
+FLOOR = 0.05  # mm, of the deviation of a square's mean height
+
+
+def blocks(images: Tensor) -> np.ndarray:
+    """Return mean heights of squares of 1 cm, (n, 22500) -> (n, 30, 30)."""
+    side = 150 // BLOCK
+    x = images.reshape(-1, side, BLOCK, side, BLOCK).mean((2, 4))
+    return x.double().numpy()
+
+
+def standardized(real: np.ndarray, simulated: np.ndarray) -> np.ndarray:
+    """Return the difference of means over its deviation, (n, ..), (m, ..) -> (..)."""
+    variance = simulated.var(0, ddof=1) + FLOOR**2
+    spread = np.sqrt(variance * (1 / len(real) + 1 / len(simulated)))
+    return (real.mean(0) - simulated.mean(0)) / spread
+
+
+def simulated_images(
+    kind: str, case: int, number: int, evidence: Any, names: tuple[str, ...]
+) -> Tensor:
+    """Return pours of posterior draws of a model at an action, shape (12, 22500)."""
+    world = get_world(WORLD_OF[kind])
+    pick = np.random.default_rng(case).choice(len(evidence.draws), NUM_POURS)
+    dim = len(world.task.pours.parameter_names)
+    found = []
+    for k, draw in enumerate(np.asarray(evidence.draws)[pick]):
+        theta = torch.from_numpy(draw[:dim]).float().clamp(0, 1)
+        seed = torch.tensor([derive_seed(FIRST[kind] + case, "picture", k)])
+        effects = dict(zip(names, draw[dim:].tolist(), strict=True))
+        action = world.actions[number][None]
+        found.append(poured(world, theta, action, seed, effects)[0])
+    return torch.stack(found)
+
+
+def residual_figure(bank: Path, kind: str, case: int, number: int) -> Any:
+    """Return the picture of a set at an action, and what models leave of it."""
+    from matplotlib.figure import Figure
+
+    criticism, report, truth = criticized(bank, kind, case)
+    tracing = criticism.trace()
+    action, images, _, _ = pour_set(kind, case)
+    here = (action == get_world(WORLD_OF[kind]).actions[number]).all(1)
+    real = blocks(images[here])
+    chosen = tuple(tracing.chosen)
+    models: list[tuple[str, str, tuple[str, ...]]] = [("bare model", "none", ())]
+    if chosen:
+        models.append((f"with {report.verdict}", " + ".join(chosen), chosen))
+    panels = [("of the set", real.mean(0), "height")]
+    for title, name, effects in models:
+        evidence = tracing.evidences[name]
+        x = blocks(simulated_images(kind, case, number, evidence, effects))
+        panels.append((title, x.mean(0), "height"))
+        panels.append((f"residual, {title}", standardized(real, x), "sd"))
+    figure = Figure(figsize=(3.1 * len(panels), 3.1), layout="constrained")
+    top = max(panel.max() for _, panel, unit in panels if unit == "height")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for own, (title, panel, unit) in zip(axes, panels, strict=True):
+        scale = {"vmin": 0, "vmax": top, "cmap": "viridis"}
+        if unit == "sd":
+            scale = {"vmin": -6, "vmax": 6, "cmap": "RdBu_r"}
+        drawn = own.imshow(panel, extent=(-15, 15, 15, -15), **scale)
+        own.set_title(title, fontsize=8)
+        own.set_xlabel("y [cm]", fontsize=8)
+        own.tick_params(labelsize=7)
+        label = "mean height [mm]" if unit == "height" else "sd of the chaos"
+        figure.colorbar(drawn, ax=own, shrink=0.7).set_label(label, fontsize=7)
+    axes[0].set_ylabel("x [cm]", fontsize=8)
+    strength = f" {float(truth['phi']):.3g}" if kind == "hidden" else ""
+    figure.suptitle(f"{truth['truth']}{strength}: verdict {report.verdict}", fontsize=9)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The residual over the picture.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--bank", type=Path, required=True)
+    parser.add_argument("--kind", choices=KINDS, default="hidden")
+    parser.add_argument("--case", type=int, default=0)
+    parser.add_argument("--action", type=int, default=0, help="which, of the world's")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    figure = residual_figure(
+        arguments.bank, arguments.kind, arguments.case, arguments.action
+    )
+    save(figure, str(arguments.folder / f"residual_{arguments.kind}.png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""What the closed loop said of images, from the rows of a run."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.pouring.summary import Rows
+from sbi_active.plots import as_table
+
+__all__ = ["summarize"]
+
+
+def summarize(rows: Rows) -> str:
+    """Return one line a set and the counts."""
+    if not rows:
+        return "no sets yet"
+    table = [
+        [
+            f"{r['kind']} {r['case']}",
+            r["truth"] + (f" {float(r['phi']):.3g}" if r["kind"] == "hidden" else ""),
+            r["verdict"],
+            f"{float(r['log_bayes']):.1f}",
+            f"{float(r['p_truth']):.2f}" if r["kind"] == "hidden" else "",
+            f"{float(r['rmse_before']):.2f} -> {float(r['rmse_after']):.2f}",
+            f"{float(r['cpu_seconds']):.0f}",
+        ]
+        for r in rows
+    ]
+    header = ["set", "truth", "verdict", "log Bayes factor", "P(truth)"]
+    header += ["held-out error, sd", "CPU s"]
+    lines = [as_table(table, header), ""]
+    hidden, clean, material = (
+        [r for r in rows if r["kind"] == kind]
+        for kind in ("hidden", "clean", "material")
+    )
+    if clean:
+        alarms = sum(r["alarm"] == "True" for r in clean)
+        lines.append(f"clean sets: {alarms} false alarms of {len(clean)}")
+    if hidden:
+        found = [r for r in hidden if r["alarm"] == "True"]
+        top = sum(r["place"] == "1" for r in found)
+        ratio = [float(r["rmse_after"]) / float(r["rmse_before"]) for r in found]
+        middle = f"{np.median(ratio):.2f}" if ratio else "-"
+        lines.append(
+            f"hidden sets: {len(found)} of {len(hidden)} alarms; the effect, or one no "
+            f"action separates from it, first in {top} of these; error after / before, "
+            f"median {middle}"
+        )
+    if material:
+        said = sum("unexplained" in r["verdict"] for r in material)
+        alarms = sum(r["alarm"] == "True" for r in material)
+        lines.append(
+            f"material: {alarms} of {len(material)} alarms, 'unexplained' in {said}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,79 @@
+"""Pours of the eight-parameter model, behind campaigns on a material.
+
+    python -m benchmarks.pouring.material.bank FOLDER --part prior --rows 300
+    python -m benchmarks.pouring.material.bank FOLDER --part compared --rows 150
+    python -m benchmarks.pouring.material.bank FOLDER --report
+
+Rows of ``prior`` are shared out by where the bucket stands: half of them at p = 0, two
+fifths at -30 cm, a tenth at 30 cm, from where next to nothing comes into view; a
+quarter at the slow rate, which costs twice as much. ``compared`` pours where the paper
+compares images. Files and their resumption are those of ``benchmarks.pouring.bank``.
+One bank serves beads and gravel: where all particles have one density it cancels.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill, report
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
+
+__all__ = ["draw"]
+
+PARTS = ("prior", "compared")
+PLACES, PLACE_SHARES = (-30.0, 0.0, 30.0), (0.4, 0.5, 0.1)
+RATE_SHARES = (0.25, 0.375, 0.375)
+
+
+def draw(task: Any, part: str, number: int) -> Drawn:
+    """Return parameters, actions and seeds of a file of rows."""
+    seed = derive_seed(0, "material bank", part, number)
+    with forked_generators(seed):
+        theta = task.prior.sample(torch.Size([ROWS_A_FILE]))
+    rng = np.random.default_rng(seed)
+    action = np.stack(
+        [
+            rng.choice(HEIGHTS, ROWS_A_FILE),
+            rng.choice(PLACES, ROWS_A_FILE, p=PLACE_SHARES),
+            rng.choice(RATES, ROWS_A_FILE, p=RATE_SHARES),
+        ],
+        1,
+    )
+    if part == "compared":
+        action = np.tile(COMPARED_AT, (ROWS_A_FILE, 1))
+    return Drawn(theta, torch.tensor(action).float(), row_seeds(seed, ROWS_A_FILE))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Pours of the eight-parameter model.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--part", choices=[*PARTS], default="prior")
+    parser.add_argument("--rows", type=int, default=300)
+    parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
+    parser.add_argument("--report", action="store_true", help="simulate nothing")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if not arguments.report:
+        mine, of = map(int, arguments.share.split("/"))
+        task: Any = get_task("pouring_real")
+        fill(
+            arguments.folder,
+            arguments.part,
+            arguments.rows,
+            (mine, of),
+            task.pours,
+            partial(draw, task),
+        )
+    print(report(arguments.folder, arguments.part))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,265 @@
+r"""What campaigns on a material know of each action and summary, and what they believe.
+
+As in ``benchmarks.pouring.learned``, with eight parameters and fewer pours: one
+likelihood for each place of the bucket along y and summary, which takes the height and
+the rate beside theta, and a belief by weights on points of the prior.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import qmc
+from torch import Tensor
+
+from benchmarks.pouring.bank import read, read_parts
+from benchmarks.pouring.learned import (
+    NUM_ALL,
+    NUM_COMPONENTS,
+    NUM_OUTER,
+    Earlier,
+    Learned,
+    summaries_of,
+)
+from benchmarks.pouring.likelihood import (
+    ImageLikelihood,
+    components,
+    doubted,
+    observed,
+)
+from benchmarks.pouring.power import best_power, told_by
+from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring import images_of, intersection_volume
+from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
+from sbi_active.tasks.pouring.task import PLACES
+
+__all__ = ["ByPlace", "Overlap", "PointBelief", "compared_pours", "kept", "learn"]
+
+Array = NDArray[Any]
+
+NUM_PARAMETERS = 8
+LOG_NUM_POINTS = 14
+NUM_FOLDS = 3
+NUM_DRAWS = 1_000  # of the prior, that left-out pours are judged on
+PARTS = ("prior", "compared")
+
+
+class PointBelief:
+    """A belief as weights on 16,384 points that fill the prior evenly.
+
+    Args:
+        log_weight: Up to a constant, shape (n,).
+    """
+
+    def __init__(self, log_weight: Array) -> None:
+        self.log_weight = log_weight - logsumexp(log_weight)
+
+    @staticmethod
+    def points() -> Array:
+        """Return the points, of Sobol's sequence, shape (n, 8)."""
+        sobol = qmc.Sobol(NUM_PARAMETERS, seed=0)  # pyright: ignore[reportCallIssue]
+        return sobol.random_base2(LOG_NUM_POINTS)
+
+    @classmethod
+    def uniform(cls) -> PointBelief:
+        """Return the prior."""
+        return cls(np.zeros(2**LOG_NUM_POINTS))
+
+    @property
+    def effective(self) -> float:
+        """Effective number of points."""
+        return float(np.exp(-logsumexp(2 * self.log_weight)))
+
+    def sample(self, num: int, seed: int) -> Array:
+        """Return draws, shape (num, 8)."""
+        rng = np.random.default_rng(seed)
+        return self.points()[rng.choice(2**LOG_NUM_POINTS, num, p=self.weight)]
+
+    @property
+    def weight(self) -> Array:
+        """Shape (n,), of sum 1."""
+        weight = np.exp(self.log_weight)
+        return weight / weight.sum()
+
+
+def beside(theta: Array, action: Array) -> Array:
+    """Return theta (n, 8) beside height and rate, which are scaled to [0, 1]."""
+    low, high = np.array([HEIGHTS[0], RATES[0]]), np.array([HEIGHTS[-1], RATES[-1]])
+    scaled = (np.atleast_2d(action)[:, [0, 2]] - low) / (high - low)
+    return np.concatenate([theta, np.broadcast_to(scaled, (len(theta), 2))], 1)
+
+
+@dataclass(frozen=True)
+class ByPlace:
+    """Likelihoods of their own for each place of the bucket and summary.
+
+    Attributes:
+        learned: By delta, and by place along y.
+        actions: Shape (27, 3).
+    """
+
+    learned: list[dict[float, Learned]]
+    actions: Tensor
+
+    def gains(
+        self, belief: PointBelief, earlier: Earlier, seed: int
+    ) -> tuple[Array, Array]:
+        """Return gains by delta and action, nats, and their errors, on common draws."""
+        theta = belief.sample(NUM_ALL, seed)
+        values = np.array(
+            [
+                [
+                    self.at(delta, number).likelihood.gain(
+                        beside(theta, action.double().numpy()),
+                        NUM_OUTER,
+                        np.random.default_rng(seed),
+                        earlier[delta, number],
+                    )
+                    for number, action in enumerate(self.actions)
+                ]
+                for delta in range(len(self.learned))
+            ]
+        )
+        return values.mean(2), values.std(2) / np.sqrt(NUM_OUTER)
+
+    def at(self, delta: int, number: int) -> Learned:
+        """Return what is learned for an action."""
+        return self.learned[delta][float(self.actions[number, 1])]
+
+    def log_likelihood(
+        self, theta: Array, image: Tensor, delta: int, number: int, earlier: Earlier
+    ) -> Array:
+        """Return log densities of an image, shape (n,), and remember it.
+
+        Args:
+            theta: Spread as the prior is, shape (n, 8).
+            image: Shape (22500,).
+            delta: Of the summary.
+            number: Of the action.
+            earlier: Statistics of earlier trials, to which its own are added.
+        """
+        own = self.at(delta, number)
+        seen = own.seen(image, delta)
+        known = beside(theta, self.actions[number].double().numpy())
+        found = own.likelihood.at(known, seen, earlier[delta, number])
+        if seen is not None and len(seen):
+            earlier[delta, number].append(seen)
+        return doubted(found, own.likelihood.power)
+
+
+def cross_validated(
+    theta: Array, action: Array, summary: Array, is_empty: Array
+) -> tuple[ImageLikelihood, Array, Array]:
+    """Return the likelihood of a place, and how left-out pours are told by it.
+
+    Args:
+        theta: Shape (n, 8).
+        action: Shape (n, 3).
+        summary: Shape (n, q).
+        is_empty: Whether no cube is in view, shape (n,).
+    """
+    draws = np.random.default_rng(0).random((NUM_DRAWS, NUM_PARAMETERS))
+    both, num = beside(theta, action), len(theta)
+    log_p, own = np.zeros((num, NUM_DRAWS)), np.zeros(num)
+    for k in range(NUM_FOLDS):
+        out = np.arange(num) % NUM_FOLDS == k
+        fitted = ImageLikelihood.fit(
+            both[~out], summary[~out], is_empty[~out], num_wanted=NUM_PARAMETERS
+        )
+        for one in np.unique(action[out], axis=0):
+            mine = np.nonzero(out & (action == one).all(1))[0]
+            seen = [observed(fitted, summary[i], bool(is_empty[i])) for i in mine]
+            log_p[mine] = fitted.at_each(beside(draws, one), seen)
+            own[mine] = np.diag(fitted.at_each(both[mine], seen))
+    power = best_power(log_p, own)
+    told, mass = told_by(power * log_p, power * own)
+    whole = ImageLikelihood.fit(both, summary, is_empty, num_wanted=NUM_PARAMETERS)
+    return replace(whole, power=power), told, mass
+
+
+def learn(folder: Path) -> ByPlace:
+    """Return what is learned of a bank."""
+    task: Any = get_task("pouring_real")
+    rows = read_parts(folder, PARTS)
+    mesh, small = summaries_of(rows, task)
+    theta, action = rows.theta.double().numpy(), rows.action.double().numpy()
+    found: list[dict[float, Learned]] = [{}, {}]
+    for place in PLACES:
+        mine = action[:, 1] == place
+        is_empty = np.asarray(~mesh[mine].any(1))
+        mean, axes = components(small[mine], NUM_COMPONENTS)
+        both = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
+        for delta, summary in enumerate(both):
+            learned = cross_validated(theta[mine], action[mine], summary, is_empty)
+            found[delta][place] = Learned(
+                learned[0], int(mine.sum()), *learned[1:], mean, axes
+            )
+    return ByPlace(found, task.actions.values)
+
+
+def kept(bank: Path, path: Path | None) -> ByPlace:
+    """Return what is learned of a bank, from a file of our own where there is one."""
+    if path is not None and path.exists():
+        return pickle.loads(path.read_bytes())
+    learned = learn(bank)
+    if path is not None:
+        path.write_bytes(pickle.dumps(learned))
+    return learned
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What a pour of the model shares with pours of the material, as theta tells.
+
+    Attributes:
+        process: Of the intersection volume, mm summed over pixels, without the chaos.
+        mean_of_prior: Mean over the pours behind it, which are from the prior.
+        explained: Share of the variance of left-out pours.
+        num: Pours behind it.
+    """
+
+    process: GaussianProcess
+    mean_of_prior: float
+    explained: float
+    num: int
+
+    @staticmethod
+    def fit(theta: Array, volume: Array) -> Overlap:
+        """Learn from pours: theta (n, 8) and volumes (n,)."""
+        process = GaussianProcess.fit(
+            2 * theta - 1, volume[:, None], noisy=True, degree=1
+        )
+        missed = float((process.left_out**2).mean() / volume.var())
+        return Overlap(process, float(volume.mean()), 1 - missed, len(theta))
+
+    def mean(self, belief: PointBelief) -> float:
+        """Return the expectation under a belief: InterVol of all its draws."""
+        return float(belief.weight @ self.at_points)
+
+    @cached_property
+    def at_points(self) -> Array:
+        """What it is at the points of a belief, shape (n,)."""
+        return self.process.predict(2 * PointBelief.points() - 1)[0][:, 0]
+
+
+def compared_pours(folder: Path, real: Tensor) -> Overlap:
+    """Return the overlap with images of a material, shape (k, 22500), at the mean."""
+    task: Any = get_task("pouring_real")
+    theta, volume = [], []
+    for part in PARTS:
+        rows = read(folder, part)
+        mine = (rows.action - torch.tensor(COMPARED_AT)).abs().amax(1) < 1e-5
+        images = images_of(rows.poses[mine.numpy()], task.pours.particles)
+        each = [intersection_volume(one, images) for one in real]
+        theta.append(rows.theta[mine].double().numpy())
+        volume.append(torch.stack(each).mean(0).double().numpy())
+    return Overlap.fit(np.concatenate(theta), np.concatenate(volume))
