@@ -86,5 +86,8 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": ["sphinx-version"],
 }
+# Pages without others below them have nothing to navigate in a section.
+ALONE = ("start", "overview", "architecture", "bibliography", "changelog")
+html_sidebars: dict[str, list[str]] = {page: [] for page in ALONE}
 html_context = {"default_mode": "auto"}
 copybutton_exclude = ".linenos, .gp, .go"

@@ -82,7 +82,7 @@ calibration = check_calibration(inference, model, actions=actions, num_simulatio
 print(calibration)
 
 # %%
-calibration.plot()
+_ = calibration.plot()
 # %% [markdown]
 # A network of 300 steps and few rows is quick, and what it loses is said. Refined
 # beliefs are checked by `check_belief`: see [can it be trusted](../trust.md).
