@@ -48,7 +48,7 @@ nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE / "_build" / "notebooks")
 nb_execution_in_temp = True
-nb_execution_timeout = 300
+nb_execution_timeout = 900  # s; a cell takes seconds, on a busy machine minutes
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
@@ -86,5 +86,8 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": ["sphinx-version"],
 }
+# Pages without others below them have nothing to navigate in a section.
+ALONE = ("start", "overview", "architecture", "bibliography", "changelog")
+html_sidebars: dict[str, list[str]] = {page: [] for page in ALONE}
 html_context = {"default_mode": "auto"}
 copybutton_exclude = ".linenos, .gp, .go"

@@ -66,7 +66,7 @@ TABLES = {
         "benchmarks.box_collision.run --summary",
         "benchmarks.box_collision.run --summary --table coverage --rounds 3",
         "benchmarks.box_collision.run --summary --setting learned "
-        "--methods asbi nsbi alhi nlhi --trials 3",
+        "--methods asbi nsbi alhi nlhi --trials 10",
         "benchmarks.table box_collision/speed.json",
     ),
     "The closed loop, on worlds whose truth is known": (

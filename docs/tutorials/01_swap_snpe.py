@@ -78,7 +78,7 @@ print(belief.diagnostics)
 # The picture shows what each action was expected to tell in the last round:
 
 # %%
-design.plot().set_title("expected information of each action, second trial")
+_ = design.plot().set_title("expected information of each action, second trial")
 
 # %% [markdown]
 # A [campaign](03_your_own_robot.py) does these steps by itself.

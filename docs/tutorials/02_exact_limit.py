@@ -52,7 +52,7 @@ figure, ax = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 first.plot(ax)
 ax.plot(task.actions.values[:, 0], gain, color="C1", label="exact")
 ax.set(title="what the first trial tells")
-ax.legend()
+_ = ax.legend()
 
 # %% [markdown]
 # Where candidates far behind were dropped early, their estimates are rough: a design

@@ -94,7 +94,7 @@ campaign.correct(2, robot(campaign.history[2].action, 2), reason="read the wrong
 print(campaign.update())
 
 # %%
-campaign.plot(theta_true=truth[0])
+_ = campaign.plot(theta_true=truth[0])
 # %%
 campaign.to_dataframe()[["speed [m/s]", "distance", "information_gained", "health"]]
 

@@ -27,7 +27,7 @@ belief = campaign.update()
 print(belief)
 
 # %%
-campaign.plot(theta_true=task.theta_true, num_predicted=16)
+_ = campaign.plot(theta_true=task.theta_true, num_predicted=16)
 # %% [markdown]
 # What limits the belief is said with it. Two pushes determine the density and leave
 # the two frictions wide; six do more, see the committed result.

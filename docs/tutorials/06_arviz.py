@@ -43,12 +43,12 @@ az.summary(data, kind="stats")
 print(campaign.belief.diagnostics)
 
 # %%
-az.plot_pair(data, var_names=["theta"], kind="kde", figsize=(5, 4))
+_ = az.plot_pair(data, var_names=["theta"], kind="kde", figsize=(5, 4))
 # %% [markdown]
 # The posterior predictive beside what was observed:
 
 # %%
-az.plot_ppc(data, num_pp_samples=50, figsize=(6, 3.5))
+_ = az.plot_ppc(data, num_pp_samples=50, figsize=(6, 3.5))
 
 # %% [markdown]
 # `to_datatree` gives the same as a tree of xarray, which ArviZ 1.x reads and which
@@ -82,7 +82,7 @@ calibration = check_calibration(inference, model, actions=actions, num_simulatio
 print(calibration)
 
 # %%
-calibration.plot()
+_ = calibration.plot()
 # %% [markdown]
 # A network of 300 steps and few rows is quick, and what it loses is said. Refined
 # beliefs are checked by `check_belief`: see [can it be trusted](../trust.md).

@@ -28,7 +28,7 @@ robot = from_mjcf(
     times=[0.3, 0.6, 0.9, 1.2, 1.5],
     noise=0.005,
 )
-robot.simulator, robot.prior, robot.actions
+print(robot.simulator.parameter_names, robot.actions)
 
 # %% [markdown]
 # `from_mjcf` returns what everything else takes: simulator, prior and actions. What no

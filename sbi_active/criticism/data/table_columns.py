@@ -112,14 +112,15 @@ def find_columns(
     needed = [] if of_inputs else ["x"]
     if not (of_inputs or has_inputs or found["input"]):
         needed = ["action", "x"]
-    for key in needed:
-        if not found[key]:
-            nothing = "; where nothing was set, add a column action_none of ones"
-            raise ValueError(
-                f"expected columns {PREFIXES[key]}*; got {', '.join(names)} in "
-                f"{source}; name them, as in action_speed, x_distance[m]"
-                f"{nothing if key == 'action' else ''}"
-            )
+    missing = [key for key in needed if not found[key]]
+    if missing:
+        nothing = "; where nothing was set, add a column action_none of ones"
+        raise ValueError(
+            f"expected columns {' and '.join(f'{PREFIXES[k]}*' for k in missing)}; got "
+            f"{', '.join(names)} in {source}; name them, as in action_speed, "
+            "x_distance[m], or say which columns are what"
+            f"{nothing if 'action' in missing else ''}"
+        )
     used = [name for group in found.values() for name in group]
     stated = _units(used, names, units or {}, source)
     time = found[TIME][0] if found[TIME] else None

@@ -187,6 +187,7 @@ def read_csv(path: Path) -> pd.DataFrame:
             f"expected a CSV file; got none at {path}; check the path"
         )
     try:
+        _require_commas(path)
         table = pd.read_csv(
             path,
             header=None,
@@ -195,17 +196,44 @@ def read_csv(path: Path) -> pd.DataFrame:
             comment="#",
             encoding="utf-8-sig",
         )
-    except pd.errors.EmptyDataError:
-        table = pd.DataFrame([[""]])
-    except pd.errors.ParserError as error:
+    except UnicodeDecodeError as error:
         raise ValueError(
-            f"expected a CSV file with as many cells in each row as in the first; got "
-            f"{error} in {path}; check the commas"
+            f"expected text in UTF-8; got other bytes in {path}; save the table as CSV "
+            "in UTF-8"
         ) from error
-    header = [str(c).strip() for c in table.iloc[0]]
-    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+    except pd.errors.EmptyDataError as error:
         raise ValueError(
-            f"expected cells separated by commas; got {header[0]!r} in {path}; save "
-            "the table with commas"
-        )
+            f"expected names of columns and rows; got nothing in {path}; write the "
+            "table"
+        ) from error
+    except pd.errors.ParserError as error:
+        raise ValueError(_uneven(str(error), path)) from error
+    header = [str(c).strip() for c in table.iloc[0]]
     return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)
+
+
+def _require_commas(path: Path) -> None:
+    """Raise where the header's cells are parted by something else."""
+    with path.open(encoding="utf-8-sig") as file:
+        lines = (line.strip() for line in file)
+        header = next((line for line in lines if line and line[0] != "#"), "")
+    found = re.search(r"[;\t]", header)
+    if found and "," not in header:
+        options = f"sep={found.group()!r}" + (", decimal=','" * (found.group() == ";"))
+        raise ValueError(
+            f"expected cells separated by commas; got {header!r} in {path}; save the "
+            "table with commas and decimal points, or pass "
+            f"Trials.from_dataframe(pandas.read_csv(path, {options}))"
+        )
+
+
+def _uneven(error: str, path: Path) -> str:
+    """Return what a message says of rows with another number of cells."""
+    told = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", error)
+    num, line, got = told.groups() if told else ("", "", "")
+    return (
+        "expected as many cells in each row as in the first"
+        + (f", {num}; got {got} in line {line} of {path}" if told else "")
+        + ("" if told else f"; got {error.strip()} in {path}")
+        + "; write decimals with a point, and put text that holds a comma in quotes"
+    )

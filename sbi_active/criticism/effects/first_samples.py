@@ -280,9 +280,11 @@ def _first(
     t, x = t[seen], x[seen]
     kept = t - t[:1] < within
     if kept.sum() < degree + 1:
+        apart = f", which are {np.median(np.diff(t)):.3g} apart" if len(t) > 1 else ""
         raise ValueError(
             f"expected {degree + 1} or more samples within {within:g} of the first; "
-            f"got {int(kept.sum())} in {trials.called([i])}; pass a larger within"
+            f"got {int(kept.sum())} in {trials.called([i])}{apart}; pass a larger "
+            "within, or name the unit of the times, as in time_ms"
         )
     return t[kept], x[kept]
 

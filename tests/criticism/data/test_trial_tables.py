@@ -168,6 +168,15 @@ SHORT = "trial,time,action_v,x_y"
             "trial;time;action_v;x_y",
             "separated by commas; got 'trial;time",
         ),
+        (["1\t0\t1\t5"], "trial\ttime\taction_v\tx_y", r"by commas.*sep='\\t'\)\)"),
+        (
+            ["1;0,5;1;5,2"],
+            "trial;time;action_v;x_y",
+            "decimal points, or pass .*sep=';', decimal=','",
+        ),
+        (["1,0,5,1,5,2"], SHORT, "first, 4; got 6 in line 2 of trials.csv; write dec"),
+        (["1,0,3,4"], "throw,t,x,y", r"columns action_\* and x_\*; got throw, t, x, y"),
+        ([], "", "names of columns and rows; got nothing in trials.csv"),
         (["1,0,1,"], SHORT, "at least one valid trial"),
     ],
 )
@@ -175,6 +184,23 @@ SHORT = "trial,time,action_v,x_y"
 def test_a_long_table_that_is_not_understood(rows, header, message):
     with pytest.raises(ValueError, match=message):
         read(rows, header)
+
+
+def test_semicolons_are_read_as_the_error_says():
+    with open("trials.csv", "w") as file:
+        file.write("trial;time;action_v;x_y\n1;0,5;1;5,2\n")
+    frame = pd.read_csv("trials.csv", sep=";", decimal=",")
+    trials = Trials.from_dataframe(frame)
+    assert trials.x.tolist() == [[pytest.approx(5.2)]]
+    assert trials.sample_times.tolist() == [[0.5]]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_a_table_in_another_encoding(encoding):
+    with open("trials.csv", "w", encoding=encoding) as file:
+        file.write("action_v,x_y[°]\n1,2\n")
+    with pytest.raises(ValueError, match=r"text in UTF-8; got other bytes in trials"):
+        Trials.from_csv("trials.csv")
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def test_a_loop_finds_what_a_start_at_rest_would_hide():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"within": 0.05}, "2 or more samples within 0.05 of the first; got 1"),
+        ({"within": 0.05}, "0.05 of the first; got 1 .* which are 0.1 apart; pass"),
         ({"start": {"level": 1}}, "axis from 0 to 0; got 1; number"),
         ({"sd": 0.0}, "expected a standard deviation > 0 of the sensor; got 0.0"),
     ],
