@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from scipy.stats import qmc
 from torch import Tensor
 
@@ -37,6 +36,7 @@ from benchmarks.pouring.likelihood import (
 )
 from benchmarks.pouring.power import best_power, told_by
 from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, intersection_volume
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
@@ -61,7 +61,7 @@ class PointBelief:
     """
 
     def __init__(self, log_weight: Array) -> None:
-        self.log_weight = log_weight - logsumexp(log_weight)
+        self.log_weight = log_weight - log_sum_exp(log_weight)
 
     @staticmethod
     def points() -> Array:
@@ -77,7 +77,7 @@ class PointBelief:
     @property
     def effective(self) -> float:
         """Effective number of points."""
-        return float(np.exp(-logsumexp(2 * self.log_weight)))
+        return float(np.exp(-log_sum_exp(2 * self.log_weight)))
 
     def sample(self, num: int, seed: int) -> Array:
         """Return draws, shape (num, 8)."""
