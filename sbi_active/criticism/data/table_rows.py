@@ -207,7 +207,11 @@ def read_csv(path: Path) -> pd.DataFrame:
             "table"
         ) from error
     except pd.errors.ParserError as error:
-        raise ValueError(_uneven(str(error), path)) from error
+        raise ValueError(
+            f"expected as many cells in each row as in the first{_uneven(str(error))} "
+            f"of {path}; write decimals with a point, and put text that holds a comma "
+            "in quotes"
+        ) from error
     header = [str(c).strip() for c in table.iloc[0]]
     return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)
 
@@ -227,13 +231,10 @@ def _require_commas(path: Path) -> None:
         )
 
 
-def _uneven(error: str, path: Path) -> str:
-    """Return what a message says of rows with another number of cells."""
+def _uneven(error: str) -> str:
+    """Return what pandas says of a row with another number of cells."""
     told = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", error)
-    num, line, got = told.groups() if told else ("", "", "")
-    return (
-        "expected as many cells in each row as in the first"
-        + (f", {num}; got {got} in line {line} of {path}" if told else "")
-        + ("" if told else f"; got {error.strip()} in {path}")
-        + "; write decimals with a point, and put text that holds a comma in quotes"
-    )
+    if told is None:
+        return f"; got {error.strip()} in a row"
+    num, line, got = told.groups()
+    return f", {num}; got {got} in line {line}"
