@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -179,27 +179,45 @@ def report(folder: Path, part: str) -> str:
     return f"{part}: {len(rows)} pours, {seconds:.3f} CPU s each at the mean"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Pours from the prior, as poses.")
+def run_command(
+    description: str,
+    option: str,
+    names: Sequence[str],
+    num: int,
+    pours_and_draw: Callable[[str], tuple[Pours, Draw]],
+) -> None:
+    """Fill a part of a folder as the command line says, and print what it holds.
+
+    Args:
+        description: Of the command.
+        option: That names the part, such as "part".
+        names: Of the parts, the first of which is the default.
+        num: Rows by default.
+        pours_and_draw: Returns, of a part, what pours it and what draws its rows.
+    """
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--part", choices=[*PARTS], default="prior")
-    parser.add_argument("--rows", type=int, default=6_000)
+    parser.add_argument(
+        f"--{option}", dest="part", choices=[*names], default=[*names][0]
+    )
+    parser.add_argument("--rows", type=int, default=num)
     parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
     parser.add_argument("--report", action="store_true", help="simulate nothing")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if not arguments.report:
         mine, of = map(int, arguments.share.split("/"))
-        task: Any = get_task("pouring")
-        fill(
-            arguments.folder,
-            arguments.part,
-            arguments.rows,
-            (mine, of),
-            task.pours,
-            partial(draw, task),
-        )
+        pours, drawn = pours_and_draw(arguments.part)
+        fill(arguments.folder, arguments.part, arguments.rows, (mine, of), pours, drawn)
     print(report(arguments.folder, arguments.part))
+
+
+def main() -> None:
+    def pours_and_draw(_: str) -> tuple[Pours, Draw]:
+        task: Any = get_task("pouring")
+        return task.pours, partial(draw, task)
+
+    run_command("Pours from the prior, as poses.", "part", PARTS, 6_000, pours_and_draw)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.pouring.summary import column, label, read
+from benchmarks.pouring.summary import column, label
+from benchmarks.rows import read
 from sbi_active.plots import save
 
 __all__ = ["log_prob_figure", "selected_figure"]

@@ -19,7 +19,6 @@ summary in their place (``network``).
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -34,10 +33,10 @@ from benchmarks.pouring.network import ByNetwork, kept_networks
 from benchmarks.pouring.summary import (
     bank_table,
     coverage_table,
-    read,
     reference_table,
     summarize,
 )
+from benchmarks.rows import append, read
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
@@ -139,7 +138,6 @@ def run_missing(
 ) -> None:
     """Run the trials that are not in the file yet."""
     path = path_of(method, target, arguments)
-    path.parent.mkdir(parents=True, exist_ok=True)
     done = {int(row["seed"]) for row in read(path)}
     for seed in range(arguments.first, arguments.first + arguments.trials):
         if seed in done:
@@ -152,20 +150,10 @@ def run_missing(
             seed,
             arguments.rounds,
         )
-        is_new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            if is_new:
-                writer.writeheader()
-            writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+        append(path, COLUMNS, rows)
         spent = time.process_time() - start
         values = " ".join(f"{row['log_prob_true']:.2f}" for row in rows)
         print(f"{path.stem} {seed}: {values}, {spent:.0f} CPU s", flush=True)
-
-
-def short(value: object) -> object:
-    """Return a number with six digits."""
-    return f"{value:.6g}" if isinstance(value, float) else value
 
 
 def parse() -> argparse.Namespace:

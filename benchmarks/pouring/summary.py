@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,6 @@ __all__ = [
     "column",
     "coverage_table",
     "label",
-    "read",
     "reference_table",
     "summarize",
 ]
@@ -33,14 +30,6 @@ PUBLISHED = {
 }
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV file, none if it is not there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [*csv.DictReader(file)]
 
 
 def column(rows: Rows, key: str, number: int) -> np.ndarray:

@@ -17,7 +17,6 @@ of them (``emulator``). Resumable; one row a set.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from functools import cache
 from pathlib import Path
@@ -31,8 +30,7 @@ from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.loop.emulator import Emulator, pictures_numbers, side_of
 from benchmarks.pouring.loop.summary import summarize
 from benchmarks.pouring.loop.worlds import World, get_world
-from benchmarks.pouring.run import short
-from benchmarks.pouring.summary import read
+from benchmarks.rows import append, read
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Context, Criticism, Report, Trials
 from sbi_active.seeding import derive_seed, forked_generators
@@ -223,12 +221,7 @@ def main() -> None:
                 if (kind, str(case)) in done:
                     continue
                 row = row_of(arguments.bank, kind, case)
-                is_new = not path.exists()
-                with path.open("a", newline="") as file:
-                    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-                    if is_new:
-                        writer.writeheader()
-                    writer.writerow({k: short(v) for k, v in row.items()})
+                append(path, COLUMNS, [row])
                 print(kind, case, row["truth"], "->", row["verdict"], flush=True)
     print(summarize(read(path)))
 

@@ -14,20 +14,19 @@ The eight parameters of "material" are learned from the bank of its campaigns be
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill, report
+from benchmarks.pouring.bank import ROWS_A_FILE, Draw, Drawn, run_command
 from sbi_active.criticism import Effect
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring import Pours
 
 __all__ = ["WORLDS", "World", "draw", "phi_of", "poured_effects"]
 
@@ -87,26 +86,11 @@ def draw(world: World, part: str, number: int) -> Drawn:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Pours with effects.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--world", choices=[*WORLDS], default="cubes")
-    parser.add_argument("--rows", type=int, default=350)
-    parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
-    parser.add_argument("--report", action="store_true", help="simulate nothing")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    if not arguments.report:
-        mine, of = map(int, arguments.share.split("/"))
-        world = get_world(arguments.world)
-        fill(
-            arguments.folder,
-            world.name,
-            arguments.rows,
-            (mine, of),
-            world.task.pours,
-            partial(draw, world),
-        )
-    print(report(arguments.folder, arguments.world))
+    def pours_and_draw(name: str) -> tuple[Pours, Draw]:
+        world = get_world(name)
+        return world.task.pours, partial(draw, world)
+
+    run_command("Pours with effects.", "world", [*WORLDS], 350, pours_and_draw)
 
 
 if __name__ == "__main__":

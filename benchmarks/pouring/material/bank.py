@@ -13,17 +13,16 @@ One bank serves beads and gravel: where all particles have one density it cancel
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill, report
+from benchmarks.pouring.bank import ROWS_A_FILE, Draw, Drawn, run_command
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring import Pours
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
 
 __all__ = ["draw"]
@@ -53,26 +52,12 @@ def draw(task: Any, part: str, number: int) -> Drawn:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Pours of the eight-parameter model.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--part", choices=[*PARTS], default="prior")
-    parser.add_argument("--rows", type=int, default=300)
-    parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
-    parser.add_argument("--report", action="store_true", help="simulate nothing")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    if not arguments.report:
-        mine, of = map(int, arguments.share.split("/"))
+    def pours_and_draw(_: str) -> tuple[Pours, Draw]:
         task: Any = get_task("pouring_real")
-        fill(
-            arguments.folder,
-            arguments.part,
-            arguments.rows,
-            (mine, of),
-            task.pours,
-            partial(draw, task),
-        )
-    print(report(arguments.folder, arguments.part))
+        return task.pours, partial(draw, task)
+
+    text = "Pours of the eight-parameter model."
+    run_command(text, "part", PARTS, 300, pours_and_draw)
 
 
 if __name__ == "__main__":

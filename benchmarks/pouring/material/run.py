@@ -18,7 +18,6 @@ beliefs instead.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections import defaultdict
 from functools import cache
@@ -37,8 +36,9 @@ from benchmarks.pouring.material.learned import (
     compared_pours,
     kept,
 )
-from benchmarks.pouring.material.summary import checks_table, read, summarize
-from benchmarks.pouring.run import TEMPERED, short
+from benchmarks.pouring.material.summary import checks_table, summarize
+from benchmarks.pouring.run import TEMPERED
+from benchmarks.rows import append, read, short
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import intersection_volume
@@ -118,17 +118,6 @@ def poured(belief: PointBelief, material: str, num: int, seed: int) -> np.ndarra
     images = task.pours.images(theta, action, seeds=seeds)
     each = [intersection_volume(real, images) for real in compared_images(material)]
     return torch.stack(each).mean(0).double().numpy()
-
-
-def append(path: Path, columns: list[str], rows: list[dict[str, object]]) -> None:
-    """Add rows to a CSV file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    is_new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        if is_new:
-            writer.writeheader()
-        writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
 
 
 def run_missing(learned: ByPlace, arguments: argparse.Namespace) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
@@ -20,6 +23,8 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.formulas import guess
+
+Array = NDArray[Any]
 
 
 def beside_misfit(
@@ -49,7 +54,7 @@ def beside_misfit(
         The verdict, and the models if it is theirs.
     """
     misfit, timed = None, rivals.measurements.is_sequence
-    several = detection.alarm and len(tracing.chosen) > 1 and not timed
+    several = len(tracing.chosen) > 1 and not timed
     if _is_missed(tracing, detection, rivals) or several:
         # It is no error of a sensor: a process that follows the action is.
         misfit = find_misfit(rivals, equivalent, is_known=True, search=search)
@@ -57,7 +62,7 @@ def beside_misfit(
     if is_bare and (misfit is None or not timed):
         tracing = replace(tracing, guesses=guess(rivals))
     if misfit is None:
-        return (widened(tracing, rivals.seed) if detection.alarm else tracing), None
+        return widened(tracing, rivals.seed, _within(rivals)), None
     if not timed and not misfit.replaces(tracing.verdict):
         return with_intervals(tracing, misfit), None
     rivals.fits.clear()
@@ -65,6 +70,11 @@ def beside_misfit(
     if found.verdict == UNEXPLAINED and not timed:
         found = replace(found, guesses=tracing.guesses)
     return found, misfit
+
+
+def _within(rivals: RivalSet) -> Callable[[ModelKey, Array], Array]:
+    """Return what moves draws of a model into the bounds of its prior."""
+    return lambda key, z: rivals.rival(key).coordinates.within(z)
 
 
 def _is_missed(tracing: Tracing, detection: Detection, rivals: RivalSet) -> bool:

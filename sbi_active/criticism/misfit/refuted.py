@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sbi_active.criticism.results import Evidence, ModelKey, Tracing
+from sbi_active.criticism.results import Estimate, Evidence, ModelKey, Tracing
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.seeding import derive_seed
 
+Array = NDArray[Any]
 
-def widened(tracing: Tracing, seed: int) -> Tracing:
+
+def widened(
+    tracing: Tracing, seed: int, within: Callable[[ModelKey, Array], Array]
+) -> Tracing:
     r"""Return a verdict whose refuted models have draws that know of it.
 
     The posterior of a model that misses the trials is as narrow as the sensor allows,
@@ -23,6 +30,7 @@ def widened(tracing: Tracing, seed: int) -> Tracing:
     Args:
         tracing: With effects as the verdict.
         seed: Of the draws.
+        within: Moves draws of a model, shape (n, k), into the bounds of its prior.
 
     References:
         Birge, Physical Review 40 (1932), for the ratio.
@@ -30,20 +38,28 @@ def widened(tracing: Tracing, seed: int) -> Tracing:
     best = tracing.evidences.get(str(ModelKey(tracing.chosen)))
     if not tracing.chosen or best is None:
         return tracing
-    found = {
-        name: _widened(own, best, derive_seed(seed, "refuted", name))
-        for name, own in tracing.evidences.items()
-    }
-    return replace(tracing, evidences=found)
+    found = dict(tracing.evidences)
+    for name, own in found.items():
+        near = own.log_evidence > best.log_evidence - THRESHOLD
+        if near or own.key.error is not None:
+            continue
+        draws = _widened(own, best, derive_seed(seed, "refuted", name))
+        found[name] = replace(own, draws=within(own.key, draws))
+    estimates = [_estimate(e, found[e.name].draws) for e in tracing.estimates]
+    return replace(tracing, evidences=found, estimates=(*estimates,))
 
 
-def _widened(own: Evidence, best: Evidence, seed: int) -> Evidence:
-    if own.log_evidence > best.log_evidence - THRESHOLD or own.key.error is not None:
-        return own
+def _estimate(estimate: Estimate, draws: Array) -> Estimate:
+    """Return an effect's estimate by the draws of the model that has it alone."""
+    phi = draws[:, -len(estimate.mean) :]
+    return replace(estimate, mean=phi.mean(0), sd=phi.std(0))
+
+
+def _widened(own: Evidence, best: Evidence, seed: int) -> Array:
     ratio = own.best_chi_square / max(best.best_chi_square, 1.0)
     mean = own.draws.mean(0)
     known = dict(zip(best.names, best.draws.mean(0), strict=True))
     apart = np.array([known.get(n, m) for n, m in zip(own.names, mean, strict=True)])
     normal = np.random.default_rng(seed).normal(size=(len(own.draws), 1))
     spread = np.sqrt(max(ratio, 1.0)) * (own.draws - mean)
-    return replace(own, draws=mean + spread + normal * (apart - mean))
+    return mean + spread + normal * (apart - mean)

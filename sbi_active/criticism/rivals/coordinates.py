@@ -91,6 +91,11 @@ class SearchCoordinates:
         t = u * self.scale + self.shift
         return np.where(self.is_log, np.exp(np.where(self.is_log, t, 0.0)), t)
 
+    def within(self, z: Array) -> Array:
+        """Return (theta, phi), natural values of shape (n, k), within their bounds."""
+        low, high = (end[: z.shape[1]] for end in self._bounds())
+        return np.clip(z, low, high)
+
     def split(self, u: Array) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect, as the simulator takes them."""
         z = torch.from_numpy(self.to_z(u))

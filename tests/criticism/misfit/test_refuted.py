@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sbi_active.criticism.misfit.refuted import widened
-from sbi_active.criticism.results import Evidence, ModelKey, Tracing
+from sbi_active.criticism.results import Estimate, Evidence, ModelKey, Tracing
 
 RNG = np.random.default_rng(0)
 
@@ -26,7 +26,11 @@ def evidence(key, names, center, log_z, square):
     )
 
 
-def tracing(*found, chosen=("a",)):
+def anywhere(key, z):
+    return z
+
+
+def tracing(*found, chosen=("a",), estimates=()):
     return Tracing(
         verdict=" + ".join(chosen),
         chosen=chosen,
@@ -36,7 +40,7 @@ def tracing(*found, chosen=("a",)):
         equivalent=(),
         near=(),
         aliases=(),
-        estimates=(),
+        estimates=estimates,
         evidences={e.name: e for e in found},
         robust=True,
     )
@@ -48,7 +52,7 @@ OTHER = evidence(ModelKey(("b",)), ("theta", "b"), [1.5, 0.7], -50.0, 100.0)
 
 
 def test_a_refuted_model_is_spread_as_far_as_what_explains_moves_it():
-    found = widened(tracing(BARE, BEST, OTHER), 0).evidences
+    found = widened(tracing(BARE, BEST, OTHER), 0, anywhere).evidences
     assert found["none"].draws.mean() == pytest.approx(2.0, abs=0.05)
     # Four times as wide by the chi-squares, and a deviation of one apart.
     assert found["none"].draws.std() == pytest.approx(1.0, rel=0.05)
@@ -57,19 +61,47 @@ def test_a_refuted_model_is_spread_as_far_as_what_explains_moves_it():
     assert found["a"] is BEST
 
 
+def test_draws_stay_within_the_prior_and_estimates_follow_them():
+    estimate = Estimate(
+        name="b",
+        family="sensor",
+        units="m",
+        describe="",
+        probability=0.0,
+        log_bayes_factor=50.0,
+        mean=OTHER.draws[:, 1:].mean(0),
+        sd=OTHER.draws[:, 1:].std(0),
+        effective_sample_size=4_000.0,
+        engine="least squares",
+    )
+    found = widened(
+        tracing(BEST, OTHER, estimates=(estimate,)),
+        0,
+        lambda key, z: np.clip(z, [1.2, 0.0], [1.6, 0.71]),
+    )
+    draws = found.evidences["b"].draws
+    assert (draws.min(0) >= [1.2, 0.0]).all()
+    assert (draws.max(0) <= [1.6, 0.71]).all()
+    told = found.estimates[0]
+    assert told.mean == pytest.approx(draws[:, 1:].mean(0))
+    assert told.sd == pytest.approx(draws[:, 1:].std(0))
+    assert told.sd > 1.2 * estimate.sd
+
+
 def test_what_explains_about_as_well_keeps_its_draws():
     close = replace(OTHER, log_evidence=-1.0)
-    assert widened(tracing(BEST, close), 0).evidences["b"] is close
+    assert widened(tracing(BEST, close), 0, anywhere).evidences["b"] is close
 
 
 def test_without_an_effect_nothing_explains():
     before = tracing(BARE, BEST, chosen=())
-    assert widened(before, 0) is before
+    assert widened(before, 0, anywhere) is before
 
 
 def test_the_seed_decides_the_draws():
     one, same, other = (
-        widened(tracing(BARE, BEST), seed).evidences["none"].draws for seed in (1, 1, 2)
+        widened(tracing(BARE, BEST), seed, anywhere).evidences["none"].draws
+        for seed in (1, 1, 2)
     )
     assert (one == same).all()
     assert not (one == other).all()
