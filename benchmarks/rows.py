@@ -6,6 +6,8 @@ import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from torch import Tensor
+
 
 def read(path: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV file, none if it is not there."""
@@ -30,4 +32,4 @@ def append(
 
 def short(value: object) -> object:
     """Return a number with six digits."""
-    return f"{value:.6g}" if isinstance(value, float) else value
+    return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value

@@ -38,9 +38,9 @@ from benchmarks.box_collision.summary import (
     STAGES,
     coverage_table,
     draw,
-    read,
     summarize,
 )
+from benchmarks.rows import append, read, short
 from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.campaign.learning.methods import METHODS, find_method
@@ -286,19 +286,9 @@ def run_missing(method: str, target: str, arguments: argparse.Namespace) -> None
         start = time.process_time()
         task = make_task(target, arguments, seed)
         rows = run_trial(task, method, seed, arguments)
-        new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            if new:
-                writer.writeheader()
-            writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+        append(path, COLUMNS, rows)
         spent = time.process_time() - start
         print(f"{path.stem} trial {seed}: {spent:.0f} CPU s", flush=True)
-
-
-def short(value: object) -> object:
-    """Return a number with six digits."""
-    return f"{value:.6g}" if isinstance(value, float) else value
 
 
 def parse() -> argparse.Namespace:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.published import published
+from benchmarks.rows import read
 from sbi_active.plots import as_table
 
 __all__ = [
@@ -42,14 +42,6 @@ COLORS = {"1": "tab:blue", "2": "tab:orange"}
 LARGEST_ERROR = 0.5
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV file, none if it is not there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [*csv.DictReader(file)]
 
 
 def column(rows: Rows, key: str, round_: int | None = None) -> Any:

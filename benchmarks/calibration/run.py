@@ -15,11 +15,11 @@ Resumable: a row that stands in the CSV is not run again. Seeds from 2000 on jud
 from __future__ import annotations
 
 import argparse
-import csv
 import warnings
 from pathlib import Path
 
 from benchmarks.calibration import beliefs, networks
+from benchmarks.rows import append, read
 from sbi_active.diagnostics.verdict import clopper_pearson
 
 RESULTS = Path(__file__).parent / "results"
@@ -38,39 +38,24 @@ def path(table: str) -> Path:
     return RESULTS / f"{table}.csv"
 
 
-def read(table: str) -> list[dict[str, str]]:
-    """Return the rows so far."""
-    if not path(table).exists():
-        return []
-    with path(table).open(newline="") as file:
-        return [*csv.DictReader(file)]
-
-
 def run(table: str, problem: str, kind: str, seeds: range) -> None:
     """Run the seeds that are not there yet."""
     make, columns, _ = TABLES[table]
-    done = {(r["problem"], r["kind"], int(r["seed"])) for r in read(table)}
+    done = {(r["problem"], r["kind"], int(r["seed"])) for r in read(path(table))}
     for seed in seeds:
         if (problem, kind, seed) in done:
             continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             row = make(problem, kind, seed)
-        is_new = not path(table).exists()
-        with path(table).open("a", newline="") as file:
-            writer = csv.DictWriter(file, columns)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(
-                {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
-            )
+        append(path(table), columns, [row])
         print(problem, kind, seed, row["verdict"], row["reason"], flush=True)
 
 
 def summary(table: str, first: int) -> None:
     """Print the share flagged, by problem and kind."""
     groups: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in read(table):
+    for row in read(path(table)):
         if int(row["seed"]) >= first:
             groups.setdefault((row["problem"], row["kind"]), []).append(row)
     for (problem, kind), rows in groups.items():

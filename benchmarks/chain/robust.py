@@ -21,7 +21,8 @@ from typing import Any
 import pandas as pd
 import torch
 
-from benchmarks.chain.run import RESULTS, append
+from benchmarks.chain.run import RESULTS
+from benchmarks.rows import append
 from sbi_active import ASBI
 from sbi_active.plots import as_table
 from sbi_active.pyro import RobustASBI
@@ -102,7 +103,8 @@ def main() -> None:
         for case in ("gross", "clean"):
             for method in METHODS:
                 if (seed, case, method) not in known:
-                    append(path, [judged(seed, case, method)])
+                    row = judged(seed, case, method)
+                    append(path, [*row], [row])
     print(summary(pd.read_csv(path)))
 
 

@@ -21,7 +21,6 @@ alone. Rows are added to results/, and those that are there are not run again.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 import warnings
 from pathlib import Path
@@ -33,6 +32,7 @@ import torch
 from scipy.stats import binom, t
 from torch import Tensor
 
+from benchmarks.rows import append
 from sbi_active import Campaign, RefinementOptions
 from sbi_active.inference import refine
 from sbi_active.plots import as_table
@@ -138,18 +138,6 @@ def rounds(parameters: int, seed: int) -> list[dict[str, Any]]:
     return rows
 
 
-def append(path: Path, rows: list[dict[str, Any]]) -> None:
-    is_new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, [*rows[0]], lineterminator="\n")
-        if is_new:
-            writer.writeheader()
-        writer.writerows(
-            {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
-            for row in rows
-        )
-
-
 def done(path: Path) -> set[tuple[int, int]]:
     if not path.exists():
         return set()
@@ -229,7 +217,7 @@ def main() -> None:
             else:
                 want = seed < options.seeds[0] + options.references
                 rows = [judged(dim, seed, with_reference=want)]
-            append(path, rows)
+            append(path, [*rows[0]], rows)
             print(rows[-1], flush=True)
 
 

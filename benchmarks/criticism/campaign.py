@@ -32,9 +32,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from benchmarks.criticism.intervals import rate
-from benchmarks.criticism.run import append, read
 from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.numerical import NOISE_SD, response
+from benchmarks.rows import append, read
 from sbi_active import Campaign, CampaignOptions
 from sbi_active.criticism import Report
 from sbi_active.seeding import derive_seed, forked_generators, row_normals
@@ -319,7 +319,7 @@ def main() -> None:
                 except Exception as error:  # a crash is a result of the benchmark
                     failure = f"{type(error).__name__}: {error}"[:300]
                     row = {"case": number, "kind": kind, "failure": failure}
-                append(path, [row], COLUMNS)
+                append(path, COLUMNS, [row])
                 print({k: row.get(k) for k in COLUMNS if k in row}, flush=True)
         rows += read(path)
     print("\n".join(summary(rows)))

@@ -25,7 +25,6 @@ setting, in benchmarks/criticism/results. Give each command a core of its own
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,6 +33,7 @@ from benchmarks.criticism.active import ACTIVE_COLUMNS, score_active
 from benchmarks.criticism.cases import KINDS, draw_case
 from benchmarks.criticism.scores import COLUMNS, score_case
 from benchmarks.criticism.worlds import get_world
+from benchmarks.rows import append, read
 
 RESULTS = Path(__file__).parent / "results"
 #: Which kinds of cases a table is made of.
@@ -91,7 +91,7 @@ def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> 
             oracle = kind == "library" and case.truth.effects[0].hook != "noise"
             oracle = oracle and not world.is_rough
             rows = [score_case(case, number, oracle=oracle)]
-        append(path, rows, ACTIVE_COLUMNS if active else COLUMNS)
+        append(path, ACTIVE_COLUMNS if active else COLUMNS, rows)
         last = rows[-1]
         print(
             f"{path.stem} case {number}: {last.get('effects')} -> "
@@ -99,29 +99,6 @@ def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> 
             f"{float(str(last.get('cpu_seconds') or 'nan')):.0f} CPU s",
             flush=True,
         )
-
-
-def append(path: Path, rows: list[dict[str, object]], columns: list[str]) -> None:
-    """Add rows to a CSV file."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, columns)
-        if new:
-            writer.writeheader()
-        writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV file, none if it is not there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [*csv.DictReader(file)]
-
-
-def short(value: object) -> object:
-    """Return a number with six digits."""
-    return f"{value:.6g}" if isinstance(value, float) else value
 
 
 def main() -> None:

@@ -11,7 +11,6 @@ round in benchmarks/dear/results/rows.csv, and the table is printed.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import torch
 from sbi.inference import NPE_C
 from sbi.utils import RestrictedPrior, get_density_thresholder
 
+from benchmarks.rows import append, read
 from sbi_active import Campaign
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -127,26 +127,9 @@ def stock(task: Any, method: str, num: int, trials: list[Any], seed: int) -> Any
         return posterior
 
 
-def read() -> list[dict[str, str]]:
-    """Return the rows so far."""
-    if not ROWS.exists():
-        return []
-    with ROWS.open(newline="") as file:
-        return [*csv.DictReader(file)]
-
-
 def write(rows: list[dict[str, Any]]) -> None:
-    """Append rows."""
-    new = not ROWS.exists()
-    with ROWS.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-        if new:
-            writer.writeheader()
-        for row in rows:
-            short = {
-                k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()
-            }
-            writer.writerow(short)
+    """Append rows, without what has no column."""
+    append(ROWS, COLUMNS, [{k: row.get(k) for k in COLUMNS} for row in rows])
 
 
 def cell(rows: list[dict[str, str]], key: str, rounds: tuple[int, ...]) -> Any:
@@ -222,7 +205,7 @@ def main() -> None:
         key = {"task": name, "per_round": label, "seed": seed}
         done = {
             r["method"]
-            for r in read()
+            for r in read(ROWS)
             if (r["task"], r["per_round"], int(r["seed"])) == (name, label, seed)
         }
         methods = [m for m in given.methods if size is not None or m == "campaign"]
@@ -247,7 +230,7 @@ def main() -> None:
             more = {"round": ROUNDS, "num_simulations": size, "cpu": cpu / ROUNDS}
             write([{**key, "method": method, **found, **more}])
         print(name, label, seed, flush=True)
-    print(table(read()))
+    print(table(read(ROWS)))
 
 
 if __name__ == "__main__":

@@ -29,10 +29,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.criticism.run import append, read
 from benchmarks.forces.hidden import FITTED, HELD_OUT, NUM_TRIALS, Hidden, draw
 from benchmarks.forces.machines import MACHINES, Machine, machine
 from benchmarks.forces.summary import summary
+from benchmarks.rows import append, read
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -207,7 +207,7 @@ def main() -> None:
             if (name, kind, str(number)) in done:
                 continue
             row = run_case(name, kind, number)
-            append(arguments.result, [row], COLUMNS)
+            append(arguments.result, COLUMNS, [row])
             print(
                 f"{name} {kind} {number}: {row['form'] or 'nothing'} -> "
                 f"{row['verdict']}, {row['family']} {row['p_family']:.2f}; held out "

@@ -27,11 +27,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from benchmarks.criticism.run import append, read
 from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
 from benchmarks.misfit.scores import COLUMNS, score_case
 from benchmarks.misfit.summary import summary
+from benchmarks.rows import append, read
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -45,7 +45,7 @@ def run_kind(group: str, kind: Kind, first: int, cases: int) -> None:
         if number in done:
             continue
         row = score_case(draw_case(group, kind, number), number)
-        append(path, [row], COLUMNS)
+        append(path, COLUMNS, [row])
         outcome = row.get("failure") or row.get("verdict")
         print(
             f"{group} {kind} {number}, {row['machine']}: {row['true']} beside "

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.distributions import HalfNormal, Independent, Normal
 
 from benchmarks.criticism.intervals import rate
-from benchmarks.criticism.run import append, read
+from benchmarks.rows import append, read
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.report.numbers import FEWEST_DRAWS
@@ -249,7 +249,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             if (number, str(int(is_hidden))) in done:
                 continue
             row = score_case(number, is_hidden=is_hidden)
-            append(arguments.out, [row], COLUMNS)
+            append(arguments.out, COLUMNS, [row])
             print(*(f"{k} {row[k]}," for k in COLUMNS), flush=True)
     print(*summary(read(arguments.out)), sep="\n")
 

@@ -21,12 +21,9 @@ method and setting, in benchmarks/numerical/results.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,12 +38,11 @@ from benchmarks.numerical.run import (
     column,
     exact_limits,
     make_task,
-    read,
     reference,
     round_row,
-    short,
 )
 from benchmarks.published import published
+from benchmarks.rows import append, read
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.plots import as_table
@@ -129,21 +125,10 @@ def run_method(
             continue
         start = time.process_time()
         rows = run_trial(make_task("linear", "fixed", seed), method, setting, seed)
-        append(path, rows)
+        append(path, [*COLUMNS, "c2st"], rows)
         spent = time.process_time() - start
         print(f"{setting} {method} trial {seed}: {spent:.0f} CPU s", flush=True)
     return [row for row in read(path) if int(row["seed"]) < trials]
-
-
-def append(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append rows to a CSV file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, [*COLUMNS, "c2st"])
-        if new:
-            writer.writeheader()
-        writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
 
 
 def summary(name: str, rows: list[dict[str, str]]) -> list[str]:

@@ -12,7 +12,6 @@ setting, in benchmarks/numerical/results; the table is printed at the end.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 import warnings
 from collections.abc import Sequence
@@ -25,6 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.published import published
+from benchmarks.rows import append, read
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
@@ -161,27 +161,9 @@ def run_setting(arguments: argparse.Namespace, method: str, setting: str) -> lis
         start = time.process_time()
         task = make_task(arguments.task, arguments.truth, seed)
         rows = run_trial(task, method, setting, seed, arguments)
-        new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if new:
-                writer.writeheader()
-            writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+        append(path, COLUMNS, rows)
         print(f"{name} trial {seed}: {time.process_time() - start:.0f} CPU s")
     return [row for row in read(path) if int(row["seed"]) < arguments.trials]
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV file, none if it is not there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [*csv.DictReader(file)]
-
-
-def short(value: object) -> object:
-    """Return a number with six digits."""
-    return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value
 
 
 def exact_limits() -> dict[str, tuple[str, ...]]:

@@ -25,7 +25,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
-import csv
 import io
 import sys
 import time
@@ -40,6 +39,7 @@ import torch
 
 from benchmarks.criticism.intervals import wilson
 from benchmarks.robots.machines import CONDITIONS, MACHINES, Machine, Set, recorded
+from benchmarks.rows import append
 from sbi_active import GaussianNoise
 from sbi_active.criticism import close_loop
 from sbi_active.criticism.identification import identify
@@ -142,13 +142,7 @@ def run(
             if condition.startswith("friction"):
                 ways += ["bare", *(["loop"] if loop else [])]
             ways = [w for w in ways if (machine, condition, seed, w) not in done]
-            fresh = not out.is_file()
-            rows = [*rows_of(machine, condition, seed, ways)]
-            with out.open("a", newline="") as file:
-                writer = csv.DictWriter(file, FIELDS)
-                if fresh:
-                    writer.writeheader()
-                writer.writerows(rows)
+            append(out, FIELDS, [*rows_of(machine, condition, seed, ways)])
         print(machine, "seed", seed, flush=True)
 
 

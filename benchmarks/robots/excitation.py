@@ -40,8 +40,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.criticism.run import append, read
 from benchmarks.robots.models import ARM
+from benchmarks.rows import append, read
 from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
@@ -376,7 +376,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for name in [] if arguments.summary else machines:
         for case in range(arguments.first, arguments.first + arguments.cases):
             if (name, case) not in done:
-                append(arguments.out, score(name, case), COLUMNS)
+                append(arguments.out, COLUMNS, score(name, case))
                 print(name, case, flush=True)
     print(*summary(read(arguments.out)), sep="\n")
 

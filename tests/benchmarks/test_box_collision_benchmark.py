@@ -14,11 +14,11 @@ from benchmarks.box_collision.summary import (  # noqa: E402
     STAGES,
     coverage_table,
     draw,
-    read,
     save,
     summarize,
     time_parts,
 )
+from benchmarks.rows import read  # noqa: E402
 from sbi_active.tasks.box_collision import exact_posterior  # pyright: ignore  # noqa: E402
 
 

@@ -83,7 +83,7 @@ def memory(action: Tensor) -> Tensor:
 
 
 def groups(action: Tensor) -> Tensor:
-    """Return the means of two groups of 100 people, of whom so many are in the first."""
+    """Return the means of two groups of 100 people, so many of them in the first."""
     w = pyro.sample("w", dist.Normal(torch.zeros(2), torch.tensor([10.0, 2.5])))
     sizes = torch.cat([action, 100 - action])
     return pyro.sample("x", dist.Normal(w, sizes.rsqrt()).to_event(1))
@@ -91,7 +91,7 @@ def groups(action: Tensor) -> Tensor:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "model, levels, truth, rounds",
+    ("model", "levels", "truth", "rounds"),
     [
         (plane, torch.tensor([0.3, 0.6, 0.9, 1.2]), [0.12], 2),
         (memory, torch.arange(1.0, 15.0, 2.0), [5.2], 2),
