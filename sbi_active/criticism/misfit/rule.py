@@ -2,8 +2,9 @@ r"""What helps, and what is the cause, when every model is wrong.
 
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
    smallest, or is not larger on a new trial with a probability of .9: one trial far
-   from the others may hold most of a mean square. The most probable of them by the
-   shared evidence is the top.
+   from the others may hold most of a mean square. Without a time axis, where a trial
+   is too few numbers to be sure of anything, it has to be within a fifth. The most
+   probable of them by the shared evidence is the top.
 2. An effect of the top *helps* if it is more likely there than not, and predicts a
    left-out trial better with a probability of .8, or the error is twice as large
    without it; others are dropped, those first without which it is smallest.
@@ -19,9 +20,9 @@ helps, and of what is left of it where each must predict better with a probabili
 .9, since two that imitate each other both look dispensable. Where the chi-square of a
 model of k effects passes against the sensor nothing remains, and the factor is
 :math:`.85^{k - 1}`: one hardly imitates something undeclared to the sensor's error,
-several do. Without a time axis, where trials have few numbers, it is
-:math:`.85 (1 - u)^3` in either case. The thresholds, the .85 and the power are
-empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
+several do. Without a time axis it is :math:`.85 / (1 + (u / .2)^2)` in either case.
+The thresholds, the .85 and the .2 are empirical: evidence alone, or prediction alone,
+names a stand-in as surely as a cause.
 """
 
 from __future__ import annotations
@@ -41,9 +42,10 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
+ADMITTED_FEW = 1.2  # likewise, without a time axis
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-FEW = 3  # power of 1 - u where x has no time axis
+HALF = 0.2  # u that leaves half of P(cause) without a time axis
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 
@@ -109,7 +111,7 @@ def choose(
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
     """
-    keys = admitted(models)
+    keys = admitted(models, timed=timed)
     log_p = np.array([models[key].log_p for key in keys])
     p = np.exp(log_p - log_sum_exp(log_p))
     order = np.argsort(-p, kind="stable")
@@ -130,9 +132,12 @@ def choose(
         found = [_remains(models, k, n) for k in (key, surer) if n in k.effects]
         remains[n] = min(found)
         # Few numbers a trial are fitted to the sensor's error by much that is wrong.
-        share = CERTAIN * (1 - remains[n]) ** (1 if timed else FEW)
-        if timed and models[key].passes:  # several may imitate what nobody declared
+        if not timed:
+            share = CERTAIN / (1 + (remains[n] / HALF) ** 2)
+        elif models[key].passes:  # several may imitate what nobody declared
             share = CERTAIN ** (len(key.effects) - 1)
+        else:
+            share = CERTAIN * (1 - remains[n])
         cause[n] = inclusion[n] * share
     return Choice(key, probabilities, inclusion, cause, better, remains)
 
@@ -170,9 +175,14 @@ def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> flo
     return float(np.clip(u, 0.0, 1.0))
 
 
-def admitted(models: Mapping[ModelKey, Scored]) -> list[ModelKey]:
+def admitted(
+    models: Mapping[ModelKey, Scored], *, timed: bool = True
+) -> list[ModelKey]:
     """Return the models that predict left-out trials about as well as the best."""
     best = min(models.values(), key=lambda m: m.error)
+    if not timed:
+        most = ADMITTED_FEW**2 * best.error
+        return [key for key, m in models.items() if m.error <= most]
     return [
         key
         for key, m in models.items()

@@ -31,7 +31,7 @@ from sbi_active.criticism.misfit.rule import (
 from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.results import UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.criticism.under_misfit import NAMED
@@ -94,17 +94,13 @@ class Misfit:
         """Return whether it says more than a verdict of numbers without a time axis.
 
         Numbers that scatter more than declared, each for itself, leave some effect that
-        predicts a few of them better: there it needs a Bayes factor of 20 beside the
-        same error of unknown size, and to predict the rest surely better. Several
-        effects give way to a probable cause alone.
+        predicts a few of them better: they give way to a probable cause alone, and so
+        do several effects, which fit much.
         """
-        choice, found = self.choice, self.search.found
+        choice = self.choice
         if verdict == UNEXPLAINED:
             return bool(choice.key.effects)
         surely = [n for n in choice.key.effects if choice.better[n] > SURE]
-        if verdict == SCATTER:
-            gain = found[choice.key].log_p - found[ModelKey()].log_p
-            return gain > THRESHOLD and surely == [*choice.key.effects]
         return any(choice.cause[n] > NAMED for n in surely)
 
     @cached_property
@@ -230,14 +226,15 @@ def settled(
         equivalent: Groups of effects that nothing separates.
     """
     scored: dict[ModelKey, Scored] = {}
+    timed = search.rivals.measurements.is_sequence
     while True:
         for key, candidate in search.found.items():
             if key not in scored:
                 scored[key] = score(candidate)
-        top = max(admitted(scored), key=lambda key: scored[key].log_p)
+        likely = admitted(scored, timed=timed)
+        top = max(likely, key=lambda key: scored[key].log_p)
         missing = _missing(search, top)
         if not missing:
-            timed = search.rivals.measurements.is_sequence
             return choose(scored, search.names, equivalent, timed=timed)
         for key in missing:
             search.fit_set(key)

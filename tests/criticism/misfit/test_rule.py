@@ -57,6 +57,28 @@ def test_one_trial_far_from_the_others_does_not_rule_a_model_out():
     assert choose(worse, "ab").key == ModelKey(("b",))
 
 
+def test_without_a_time_axis_a_model_within_a_fifth_is_compared_and_no_other():
+    even, far = 4 * WIGGLE, 4 * WIGGLE[::-1].copy()
+    far[0] = 60.0
+    several = models(none=(0.0, 101.0), b=(0.0, 4.0)) | {
+        ModelKey(("b",)): Scored(0.0, even, False),
+        ModelKey(("a",)): Scored(30.0, far, False),
+    }
+    assert choose(several, "ab", timed=False).key == ModelKey(("b",))
+    near = {**several, ModelKey(("a",)): Scored(30.0, 1.18**2 * even, False)}
+    assert choose(near, "ab", timed=False).key == ModelKey(("a",))
+    assert choose(near, "ab").key == ModelKey(("b",))  # surely worse
+
+
+def test_without_a_time_axis_few_numbers_that_fit_prove_no_cause():
+    several = models(none=(0.0, 101.0), a=(20.0, 21.0))
+    found = choose(several, "a", timed=False)
+    assert found.remains["a"] == pytest.approx(0.2, abs=0.01)
+    assert found.cause["a"] == pytest.approx(0.85 / 2, abs=0.02)
+    several[ModelKey(("a",))] = scored(20.0, 1.0, passes=True)
+    assert choose(several, "a", timed=False).cause["a"] < 0.86
+
+
 def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
     """A fast effect has the evidence, a slow one beside it the prediction."""
     found = choose(
