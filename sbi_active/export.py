@@ -54,7 +54,7 @@ def to_inference_data(
         seed: Of the draws.
 
     Returns:
-        ArviZ 0.x: ``InferenceData``; 1.x: ``DataTree``.
+        ``InferenceData`` of ArviZ 0.x, ``DataTree`` of 1.x.
 
     Raises:
         ValueError: If names do not fit, chains are more than half of the draws, or a

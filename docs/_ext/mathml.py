@@ -10,11 +10,12 @@ from sphinx.application import Sphinx
 from sphinx.util import logging
 
 LOG = logging.getLogger(__name__)
+DIGITS = re.compile(r"(\\[td]?frac)(\d)(\d)")  # read as one number and what follows
 SPACING = re.compile(r"\\math(?:rel|bin|op)\b|\\Big(?=/)")  # looks alone
 
 
 def _converted(node: nodes.Element, *, as_block: bool = False) -> str:
-    text = SPACING.sub("", node.astext())
+    text = DIGITS.sub(r"\1{\2}{\3}", SPACING.sub("", node.astext()))
     try:
         return tex2mathml(text, as_block=as_block)
     except MathError as error:

@@ -34,11 +34,14 @@ FURTHER = {
     },
     "simulation": {"sbi_active.simulation.report": ("SimulatorReport",)},
 }
-#: Ancestors of other projects: their members are documented there.
-#: A shape such as (n, *x_shape), whose star is no emphasis.
-STAR = re.compile(r"(?<![\\\w*`])\*(?=[a-z_]+\b(?!\*))")
+#: A shape such as (n, *x_shape), whose star is no emphasis; words in a row may be.
+STAR = re.compile(r"(?<![\\\w*`])\*(?=[a-z_]+\b(?!\*))(?![a-z]+( [a-z]+)+\*)")
 END = re.compile(r"(?<=[A-Za-z])_(?=\W|$)")  # of a column's prefix: no link
-FOREIGN = "Distribution,NPE_C,NLE_A,NRE_A,NeuralPosterior,RuntimeError,Warning,object"
+LETTER = re.compile(r"^(\s*(?::\w+ [^:]+: )?)(?=\w\.$)")  # no first item of a list
+#: Ancestors of other projects: their members are documented there.
+FOREIGN = (
+    "Distribution,NPE_C,NLE_A,NRE_A,NeuralPosterior,Module,BaseException,Warning,object"
+)
 
 
 def examples(package: str) -> tuple[str, dict[str, str]]:
@@ -77,7 +80,8 @@ def first_line(value: object) -> str:
     """Return what a name is, in a line."""
     text = (inspect.getdoc(value) or "").split("\n\n")[0].replace("\n", " ")
     text = re.sub(r":math:`(.+?)`", r"$\1$", text).replace("|", "\\|")
-    return text if callable(value) else ""
+    text = re.sub(r":\w+:`[~.]?(.+?)`", r"`\1`", text)
+    return text if callable(value) else f"All of them: {', '.join(value)}."
 
 
 def page(package: str) -> str:
@@ -145,14 +149,28 @@ def overview() -> str:
 def _prepared(
     app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]
 ) -> None:
-    """Escape stars of shapes; of other projects' docstrings take the first line."""
+    """Escape what is no markup; of other projects' docstrings take the first line."""
     home = getattr(inspect.unwrap(value), "__module__", "") if callable(value) else ""
     if home and not home.startswith("sbi_active"):
-        lines[:] = [" ".join(lines).split(". ")[0].rstrip(".") + f" (of ``{home}``)."]
-    lines[:] = [_escaped(line) for line in lines]
+        first = " ".join(lines).replace("$", "").split(". ")[0].rstrip(".")
+        lines[:] = [f"{first} (of ``{home}``)."]
+    lines[:] = _without_markup(lines)
+
+
+def _without_markup(lines: list[str]) -> Iterator[str]:
+    """Yield lines with escapes, displayed formulas as they are."""
+    margin = None  # of the formula that a line is in
+    for line in lines:
+        indent = len(line) - len(line.lstrip())
+        if margin is not None and line.strip() and indent <= margin:
+            margin = None
+        if line.lstrip().startswith(".. math::"):
+            margin = indent
+        yield line if margin is not None else _escaped(line)
 
 
 def _escaped(line: str) -> str:
+    line = LETTER.sub(r"\1\\", line)
     parts = re.split(r"(``.*?``|`.*?`)", line)  # what is literal stays
     return "".join(
         p if p.startswith("`") else STAR.sub(r"\\*", END.sub(r"\\_", p)) for p in parts

@@ -97,7 +97,7 @@ class Contents:
 
     @property
     def guess(self) -> str | None:
-        """A formula that explains what no declared effect does: not declared."""
+        """A formula, not declared, that explains what no declared effect does."""
         if self.verdict != UNEXPLAINED or not self.tracing.guesses:
             return None
         return self.tracing.guesses[0][0]

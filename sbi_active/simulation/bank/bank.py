@@ -166,7 +166,7 @@ class Bank:
             log_action: Log density, or log mass, of the actions, a number or (n,).
 
         Returns:
-            Number of rows stored: less than n where rows of the same theta, action and
+            Number of rows stored, less than n where rows of the same theta, action and
             seed are there already, as those of ``simulate(..., store=bank)`` are.
         """
         before = len(self)
