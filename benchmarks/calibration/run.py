@@ -5,7 +5,8 @@
     python -m benchmarks.calibration.run --summary
 
 networks: under-trained (20 to 100 steps of the paper's network on 5,000 rows), trained
-(3,000 steps of the default one on 20,000), and trained but wrong at one action.
+(3,000 steps of the default one on 20,000; of location 5,000 steps of eight components on
+40,000, "trained less" is as the others), and trained but wrong at one action.
 beliefs: refined ones, and the same twice as wide, half as wide, or without one of two
 modes; "always" where every inference has the error, and ranks alone can tell.
 
@@ -28,7 +29,7 @@ TABLES = {
     "beliefs": (beliefs.belief_row, beliefs.COLUMNS, beliefs.PROBLEMS),
 }
 KINDS = {
-    "networks": ("under", "trained", "one action"),
+    "networks": ("under", "trained", "trained less", "one action"),
     "beliefs": beliefs.KINDS,
 }
 
