@@ -217,9 +217,11 @@ def _add_report(
         )
     found = evidences[name]
     rng = np.random.default_rng(derive_seed(seed, "report"))
-    row = rng.integers(len(found.draws), size=num_samples)
+    # Densities of trials go with the posterior that they made, not a widened one.
+    draws = np.asarray(found.draws if found.narrow is None else found.narrow)
+    draws = _spread(draws, num_samples, rng)
     made.coords["parameter"] = [*found.names]
-    made.add("posterior", "theta", np.asarray(found.draws)[row], ["parameter"])
+    made.add("posterior", "theta", draws, ["parameter"])
     residuals = report.residuals
     made.coords["round"] = [int(i) + 1 for i in residuals.index]
     made.coords["action_entry"] = [*report.action_labels]
@@ -228,7 +230,7 @@ def _add_report(
     made.add_data("observed_data", "x", x, ["round", *dims])
     pair = ["round", "action_entry"]
     made.add_data("constant_data", "action", residuals.action, pair)
-    log_prob = _rival_log_likelihood(report, found, np.asarray(found.draws)[row])
+    log_prob = _rival_log_likelihood(report, found, draws)
     if log_prob is not None:
         made.add("log_likelihood", "x", log_prob, ["round"])
     probabilities = report.probabilities
@@ -237,6 +239,29 @@ def _add_report(
     made.add_data("constant_data", "probability", values, ["model"])
     made.attrs.update(model=name, verdict=report.verdict)
     made.attrs["log_evidence"] = float(found.log_evidence)
+
+
+def _spread(draws: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
+    r"""Return draws of which none repeats, by a kernel that keeps mean and covariance.
+
+    A weighted sample that was resampled repeats its points, and tails of ties have no
+    Pareto shape. With h Silverman's width for the points that differ,
+
+    .. math::
+        \theta' = \bar\theta + \sqrt{1 - h^2}\, (\theta - \bar\theta) + h L z .
+    """
+    different = len(np.unique(draws, axis=0))
+    picked = draws[rng.integers(len(draws), size=num)]
+    dim = draws.shape[1]
+    if different == len(draws) or different <= dim:
+        return picked
+    h = (4 / ((dim + 2) * different)) ** (1 / (dim + 4))
+    h = min(h, 1.0)
+    mean = draws.mean(0)
+    values, vectors = np.linalg.eigh(np.cov(draws.T).reshape(dim, dim))
+    noise = rng.normal(size=(num, dim)) * np.sqrt(np.clip(values, 0, None))
+    spread = mean + np.sqrt(1 - h**2) * (picked - mean) + h * noise @ vectors.T
+    return np.clip(spread, draws.min(0), draws.max(0))
 
 
 def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:

@@ -138,8 +138,8 @@ def report():
         parameter_names=["gain"],
     )
     prior = BoxUniform(torch.zeros(1), 2 * torch.ones(1))
-    action = torch.linspace(0.5, 2.0, 6)[:, None]
-    x = 0.8 * action + 0.7
+    action = torch.linspace(0.5, 2.0, 40)[:, None]
+    x = 0.8 * action + 0.2
     actions = BoxActions([0.5], [2.0], names=["push"], units=["N"])
     effects = generic_effects(model, actions)
     return close_loop(
@@ -160,11 +160,22 @@ def test_rivals_of_a_report_are_compared(report):
     assert rivals[name].posterior.theta.shape[0] == 4
     assert rivals[name].posterior.attrs["verdict"] == report.verdict
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the Pareto shapes of a wrong model
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "The inplace keyword")  # ArviZ's own
         ranked = az.compare(rivals)
     assert ranked.index[0] == name
     with pytest.raises(ValueError, match="expected a model among"):
         to_inference_data(report, model="gremlins")
+
+
+def test_a_rival_has_the_posterior_that_its_densities_go_with(report):
+    """Whose intervals the report widens, since another model explains the trials."""
+    own = report.tracing.evidences["none"]
+    assert own.draws.std() > 5 * own.narrow.std()
+    draws = to_inference_data(report, model="none").posterior.theta.values.ravel()
+    assert draws.std() == pytest.approx(own.narrow.std(), rel=0.1)
+    assert draws.mean() == pytest.approx(own.narrow.mean(), abs=0.1 * draws.std())
+    assert len(np.unique(draws)) > 0.9 * len(draws)  # a resample repeats its points
 
 
 def test_rows_of_a_benchmark_and_a_tree(campaign, tmp_path):

@@ -68,13 +68,13 @@ def export_rivals(export: Any) -> dict[str, Any]:
         noise=GaussianNoise(0.1),
         parameter_names=["gain"],
     )
-    action = torch.linspace(0.5, 2.0, 6)[:, None]
+    action = torch.linspace(0.5, 2.0, 40)[:, None]
     actions = BoxActions([0.5], [2.0], names=["push"], units=["N"])
     library = generic_effects(model, actions)
     report = close_loop(
         model,
         BoxUniform(torch.zeros(1), 2 * torch.ones(1)),
-        Trials(action, 0.8 * action + 0.7),
+        Trials(action, 0.8 * action + 0.2),
         effects=[e for e in library if "offset" in e.name or "bias" in e.name],
         actions=actions,
         seed=0,

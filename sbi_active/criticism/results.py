@@ -109,12 +109,12 @@ class Evidence:
         key: Of the model.
         log_evidence: log Z, nats.
         standard_error: Of log Z, Monte Carlo, nats.
-        effective_sample_size: Of the importance weights; the particles' number for
-            tempering.
+        effective_sample_size: Of the weights; of tempering the number of particles.
         engine: "least squares" (with importance sampling) or "tempering".
         num_simulations: Trials simulated.
         names: Of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
+        narrow: Likewise by this model alone, where ``draws`` were widened; or None.
         best_chi_square: Smallest whitened residual sum of squares among the draws.
         best: Theta and phi, (dim,), that predict other trials; None for the draws.
     """
@@ -129,6 +129,7 @@ class Evidence:
     draws: Array
     best_chi_square: float
     best: Array | None = None
+    narrow: Array | None = None
 
     @property
     def name(self) -> str:
@@ -250,8 +251,7 @@ class Tracing:
             noise over the permitted actions; repeated trials may separate them.
         estimates: One an effect, most probable first.
         evidences: Of every model tried, by name, effects with priors of unknown scale.
-        robust: Whether the verdict is that of effect priors a third and three times as
-            wide.
+        robust: Whether effect priors a third and three times as wide agree.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process

@@ -138,7 +138,7 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
         model = misfit.model(key)
         u = _drawn(misfit.rivals, model, model.u, misfit.covariance(key))
         draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
-        found[name] = replace(own, draws=draws)
+        found[name] = replace(own, draws=draws, narrow=own.draws)
     return replace(tracing, evidences=found)
 
 

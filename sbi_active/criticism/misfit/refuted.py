@@ -44,7 +44,8 @@ def widened(
         if near or own.key.error is not None:
             continue
         draws = _widened(own, best, derive_seed(seed, "refuted", name))
-        found[name] = replace(own, draws=within(own.key, draws))
+        draws = within(own.key, draws)
+        found[name] = replace(own, draws=draws, narrow=own.draws)
     estimates = [_estimate(e, found[e.name].draws) for e in tracing.estimates]
     return replace(tracing, evidences=found, estimates=(*estimates,))
 
