@@ -217,9 +217,11 @@ def _add_report(
         )
     found = evidences[name]
     rng = np.random.default_rng(derive_seed(seed, "report"))
-    # Densities of trials go with the posterior that they made, not a widened one.
-    draws = np.asarray(found.draws if found.narrow is None else found.narrow)
-    draws = _spread(draws, num_samples, rng)
+    # Densities of trials go with the posterior that they made, not a widened one, which
+    # is what the verdict's own model has to be used with.
+    is_widened = found.narrow is not None and name == str(report.tracing.key)
+    narrow = found.draws if is_widened or found.narrow is None else found.narrow
+    draws = _spread(np.asarray(narrow), num_samples, rng)
     made.coords["parameter"] = [*found.names]
     made.add("posterior", "theta", draws, ["parameter"])
     residuals = report.residuals
@@ -231,7 +233,7 @@ def _add_report(
     pair = ["round", "action_entry"]
     made.add_data("constant_data", "action", residuals.action, pair)
     log_prob = _rival_log_likelihood(report, found, draws)
-    if log_prob is not None:
+    if log_prob is not None and not is_widened:
         made.add("log_likelihood", "x", log_prob, ["round"])
     probabilities = report.probabilities
     made.coords["model"] = [*probabilities]
