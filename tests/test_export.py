@@ -1,4 +1,5 @@
 import warnings
+from dataclasses import replace
 
 import arviz as az
 import matplotlib
@@ -176,6 +177,19 @@ def test_a_rival_has_the_posterior_that_its_densities_go_with(report):
     assert draws.std() == pytest.approx(own.narrow.std(), rel=0.1)
     assert draws.mean() == pytest.approx(own.narrow.mean(), abs=0.1 * draws.std())
     assert len(np.unique(draws)) > 0.9 * len(draws)  # a resample repeats its points
+
+
+def test_the_verdicts_own_model_keeps_what_was_widened(report):
+    name = str(report.tracing.key)
+    own = report.tracing.evidences[name]
+    wide = replace(own, draws=3 * own.draws, narrow=own.draws)
+    evidences = report.tracing.evidences | {name: wide}
+    widened = replace(report, tracing=replace(report.tracing, evidences=evidences))
+    found = to_inference_data(widened)
+    assert "log_likelihood" in to_inference_data(report).groups()
+    assert "log_likelihood" not in found.groups()
+    spread = found.posterior.theta.values.reshape(-1, len(own.names)).std(0)
+    assert spread == pytest.approx(3 * own.draws.std(0), rel=0.15)
 
 
 def test_rows_of_a_benchmark_and_a_tree(campaign, tmp_path):
