@@ -251,8 +251,10 @@ def test_no_page_is_forgotten():
 
 
 def test_robust_updates(run):
-    (snippet,) = run("docs/robust.md")
+    snippet, plane = run("docs/robust.md")
     assert snippet.model.misspecified(snippet.x, torch.tensor([0.0, 30.0]))[0, 1] > 0.99
+    assert plane.problem.parameter_names == ["friction"]
+    assert float(plane.friction.mean()) == pytest.approx(0.12, abs=0.03)
 
 
 def test_trust(run, capsys):
