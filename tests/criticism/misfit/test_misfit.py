@@ -6,6 +6,7 @@ import torch
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
 from sbi_active.criticism.misfit import find_misfit
+from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.results import ModelKey
 from sbi_active.simulation import AutocorrelatedNoise
 from tests.criticism.misfit.oscillator import (
@@ -199,3 +200,15 @@ def test_the_sensor_has_an_error_in_each_channel():
 def test_an_error_of_measurement_is_positive():
     with pytest.raises(ValueError, match="expected measurement_sd > 0; got 0"):
         AutocorrelatedNoise(0.1, 1.0, measurement_sd=0.0)
+
+
+def test_a_set_whose_parts_were_not_fitted_starts_from_its_effects(named):
+    """Sampling may put three effects in front of which no two were tried together."""
+    named.trace()
+    known = named._misfit.search
+    search = Search(known.rivals, known.unit, known.prior, known.cells)
+    search.fit_singles()
+    key = ModelKey(("cubic", "friction", "lag"))
+    assert not any(part in search.found for part in key.parts)
+    lag = search.found[ModelKey(("lag",))].model
+    assert search.fit_set(key).model.rms <= lag.rms
