@@ -96,27 +96,6 @@ def test_all_effects_vanish_at_their_nulls_and_move_the_numbers(known):
     assert model.noise is not None
 
 
-def test_one_process_of_all_actions_takes_height_and_rate():
-    world = get_world("material")
-    rows = draw(world, "material", 0)
-    rng = np.random.default_rng(0)
-    theta = torch.from_numpy(rng.random((200, 8))).float()
-    action = world.actions[torch.arange(200) % 3].clone()
-    action[150:, 2] = 0.2  # of another rate, without effects
-    effects = {k: np.zeros(200) for k in rows.effects}
-    effects["tilt"][:100] = rng.normal(size=100)
-    mean = 0.1 * action[:, 0].numpy() + 3 * theta[:, 1].numpy() + effects["tilt"]
-    x = mean[:, None] + 0.1 * rng.standard_normal((200, NUM_NUMBERS))
-    x = np.repeat(x[:, None], len(SHIFTS), 1)
-    emulator = Emulator.fit(world, theta, action, effects, x, joint=True)
-    half = torch.full((3, 8), 0.5)
-    found = emulator(half, world.actions, tilt=np.array([0.0, 0.0, 1.0])).numpy()
-    known = np.stack(
-        [emulator.widened[k] * emulator.roots[k] @ found[k] for k in range(3)]
-    )
-    assert known.mean(1) == pytest.approx([3.0, 5.0, 8.0], abs=0.25)
-
-
 def test_rows_have_effects_in_about_half(known):
     world = known[0].world
     rows = draw(world, "cubes", 3)

@@ -1,18 +1,21 @@
 r"""Few numbers of a depth image, and how they follow from parameters and effects.
 
-A picture is ten numbers, roots of counts, so that their chaos is about as large where
-much is in view as where little is: how many particles' worth is covered in six bands
-along y, within 3 cm of the middle along x and beyond, and how much volume there is,
-with heights as they are and squared. They are taken with the picture shifted by five
+A picture is twelve numbers, roots of counts, so that their chaos is about as large
+where much is in view as where little is: how many particles' worth is covered in six
+bands along y, within 3 cm of the middle along x and beyond; how much of it is flat, and
+how much no steeper than a third; and how much volume there is, with heights as they are
+and squared. How much is flat tells the particles' shape, whatever theta is: a box lies
+on a face. They are taken with the picture shifted by five
 distances along y, between which the camera's offset interpolates; its gain multiplies
 the volume, and the rest is a Gaussian process over theta and the strengths of the
-effects: one for each action, or one of all, with height and rate as inputs, where pours
-at other heights and rates are learned from too.
+effects, for each action.
 
 What left-out pours miss of it, chaos and error together, is the noise, of the half of
 them that have the weaker effects, as one effect alone is weaker than seven at a time:
 numbers are whitened by its root, and larger still by the factor that leaves one in
-twenty of these pours beyond the chi-square's 95 % point.
+twenty of these pours beyond the chi-square's 95 % point. What is compared is the mean
+of a few pours of one action, since the emulator's error is the same in all of them: of
+the variance, the share that the process takes for noise is divided by their number.
 """
 
 from __future__ import annotations
@@ -43,13 +46,14 @@ CORE = 15  # pixels from the middle along x
 COVERED = 0.5  # mm
 HIGHEST = 8.0  # sides of a particle: what is above hangs in the bucket
 OFFSET = 3 / 8  # of a count before its root (Anscombe, Biometrika 1948)
-NUM_NUMBERS = NUM_BANDS + 4
-VOLUME = (NUM_BANDS + 2, NUM_BANDS + 3)  # place of what the gain multiplies
+FLAT, GENTLE = 0.05, 0.3  # slopes
+NUM_NUMBERS = NUM_BANDS + 6
+VOLUME = (NUM_BANDS + 4, NUM_BANDS + 5)  # place of what the gain multiplies
 LIMIT = 0.95  # of the chi-square of left-out pours
 
 
 def pictures_numbers(images: Tensor, side: float) -> Array:
-    """Return the numbers of images (n, 22500) at all shifts, shape (n, 5, 10).
+    """Return the numbers of images (n, 22500) at all shifts, shape (n, 5, 12).
 
     Args:
         images: Heights in mm.
@@ -58,14 +62,11 @@ def pictures_numbers(images: Tensor, side: float) -> Array:
     x = images.reshape(-1, NUM_PIXELS, NUM_PIXELS).numpy().astype(np.float64)
     x = np.where(x > HIGHEST * side, 0, x)
     pixels = (side / (1e3 * PIXEL)) ** 2
+    slope = np.hypot(*np.gradient(x, 1e3 * PIXEL, axis=(1, 2)))
     found = np.empty((len(x), len(SHIFTS), NUM_NUMBERS))
     middle = NUM_PIXELS // 2
     for k, shift in enumerate(SHIFTS):
-        moved = np.zeros_like(x)
-        if shift >= 0:
-            moved[:, :, shift:] = x[:, :, : NUM_PIXELS - shift]
-        else:
-            moved[:, :, :shift] = x[:, :, -shift:]
+        moved, steep = shifted(x, shift), shifted(slope, shift)
         covered = moved > COVERED
         along = covered.sum(1).reshape(len(x), NUM_BANDS, -1).sum(2)
         total = covered.sum((1, 2))
@@ -75,6 +76,8 @@ def pictures_numbers(images: Tensor, side: float) -> Array:
                 *along.T,
                 core,
                 total - core,
+                (covered & (steep < FLAT)).sum((1, 2)),
+                (covered & (steep < GENTLE)).sum((1, 2)),
                 moved.sum((1, 2)) / side,
                 (moved**2).sum((1, 2)) / side**2,
             ],
@@ -82,6 +85,16 @@ def pictures_numbers(images: Tensor, side: float) -> Array:
         )
         found[:, k] = np.sqrt(counts / pixels + OFFSET)
     return found
+
+
+def shifted(x: Array, by: int) -> Array:
+    """Return pictures (n, 150, 150) moved along y by pixels, with zeros behind."""
+    moved = np.zeros_like(x)
+    if by >= 0:
+        moved[:, :, by:] = x[:, :, : NUM_PIXELS - by]
+    else:
+        moved[:, :, :by] = x[:, :, -by:]
+    return moved
 
 
 def interpolation(offset: Array) -> Array:
@@ -102,17 +115,14 @@ class Emulator:
     Attributes:
         world: It.
         scales: Of each poured effect's strength, by keyword.
-        processes: One an action, of the numbers at all shifts; the same for all where
-            they share it.
-        places: What the processes take besides, shape (a, 2), or (a, 0).
-        roots: Whitening of the numbers at each action, shape (a, 10, 10).
+        processes: One an action, of the numbers at all shifts.
+        roots: Of the covariance of outcomes at each action, shape (a, 12, 12).
         widened: Factor on the noise, by action.
     """
 
     world: World
     scales: dict[str, float]
     processes: tuple[GaussianProcess, ...]
-    places: Array
     roots: Array
     widened: Array
 
@@ -124,17 +134,17 @@ class Emulator:
         effects: dict[str, Array],
         x: Array,
         *,
-        joint: bool = False,
+        averaged: int = 1,
     ) -> Emulator:
         """Learn from pours.
 
         Args:
             world: Its actions are the trials'.
             theta: Shape (n, d).
-            action: Shape (n, 3); the world's, unless ``joint``.
+            action: Each one of the world's, shape (n, 3).
             effects: By keyword, each of shape (n,).
-            x: Numbers, shape (n, 5, 10).
-            joint: One process for all actions, of one place along y.
+            x: Numbers, shape (n, 5, 12).
+            averaged: Pours behind each outcome of the loop.
         """
         scales = {
             effect.apply.names[0]: float(effect.declared_draws().std())  # type: ignore[attr-defined]
@@ -145,14 +155,9 @@ class Emulator:
             [2 * theta.double().numpy() - 1, np.stack(strengths, 1)], 1
         )
         size = np.square(strengths).sum(0)
-        places = np.zeros((len(world.actions), 0))
-        groups = [(action == own).all(1).numpy() for own in world.actions]
-        if joint:
-            places = in_units(world.actions)
-            inputs = np.concatenate([inputs, in_units(action)], 1)
-            groups = [np.ones(len(inputs), dtype=bool)]
         processes, roots, widened = [], [], []
-        for mine in groups:
+        for own in world.actions:
+            mine = (action == own).all(1).numpy()
             process = GaussianProcess.fit(
                 inputs[mine], x[mine].reshape(mine.sum(), -1), noisy=True, degree=1
             )
@@ -162,30 +167,26 @@ class Emulator:
             root = np.sqrt((missed**2).mean(0))[:, None] * correlation_root(missed)
             square = (np.linalg.solve(root, missed.T) ** 2).sum(0)
             limit = chi2.ppf(LIMIT, NUM_NUMBERS)
+            sd = process.noise_sd.reshape(shape)[0, SHIFTS.index(0)]
+            chaos = np.minimum(sd**2 / (missed**2).mean(0), 1).mean()
             processes.append(process)
-            roots.append(root)
+            roots.append(root * np.sqrt(1 - chaos * (1 - 1 / averaged)))
             widened.append(max(1.0, float(np.sqrt(np.quantile(square, LIMIT) / limit))))
-        again = len(world.actions) // len(groups)
         return Emulator(
-            world,
-            scales,
-            tuple(processes * again),
-            places,
-            np.stack(roots * again),
-            np.array(widened * again),
+            world, scales, tuple(processes), np.stack(roots), np.array(widened)
         )
 
     def white(self, x: Array, number: int) -> Array:
-        """Return numbers (n, 10) at an action in units of their noise."""
+        """Return numbers (n, 12) at an action in units of their noise."""
         return np.linalg.solve(self.widened[number] * self.roots[number], x.T).T
 
     def observed(self, images: Tensor, number: int) -> Tensor:
-        """Return what the loop compares of images (n, 22500) at an action, (n, 10)."""
+        """Return what the loop compares of images (n, 22500) at an action, (n, 12)."""
         x = pictures_numbers(images, side_of(self.world))[:, SHIFTS.index(0)]
         return torch.from_numpy(self.white(x, number)).float()
 
     def __call__(self, theta: Tensor, action: Tensor, **phi: Any) -> Tensor:
-        """Return whitened numbers, shape (n, 10), without their noise."""
+        """Return whitened numbers, shape (n, 12), without their noise."""
         num = len(theta)
         strength = {
             name: np.broadcast_to(np.asarray(value, float).reshape(-1), num)
@@ -209,11 +210,9 @@ class Emulator:
             mine = np.nonzero(near.numpy() == number)[0]
             if not len(mine):
                 continue
-            place = np.broadcast_to(
-                self.places[number], (len(mine), len(self.places.T))
+            mean = process.mean(inputs[mine]).reshape(
+                len(mine), len(SHIFTS), NUM_NUMBERS
             )
-            mean = process.mean(np.concatenate([inputs[mine], place], 1))
-            mean = mean.reshape(len(mine), len(SHIFTS), NUM_NUMBERS)
             x = (weight[mine][..., None] * mean).sum(1)
             x[:, VOLUME[0]] *= gain[mine]
             x[:, VOLUME[1]] *= gain[mine] ** 2
@@ -271,11 +270,6 @@ class Emulator:
                 )
             )
         return found
-
-
-def in_units(action: Tensor) -> Array:
-    """Return height and rate of actions (n, 3) in units of one, shape (n, 2)."""
-    return (action[:, [0, 2]].double().numpy() - [35.0, 0.9]) / [20.0, 0.7]
 
 
 def side_of(world: World) -> float:

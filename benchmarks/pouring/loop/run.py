@@ -3,8 +3,8 @@
     python -m benchmarks.pouring.loop.run --bank FOLDER --kind hidden clean material
     python -m benchmarks.pouring.loop.run --summary
 
-"hidden" and "clean": ten sets each, of nine pours of 100 cubes at three actions (two
-pours of each are fitted, one is held out), with parameters from the prior; hidden sets
+"hidden" and "clean": ten sets each, of twelve pours of 100 cubes at three actions (two
+pours of each are fitted, two are held out), with parameters from the prior; hidden sets
 have one effect, each of the nine in turn, one to two and a half of its prior's
 deviations strong. "material": pours of beads and gravel, which no parameter of the
 eight-parameter model reproduces, three trials each. Nobody poured these either: they
@@ -41,9 +41,9 @@ RESULTS = Path(__file__).parents[1] / "results"
 KINDS = ("hidden", "clean", "material")
 WORLD_OF = {"hidden": "cubes", "clean": "cubes", "material": "material"}
 CASES = {"hidden": 10, "clean": 10, "material": 6}
-FIRST = {"hidden": 2_600, "clean": 2_650, "material": 2_500}  # seeds
-BARE = ("prior", "compared")  # parts without effects, of material.bank
-NUM_FITTED, NUM_HELD_OUT = 2, 1  # pours of an action
+FIRST = {"hidden": 2_700, "clean": 2_750, "material": 2_520}  # seeds
+BARE = "compared"  # part without effects, of material.bank, at one of the actions
+NUM_POURS = 2  # of an action that are fitted, and as many that are held out
 STRONG = 1.0, 2.5  # of the prior's deviation
 COLUMNS = [
     *["kind", "case", "theta", "truth", "phi", "alarm", "log_bayes", "chi_square_p"],
@@ -57,22 +57,21 @@ def emulator(bank: Path, name: str) -> Emulator:
     """Return the emulator of a world from its bank.
 
     Args:
-        bank: Folder of the worlds' pours, with those of the campaigns on a material in
-            its ``prior`` and ``compared``.
+        bank: Folder of the worlds' pours, with those that compare materials in its
+            ``compared``, if it has any.
         name: Of the world.
     """
     world = get_world(name)
     rows = read_bank(bank, name)
     theta, action, poses = [rows.theta], [rows.action], [rows.poses]
     effects = {key: [value] for key, value in rows.effects.items()}
-    for part in BARE if name == "material" else ():
-        more = read_bank(bank, part)
-        here = more.action[:, 1] == 0
-        theta.append(more.theta[here])
-        action.append(more.action[here])
-        poses.append(more.poses[here.numpy()])
+    if name == "material" and (bank / BARE).exists():
+        more = read_bank(bank, BARE)
+        theta.append(more.theta)
+        action.append(more.action)
+        poses.append(more.poses)
         for values in effects.values():
-            values.append(np.zeros(int(here.sum())))
+            values.append(np.zeros(len(more)))
     particles, every = world.task.pours.particles, np.concatenate(poses)
     x = np.concatenate(
         [
@@ -81,10 +80,8 @@ def emulator(bank: Path, name: str) -> Emulator:
         ]
     )
     strengths = {key: np.concatenate(values) for key, values in effects.items()}
-    joint = name == "material"
-    return Emulator.fit(
-        world, torch.cat(theta), torch.cat(action), strengths, x, joint=joint
-    )
+    rows_of_both = torch.cat(theta), torch.cat(action)
+    return Emulator.fit(world, *rows_of_both, strengths, x, averaged=NUM_POURS)
 
 
 def truth_of(world: World, kind: str, case: int) -> tuple[Tensor, str, float]:
@@ -105,9 +102,8 @@ def truth_of(world: World, kind: str, case: int) -> tuple[Tensor, str, float]:
 def pour_set(kind: str, case: int) -> tuple[Tensor, Tensor, list[Any], dict[str, Any]]:
     """Return actions (n, 3), images (n, 22500), roles and the truth of a set."""
     world = get_world(WORLD_OF[kind])
-    num = NUM_FITTED + NUM_HELD_OUT
-    action = world.actions.repeat_interleave(num, 0)
-    role = (["fit"] * NUM_FITTED + ["held out"] * NUM_HELD_OUT) * len(world.actions)
+    action = world.actions.repeat_interleave(2 * NUM_POURS, 0)
+    role = (["fit"] * NUM_POURS + ["held out"] * NUM_POURS) * len(world.actions)
     seed = FIRST[kind] + case
     seeds = torch.tensor([derive_seed(seed, "pour", k) for k in range(len(action))])
     if kind == "material":
@@ -153,10 +149,10 @@ def criticized(
     known = emulator(bank, WORLD_OF[kind])
     action, images, role, truth = pour_set(kind, case)
     near = torch.cdist(action, known.world.actions).argmin(1).tolist()
-    x = [
+    every = [
         known.observed(image[None], k)[0] for image, k in zip(images, near, strict=True)
     ]
-    trials = Trials(action, torch.stack(x), role=role)
+    trials = averaged(action, torch.stack(every), role)
     criticism = Criticism(
         known.model(),
         known.world.task.prior,
@@ -166,6 +162,24 @@ def criticized(
         seed=case,
     )
     return criticism, criticism.report(plan=False), truth
+
+
+def averaged(action: Tensor, x: Tensor, role: list[Any]) -> Trials:
+    """Return a trial for each action and role, the mean of its pours.
+
+    What the emulator misses is the same in all pours of an action, so that they are no
+    independent trials.
+    """
+    keys = list(dict.fromkeys(zip(map(tuple, action.tolist()), role, strict=True)))
+    mean = []
+    for place, own in keys:
+        mine = torch.tensor([r == own for r in role])
+        mean.append(x[mine & (action == torch.tensor(place)).all(1)].mean(0))
+    return Trials(
+        torch.tensor([place for place, _ in keys]),
+        torch.stack(mean),
+        role=[own for _, own in keys],
+    )
 
 
 def row_of(bank: Path, kind: str, case: int) -> dict[str, object]:

@@ -1,15 +1,15 @@
 """Worlds of the closed loop on images: what is poured, where, and with which effects.
 
-    python -m benchmarks.pouring.loop.worlds FOLDER --world cubes --rows 350
-    python -m benchmarks.pouring.loop.worlds FOLDER --world material --rows 100
+    python -m benchmarks.pouring.loop.worlds FOLDER --world cubes --rows 900
+    python -m benchmarks.pouring.loop.worlds FOLDER --world material --rows 600
     python -m benchmarks.pouring.loop.worlds FOLDER --world cubes --report
 
 Rows are pours at a world's few actions with parameters from the prior and with effects:
 each is absent from half of the rows, and else up to two and a half times as strong as
 its prior says, since the loop tries priors of three times the width. Effects of the
 camera are not poured: images know them. Files are those of ``benchmarks.pouring.bank``.
-The eight parameters of "material" are learned from the bank of its campaigns besides,
-``benchmarks.pouring.material.bank``, whose pours have no effect.
+"material" is learned from the pours that compare materials besides, part ``compared``
+of ``benchmarks.pouring.material.bank``, which have no effect.
 """
 
 from __future__ import annotations

@@ -1,0 +1,364 @@
+r"""A reference posterior of whole campaigns, from many pours around the truth.
+
+    python -m benchmarks.pouring.around --bank FOLDER --target 1 --rows 240
+    python -m benchmarks.pouring.around --summary
+
+How far is the belief of a campaign from what its images can tell? Around the final
+beliefs of a target's campaigns, in a box that holds nearly all of them, parameters are
+drawn uniformly and poured at every action that these campaigns chose: per volume of the
+prior, ten to forty times as many pours as the bank that the belief was learned from.
+The reference learns a likelihood of each action from them and from both summaries at
+once (``likelihood``), multiplies it over a campaign's trials, and takes the product to
+the one power that tells left-out parameters best; nothing else tempers it.
+
+Both are judged within the box, of which the prior is uniform: at the truth, by the
+campaign's own images, and on parameters whose pours the reference did not learn from,
+where the mean difference of
+
+.. math:: \log p(\theta^* | x_1, \ldots, x_k)
+
+has an error. Resumable; one row a campaign, in ``results/around.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.special import logsumexp
+from torch import Tensor
+
+from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill
+from benchmarks.pouring.bank import read as read_bank
+from benchmarks.pouring.grid_belief import SIDE, GridBelief
+from benchmarks.pouring.learned import ByAction, Earlier, components, kept, looked_at
+from benchmarks.pouring.likelihood import ImageLikelihood, observed
+from benchmarks.pouring.power import best_power, grid, told_by
+from benchmarks.pouring.run import RESULTS, TEMPERED
+from benchmarks.rows import append, read
+from sbi_active.plots import as_table
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
+from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring import images_of
+
+__all__ = ["Box", "Campaign", "box_around", "summarize"]
+
+OUTSIDE = 0.005  # share of the pooled beliefs beyond each side of the box
+NUM_CELLS = 14  # along each side of the box, of the reference
+NUM_COMPONENTS = 36
+NUM_FOLDS = 5
+NUM_JUDGED = 60  # parameters on which both are judged, a campaign
+COLUMNS = [
+    *["target", "seed", "num_pours", "volume", "inside", "power", "ours", "reference"],
+    *["left_out_ours", "left_out_reference", "left_out_se", "num_left_out"],
+    *["in_half", "in_most"],
+]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Where pours are drawn, in whole cells of the belief's grid.
+
+    Attributes:
+        low: Shape (3,).
+        high: Shape (3,).
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def volume(self) -> float:
+        """Share of the prior."""
+        return float((self.high - self.low).prod())
+
+    def cells(self) -> np.ndarray:
+        """Return the middles of the reference's cells, shape (14^3, 3)."""
+        return self.low + grid(NUM_CELLS) * (self.high - self.low)
+
+    def holds(self, theta: np.ndarray) -> np.ndarray:
+        """Return which of some parameters (n, 3) are inside, shape (n,)."""
+        return ((theta > self.low) & (theta < self.high)).all(1)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """The trials of one campaign.
+
+    Attributes:
+        seed: Its.
+        places: Of the actions, among those of the bank.
+        deltas: Chosen summaries.
+    """
+
+    seed: int
+    places: list[int]
+    deltas: list[int]
+
+    def images(self, task: Any, actions: Tensor) -> list[Tensor]:
+        """Return what the trials saw."""
+        return [
+            task.real_system(actions[place], seed=derive_seed(self.seed, "real", k))
+            for k, place in enumerate(self.places)
+        ]
+
+
+def campaigns(target: str, actions: Tensor, folder: Path) -> list[Campaign]:
+    """Return ASBI's of a target, as their committed rows have them."""
+    by_seed: dict[int, list[dict[str, str]]] = defaultdict(list)
+    for row in read(folder / f"target_{target}_asbi.csv"):
+        by_seed[int(row["seed"])].append(row)
+    found = []
+    for seed, rows in sorted(by_seed.items()):
+        rows.sort(key=lambda row: int(row["round"]))
+        chosen = torch.tensor(
+            [[float(row[k]) for k in ("height", "position", "rate")] for row in rows]
+        )
+        places = torch.cdist(chosen, actions.float()).argmin(1).tolist()
+        found.append(Campaign(seed, places, [int(row["delta"]) for row in rows]))
+    return found
+
+
+def belief_of(learned: ByAction, own: Campaign, images: list[Tensor]) -> GridBelief:
+    """Return the belief that the benchmark's campaign has of images of its trials."""
+    middles = GridBelief.middles().double().numpy()
+    earlier: Earlier = defaultdict(list)
+    total = np.zeros(len(middles))
+    for place, delta, image in zip(own.places, own.deltas, images, strict=False):
+        total += learned.log_likelihood(middles, image, delta, place, earlier)
+    return GridBelief(torch.from_numpy(total * float(len(images)) ** -TEMPERED))
+
+
+def box_around(beliefs: list[GridBelief]) -> Box:
+    """Return a box of whole cells that holds nearly all of some beliefs."""
+    mass = torch.stack([b.log_density.softmax(0) for b in beliefs]).mean(0)
+    cube = mass.reshape(SIDE, SIDE, SIDE).numpy()
+    low, high = np.zeros(3), np.ones(3)
+    for k in range(3):
+        others = tuple(j for j in range(3) if j != k)
+        below = np.cumsum(cube.sum(others))
+        low[k] = np.searchsorted(below, OUTSIDE) / SIDE
+        high[k] = (np.searchsorted(below, 1 - OUTSIDE) + 1) / SIDE
+    return Box(low, np.minimum(high, 1.0))
+
+
+@dataclass(frozen=True)
+class Pours:
+    """Pours in a box at one action.
+
+    Attributes:
+        theta: Shape (n, 3).
+        images: Shape (n, 22500).
+    """
+
+    theta: np.ndarray
+    images: Tensor
+
+    @cached_property
+    def looks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mesh coverage (n, 36) and thumbnails (n, 900)."""
+        return looked_at(self.images)
+
+    def learn(self, among: np.ndarray) -> BothSummaries:
+        """Return the likelihood learned from some of them."""
+        mesh, small = (look[among] for look in self.looks)
+        mean, axes = components(small, NUM_COMPONENTS)
+        summary = np.concatenate([np.sqrt(mesh), (small - mean) @ axes], 1)
+        fitted = ImageLikelihood.fit(self.theta[among], summary, ~mesh.any(1))
+        return BothSummaries(fitted, mean, axes)
+
+
+@dataclass(frozen=True)
+class BothSummaries:
+    """A likelihood of images by both summaries."""
+
+    likelihood: ImageLikelihood
+    mean: np.ndarray
+    axes: np.ndarray
+
+    def at(self, cells: np.ndarray, images: Tensor) -> np.ndarray:
+        """Return log densities of images (n, 22500) at cells, shape (n, cells)."""
+        mesh, small = looked_at(images)
+        summary = np.concatenate([np.sqrt(mesh), (small - self.mean) @ self.axes], 1)
+        seen = [
+            observed(self.likelihood, s, not m.any())
+            for s, m in zip(summary, mesh, strict=True)
+        ]
+        return self.likelihood.at_each(cells, seen)
+
+
+def pour_around(
+    bank: Path, target: str, box: Box, actions: Tensor, num: int, task: Any
+) -> list[Pours]:
+    """Return pours of the same parameters at each action, made where missing."""
+
+    def drawn(part: str, number: int) -> Drawn:
+        block, place = divmod(number, len(actions))
+        seed = derive_seed(0, "around", part, block)
+        with forked_generators(seed):
+            unit = torch.rand(ROWS_A_FILE, 3)
+        low, high = torch.from_numpy(box.low), torch.from_numpy(box.high)
+        theta = (low + unit * (high - low)).float()
+        action = actions[place].expand(ROWS_A_FILE, 3)
+        return Drawn(theta, action, row_seeds(derive_seed(seed, place), ROWS_A_FILE))
+
+    part = f"around_{target}"
+    files = -(-num // ROWS_A_FILE) * len(actions)
+    fill(bank, part, files * ROWS_A_FILE, (0, 1), task.pours, drawn)
+    rows = read_bank(bank, part)
+    found = []
+    for action in actions:
+        mine = (rows.action == action).all(1).numpy()
+        images = images_of(rows.poses[mine], task.pours.particles)
+        found.append(Pours(rows.theta[mine].double().numpy(), images))
+    return found
+
+
+def density(log_p: np.ndarray, place: int, volume: float) -> float:
+    """Return the log density of a cell, where cells fill a volume of the prior."""
+    return float(log_p[place] - logsumexp(log_p) + np.log(len(log_p) / volume))
+
+
+def nearest(cells: np.ndarray, theta: np.ndarray) -> int:
+    """Return which cell's middle is nearest to theta (3,)."""
+    return int(((cells - theta) ** 2).sum(1).argmin())
+
+
+def row_of(
+    own: Campaign, learned: ByAction, box: Box, pours: dict[int, Pours], task: Any
+) -> dict[str, object]:
+    """Return a campaign's row."""
+    cells, middles = box.cells(), GridBelief.middles().double().numpy()
+    inside, truth = box.holds(middles), task.theta_true.double().numpy()
+    distinct = [own.places.index(place) for place in dict.fromkeys(own.places)]
+    few = Campaign(
+        own.seed,
+        [own.places[k] for k in distinct],
+        [own.deltas[k] for k in distinct],
+    )
+    theta = pours[few.places[0]].theta
+    judged = np.arange(min(NUM_JUDGED, len(theta)))
+    log_p = np.zeros((len(judged), len(cells)))
+    for fold in range(NUM_FOLDS):
+        out = judged % NUM_FOLDS == fold
+        rest = np.setdiff1d(np.arange(len(theta)), judged[out])
+        for place in few.places:
+            fitted = pours[place].learn(rest)
+            log_p[out] += fitted.at(cells, pours[place].images[judged[out]])
+    at = np.array([nearest(cells, one) for one in theta[judged]])
+    power = best_power(log_p, log_p[np.arange(len(judged)), at])
+    _, mass = told_by(power * log_p, power * log_p[np.arange(len(judged)), at])
+    reference = [
+        density(power * row, k, box.volume) for row, k in zip(log_p, at, strict=True)
+    ]
+    ours = []
+    for i in judged:
+        belief = belief_of(learned, few, [pours[p].images[i] for p in few.places])
+        own_p = belief.log_density.numpy()[inside]
+        ours.append(density(own_p, nearest(middles[inside], theta[i]), box.volume))
+    images = own.images(task, learned.actions)
+    belief = belief_of(learned, own, images).log_density.numpy()
+    everything = np.arange(len(theta))
+    by_place = {place: pours[place].learn(everything) for place in few.places}
+    whole = sum(
+        by_place[place].at(cells, image[None])[0]
+        for place, image in zip(own.places, images, strict=True)
+    )
+    gap = np.array(reference) - np.array(ours)
+    return {
+        "seed": own.seed,
+        "num_pours": len(theta),
+        "volume": box.volume,
+        "inside": float(np.exp(belief)[inside].sum() / len(belief)),
+        "power": power,
+        "ours": density(belief[inside], nearest(middles[inside], truth), box.volume),
+        "reference": density(power * whole, nearest(cells, truth), box.volume),
+        "left_out_ours": np.mean(ours),
+        "left_out_reference": np.mean(reference),
+        "left_out_se": gap.std(ddof=1) / np.sqrt(len(gap)),
+        "num_left_out": len(gap),
+        "in_half": float((mass <= 0.5).mean()),
+        "in_most": float((mass <= 0.9).mean()),
+    }
+
+
+def summarize(rows: list[dict[str, str]]) -> str:
+    """Return one line a target."""
+    if not rows:
+        return "no campaigns yet"
+    table = []
+    for target in sorted({row["target"] for row in rows}):
+        own = [row for row in rows if row["target"] == target]
+        value = {k: np.array([float(row[k]) for row in own]) for k in COLUMNS[2:]}
+        gap = value["left_out_reference"] - value["left_out_ours"]
+        at_truth = value["reference"] - value["ours"]
+        error = np.sqrt((value["left_out_se"] ** 2).mean() / len(own))
+        table.append(
+            [
+                target,
+                len(own),
+                f"{np.median(value['ours']):.2f}",
+                f"{np.median(value['reference']):.2f}",
+                f"{np.median(at_truth):.2f}",
+                f"{gap.mean():.2f} +- {error:.2f}",
+                f"{value['in_half'].mean():.2f}, {value['in_most'].mean():.2f}",
+                f"{value['num_pours'][0]:.0f} in {value['volume'][0]:.3f}",
+            ]
+        )
+    header = ["target", "campaigns", "log p(truth), ours", "reference", "gap, median"]
+    header += ["gap on left-out parameters", "reference: in 50 %, 90 %"]
+    return as_table(table, [*header, "pours an action, volume"])
+
+
+def run_missing(
+    bank: Path, learned: ByAction, target: str, num: int, results: Path
+) -> None:
+    """Make the rows of a target that are missing."""
+    task: Any = get_task("pouring", target=int(target))
+    path = results / "around.csv"
+    every = campaigns(target, learned.actions, results)
+    beliefs = [
+        belief_of(learned, own, own.images(task, learned.actions)) for own in every
+    ]
+    box = box_around(beliefs)
+    print("box", box.low, box.high, f"volume {box.volume:.3f}", flush=True)
+    places = sorted({place for own in every for place in own.places})
+    found = pour_around(bank, target, box, learned.actions[places], num, task)
+    pours = dict(zip(places, found, strict=True))
+    done = {row["seed"] for row in read(path) if row["target"] == target}
+    for own in every:
+        if str(own.seed) not in done:
+            row = {"target": target} | row_of(own, learned, box, pours, task)
+            append(path, COLUMNS, [row])
+            print(row, flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="A reference of whole campaigns.")
+    parser.add_argument("--bank", type=Path, help="folder of pours")
+    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
+    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
+    parser.add_argument("--rows", type=int, default=250, help="pours an action")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if not arguments.summary:
+        if arguments.bank is None:
+            parser.error("expected --bank FOLDER; got none; make one, see bank.py")
+        learned = kept(arguments.bank, arguments.learned)
+        for target in [arguments.target] if arguments.target else ["1", "2"]:
+            run_missing(
+                arguments.bank, learned, target, arguments.rows, arguments.results
+            )
+    print(summarize(read(arguments.results / "around.csv")))
+
+
+if __name__ == "__main__":
+    main()
