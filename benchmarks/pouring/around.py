@@ -1,6 +1,6 @@
 r"""A reference posterior of whole campaigns, from many pours around the truth.
 
-    python -m benchmarks.pouring.around --bank FOLDER --target 1 --rows 240
+    python -m benchmarks.pouring.around --bank FOLDER --target 1 --rows 200
     python -m benchmarks.pouring.around --summary
 
 How far is the belief of a campaign from what its images can tell? Around the final
@@ -49,7 +49,7 @@ from sbi_active.tasks.pouring import images_of
 
 __all__ = ["Box", "Campaign", "box_around", "summarize"]
 
-OUTSIDE = 0.005  # share of the pooled beliefs beyond each side of the box
+OUTSIDE = 0.02  # share of the pooled beliefs beyond each side of the box
 NUM_CELLS = 14  # along each side of the box, of the reference
 NUM_COMPONENTS = 36
 NUM_FOLDS = 5
@@ -344,7 +344,7 @@ def main() -> None:
     parser.add_argument("--bank", type=Path, help="folder of pours")
     parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
     parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
-    parser.add_argument("--rows", type=int, default=250, help="pours an action")
+    parser.add_argument("--rows", type=int, default=200, help="pours an action")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--summary", action="store_true", help="run nothing")
     arguments = parser.parse_args()

@@ -49,7 +49,17 @@ def summarize(rows: Rows) -> str:
     if material:
         said = sum("unexplained" in r["verdict"] for r in material)
         alarms = sum(r["alarm"] == "True" for r in material)
+        missed = sum(r["verdict"] == "none" for r in material)
+        stand_ins = [r for r in material if r["verdict"] not in ("unexplained", "none")]
+        ratio = [float(r["rmse_after"]) / float(r["rmse_before"]) for r in stand_ins]
+        left = f", which leave {ratio_range(ratio)} of the error" if ratio else ""
         lines.append(
-            f"material: {alarms} of {len(material)} alarms, 'unexplained' in {said}"
+            f"material: {alarms} of {len(material)} alarms; 'unexplained' in {said}, "
+            f"stand-ins in {len(stand_ins)}{left}; 'none' in {missed}"
         )
     return "\n".join(lines)
+
+
+def ratio_range(ratio: list[float]) -> str:
+    """Return the median and the range of some shares."""
+    return f"{np.median(ratio):.2f} ({min(ratio):.2f} to {max(ratio):.2f})"
