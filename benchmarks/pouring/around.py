@@ -84,7 +84,7 @@ class Box:
 
     def holds(self, theta: np.ndarray) -> np.ndarray:
         """Return which of some parameters (n, 3) are inside, shape (n,)."""
-        return ((theta > self.low) & (theta < self.high)).all(1)
+        return np.asarray(((theta > self.low) & (theta < self.high)).all(1))
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Pours:
         mesh, small = (look[among] for look in self.looks)
         mean, axes = components(small, NUM_COMPONENTS)
         summary = np.concatenate([np.sqrt(mesh), (small - mean) @ axes], 1)
-        fitted = ImageLikelihood.fit(self.theta[among], summary, ~mesh.any(1))
+        fitted = ImageLikelihood.fit(self.theta[among], summary, mesh.sum(1) == 0)
         return BothSummaries(fitted, mean, axes)
 
 
@@ -266,10 +266,9 @@ def row_of(
     belief = belief_of(learned, own, images).log_density.numpy()
     everything = np.arange(len(theta))
     by_place = {place: pours[place].learn(everything) for place in few.places}
-    whole = sum(
-        by_place[place].at(cells, image[None])[0]
-        for place, image in zip(own.places, images, strict=True)
-    )
+    whole = np.zeros(len(cells))
+    for place, image in zip(own.places, images, strict=True):
+        whole += by_place[place].at(cells, image[None])[0]
     gap = np.array(reference) - np.array(ours)
     return {
         "seed": own.seed,

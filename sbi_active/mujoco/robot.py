@@ -96,8 +96,8 @@ def from_mjcf(
         sensors: Sensors of the MJCF that are read, None for all; also joints, as in
             "hinge" or "hinge velocity", for which it has no sensor.
         actions: What is chosen in each trial, beside a signal too: its names are
-            joints (start positions), joints with " velocity", actuators (a control
-            that is held), or "model".
+            joints (start positions), joints with ``" velocity"`` behind, actuators
+            (a control that is held), or "model".
         times: At which sensors are read, s from the start of a trial, shape (k,); None
             takes those of the inputs, of the recordings, or they come with the trials.
         noise: Of the sensors, as ``SimulatorModel`` takes it, or standard deviations by

@@ -80,27 +80,31 @@ def residual_figure(bank: Path, kind: str, case: int, number: int) -> Any:
     chosen = tuple(tracing.chosen)
     models: list[tuple[str, str, tuple[str, ...]]] = [("bare model", "none", ())]
     if chosen:
-        models.append((f"with {report.verdict}", " + ".join(chosen), chosen))
-    panels = [("of the set", real.mean(0), "height")]
+        models.append(("verdict's effects", " + ".join(chosen), chosen))
+    panels = [[("of the set", real.mean(0)), None]]
     for title, name, effects in models:
         evidence = tracing.evidences[name]
         x = blocks(simulated_images(kind, case, number, evidence, effects))
-        panels.append((title, x.mean(0), "height"))
-        panels.append((f"residual, {title}", standardized(real, x), "sd"))
-    figure = Figure(figsize=(3.1 * len(panels), 3.1), layout="constrained")
-    top = max(panel.max() for _, panel, unit in panels if unit == "height")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for own, (title, panel, unit) in zip(axes, panels, strict=True):
-        scale = {"vmin": 0, "vmax": top, "cmap": "viridis"}
-        if unit == "sd":
-            scale = {"vmin": -6, "vmax": 6, "cmap": "RdBu_r"}
-        drawn = own.imshow(panel, extent=(-15, 15, 15, -15), **scale)
-        own.set_title(title, fontsize=8)
-        own.set_xlabel("y [cm]", fontsize=8)
-        own.tick_params(labelsize=7)
-        label = "mean height [mm]" if unit == "height" else "sd of the chaos"
-        figure.colorbar(drawn, ax=own, shrink=0.7).set_label(label, fontsize=7)
-    axes[0].set_ylabel("x [cm]", fontsize=8)
+        residual = standardized(real, x)
+        panels.append([(title, x.mean(0)), (f"residual, {title}", residual)])
+    top = max(float(above[1].max()) for above, _ in panels)  # type: ignore[index]
+    figure = Figure(figsize=(3.1 * len(panels), 5.8), layout="constrained")
+    axes = figure.subplots(2, len(panels), squeeze=False)
+    for column, pair in zip(axes.T, panels, strict=True):
+        for own, panel, is_height in zip(column, pair, (True, False), strict=True):
+            if panel is None:
+                own.set_visible(False)
+                continue
+            scale: dict[str, Any] = {"vmin": -6, "vmax": 6, "cmap": "RdBu_r"}
+            if is_height:
+                scale = {"vmin": 0, "vmax": top, "cmap": "viridis"}
+            drawn = own.imshow(panel[1], extent=(-15, 15, 15, -15), **scale)
+            own.set_title(panel[0], fontsize=9)
+            own.set_xlabel("y [cm]", fontsize=8)
+            own.tick_params(labelsize=7)
+            bar = figure.colorbar(drawn, ax=own, shrink=0.8)
+            bar.set_label("mean height [mm]" if is_height else "sd of the chaos")
+    axes[0, 0].set_ylabel("x [cm]", fontsize=8)
     strength = f" {float(truth['phi']):.3g}" if kind == "hidden" else ""
     figure.suptitle(f"{truth['truth']}{strength}: verdict {report.verdict}", fontsize=9)
     return figure

@@ -154,7 +154,7 @@ class Search:
         """Fit one set of effects from its parts, once."""
         if key not in self.found:
             known = [p for p in key.parts if p in self.found]
-            # A set that sampling found may stand where no part but its effects was fitted.
+            # Of a set that sampling found, its effects alone may be what was fitted.
             alone = [ModelKey((name,)) for name in key.effects]
             self.keep(self._fit(key, known or alone))
         return self.found[key]
