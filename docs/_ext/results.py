@@ -112,6 +112,8 @@ TABLES = {
     ),
     "Pouring": (
         "benchmarks.pouring.run --summary",
+        "benchmarks.pouring.around --summary",
+        "benchmarks.pouring.refined --summary",
         "benchmarks.pouring.material.run --summary",
         "benchmarks.pouring.loop.run --summary",
     ),

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 pytest.importorskip("pybullet")
+from benchmarks.pouring import refined  # noqa: E402
 from benchmarks.pouring.around import (  # noqa: E402
     NUM_CELLS,
     Box,
@@ -15,6 +16,7 @@ from benchmarks.pouring.around import (  # noqa: E402
     nearest,
     summarize,
 )
+from benchmarks.pouring.bank import Rows, draw  # noqa: E402
 from benchmarks.pouring.grid_belief import GridBelief  # noqa: E402
 from benchmarks.pouring.run import RESULTS  # noqa: E402
 from benchmarks.rows import read  # noqa: E402
@@ -87,3 +89,26 @@ def test_the_table_has_the_gap_with_its_error():
     assert "0.25" in text
     assert "0.50 +- 0.10" in text
     assert summarize([]) == "no campaigns yet"
+
+
+def test_the_table_of_refined_beliefs_has_all_three():
+    row = dict.fromkeys(refined.COLUMNS, "1.0") | {"target": "2", "gap": "0.4"}
+    row |= {"left_out_ours": "3.9", "left_out_refined": "5.3", "num_left_out": "55"}
+    text = refined.summarize([row, {**row, "seed": "2"}])
+    assert "3.90 / 5.30 / 1.00" in text
+    assert "0.40 +- 0.71" in text
+    assert "110" in text
+
+
+def test_the_bank_gives_the_pours_of_an_action():
+    task = get_task("pouring")
+    drawn = draw(task, "prior", 0)
+    rows = Rows(drawn.theta, drawn.action, np.zeros((50, 100, 7), np.float32), 0.0, {})
+    rows.poses[..., 2] = -1  # nothing is above the ground
+    action = drawn.action[3]
+    found = refined.of_bank(rows, action, task)
+    mine = (drawn.action == action).all(1)
+    np.testing.assert_array_equal(found.theta, drawn.theta[mine].double())
+    assert not found.images.any()
+    both = refined.joined(found, found)
+    assert len(both.theta) == len(both.images) == 2 * int(mine.sum())

@@ -1,0 +1,227 @@
+r"""A campaign's belief refined by pours around it, beside the reference.
+
+    python -m benchmarks.pouring.refined --bank FOLDER --target 2 --pours 100
+    python -m benchmarks.pouring.refined --summary
+
+After its last round a campaign pours parameters drawn uniformly in a box about its own
+belief, 100 at each action that it chose, and learns the likelihoods of these actions
+anew, from these and the bank's pours of the action, by both summaries of each image at
+once. The product over its trials is tempered as the campaign's is.
+
+It is judged as ``around`` judges, in that box and on those pours (which are made there
+first): by the truth and the campaign's own images, and on parameters from which neither
+the reference nor the refinement learned, those within the campaign's own box.
+Resumable; one row a campaign, in ``results/refined.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.pouring.around import (
+    NUM_JUDGED,
+    Box,
+    Campaign,
+    Pours,
+    belief_of,
+    box_around,
+    campaigns,
+    density,
+    nearest,
+    pour_around,
+)
+from benchmarks.pouring.bank import Rows, read_parts
+from benchmarks.pouring.grid_belief import GridBelief
+from benchmarks.pouring.learned import PARTS, ByAction, kept
+from benchmarks.pouring.power import best_power
+from benchmarks.pouring.run import RESULTS, TEMPERED
+from benchmarks.rows import append, read
+from sbi_active.plots import as_table
+from sbi_active.tasks import get_task
+from sbi_active.tasks.pouring import images_of
+
+__all__ = ["of_bank", "summarize"]
+
+COLUMNS = [
+    *["target", "seed", "num_pours", "cpu_pours", "ours", "refined", "reference"],
+    *["left_out_ours", "left_out_refined", "left_out_reference", "gap", "gap_se"],
+    "num_left_out",
+]
+
+
+def of_bank(rows: Rows, action: Tensor, task: Any) -> Pours:
+    """Return the bank's pours at an action."""
+    mine = (rows.action == action).all(1).numpy()
+    images = images_of(rows.poses[mine], task.pours.particles)
+    return Pours(rows.theta[mine].double().numpy(), images)
+
+
+def joined(first: Pours, second: Pours) -> Pours:
+    """Return the pours of both."""
+    theta = np.concatenate([first.theta, second.theta])
+    return Pours(theta, torch.cat([first.images, second.images]))
+
+
+def row_of(
+    bank: Path,
+    target: str,
+    num: int,
+    own: Campaign,
+    learned: ByAction,
+    box: Box,
+    known: dict[int, Pours],
+    task: Any,
+) -> dict[str, object]:
+    """Return a campaign's row."""
+    images = own.images(task, learned.actions)
+    belief = belief_of(learned, own, images)
+    narrow = box_around([belief])
+    places = list(dict.fromkeys(own.places))
+    deltas = [own.deltas[own.places.index(place)] for place in places]
+    start = time.process_time()
+    fresh = pour_around(
+        bank, f"{target}_{own.seed}", narrow, learned.actions[places], num, task
+    )
+    spent = time.process_time() - start
+    stored = read_parts(bank, PARTS)
+    theta, cells = known[places[0]].theta, box.cells()
+    judged = np.nonzero(narrow.holds(theta[:NUM_JUDGED]))[0]
+    rest = np.arange(NUM_JUDGED, len(theta))
+    refined, reference, left_refined, left_reference = (
+        np.zeros((n, len(cells))) for n in (1, 1, len(judged), len(judged))
+    )
+    for place, pours in zip(places, fresh, strict=True):
+        both = joined(pours, of_bank(stored, learned.actions[place], task))
+        mine = both.learn(np.arange(len(both.theta)))
+        other = known[place].learn(rest)
+        seen = torch.stack(
+            [im for im, p in zip(images, own.places, strict=True) if p == place]
+        )
+        refined += mine.at(cells, seen).sum(0)
+        reference += other.at(cells, seen).sum(0)
+        left_refined += mine.at(cells, known[place].images[judged])
+        left_reference += other.at(cells, known[place].images[judged])
+    at = np.array([nearest(cells, theta[i]) for i in judged])
+    power = best_power(left_reference, left_reference[np.arange(len(at)), at])
+    tempered, few = len(own.places) ** -TEMPERED, len(places) ** -TEMPERED
+    truth = nearest(cells, task.theta_true.double().numpy())
+    told = [
+        [density(scale * row, k, box.volume) for row, k in zip(rows, at, strict=True)]
+        for scale, rows in ((few, left_refined), (power, left_reference))
+    ]
+    middles = GridBelief.middles().double().numpy()
+    inside = box.holds(middles)
+
+    def by_bank(campaign: Campaign, some: list[Tensor], parameters: Any) -> float:
+        log_p = belief_of(learned, campaign, some).log_density.numpy()[inside]
+        return density(log_p, nearest(middles[inside], parameters), box.volume)
+
+    alone = Campaign(own.seed, places, deltas)
+    bank_told = [
+        by_bank(alone, [known[p].images[i] for p in places], theta[i]) for i in judged
+    ]
+    gap = np.array(told[1]) - np.array(told[0])
+    return {
+        "target": target,
+        "seed": own.seed,
+        "num_pours": sum(len(pours.theta) for pours in fresh),
+        "cpu_pours": spent,
+        "ours": by_bank(own, images, task.theta_true.double().numpy()),
+        "refined": density(tempered * refined[0], truth, box.volume),
+        "reference": density(power * reference[0], truth, box.volume),
+        "left_out_ours": float(np.mean(bank_told)),
+        "left_out_refined": float(np.mean(told[0])),
+        "left_out_reference": float(np.mean(told[1])),
+        "gap": float(gap.mean()),
+        "gap_se": float(gap.std(ddof=1) / np.sqrt(len(gap))),
+        "num_left_out": len(gap),
+    }
+
+
+def summarize(rows: list[dict[str, str]]) -> str:
+    """Return one line a target."""
+    if not rows:
+        return "no campaigns yet"
+    table = []
+    for target in sorted({row["target"] for row in rows}):
+        own = [row for row in rows if row["target"] == target]
+        value = {k: np.array([float(row[k]) for row in own]) for k in COLUMNS[2:]}
+        names = ("ours", "refined", "reference")
+        error = np.sqrt((value["gap_se"] ** 2).mean() / len(own))
+        table.append(
+            [
+                target,
+                len(own),
+                " / ".join(f"{np.median(value[k]):.2f}" for k in names),
+                " / ".join(f"{value[f'left_out_{k}'].mean():.2f}" for k in names),
+                f"{value['gap'].mean():.2f} +- {error:.2f}",
+                f"{value['num_left_out'].sum():.0f}",
+                f"{value['num_pours'].mean():.0f}, {value['cpu_pours'].mean():.0f}",
+            ]
+        )
+    header = ["target", "campaigns", "log p(truth): bank / refined / reference"]
+    header += ["on left-out parameters", "gap of the refined", "left out"]
+    return as_table(table, [*header, "pours, CPU s"])
+
+
+def run_missing(
+    bank: Path, learned: ByAction, target: str, arguments: argparse.Namespace
+) -> None:
+    """Make the rows of a target that are missing."""
+    task: Any = get_task("pouring", target=int(target))
+    path = arguments.results / "refined.csv"
+    every = campaigns(target, learned.actions, arguments.results)
+    box = box_around(
+        [belief_of(learned, own, own.images(task, learned.actions)) for own in every]
+    )
+    places = sorted({place for own in every for place in own.places})
+    known = pour_around(
+        bank, target, box, learned.actions[places], arguments.rows, task
+    )
+    done = {row["seed"] for row in read(path) if row["target"] == target}
+    for own in every[: arguments.trials]:
+        if str(own.seed) not in done:
+            row = row_of(
+                bank,
+                target,
+                arguments.pours,
+                own,
+                learned,
+                box,
+                dict(zip(places, known, strict=True)),
+                task,
+            )
+            append(path, COLUMNS, [row])
+            print(row, flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Beliefs refined by pours.")
+    parser.add_argument("--bank", type=Path, help="folder of pours")
+    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
+    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
+    parser.add_argument("--rows", type=int, default=200, help="of the reference")
+    parser.add_argument("--pours", type=int, default=100, help="an action")
+    parser.add_argument("--trials", type=int, default=5)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if not arguments.summary:
+        if arguments.bank is None:
+            parser.error("expected --bank FOLDER; got none; make one, see bank.py")
+        learned = kept(arguments.bank, arguments.learned)
+        for target in [arguments.target] if arguments.target else ["1", "2"]:
+            run_missing(arguments.bank, learned, target, arguments)
+    print(summarize(read(arguments.results / "refined.csv")))
+
+
+if __name__ == "__main__":
+    main()
