@@ -6,7 +6,8 @@ r"""A campaign's belief refined by pours around it, beside the reference.
 After its last round a campaign pours parameters drawn uniformly in a box about its own
 belief, 100 at each action that it chose, and learns the likelihoods of these actions
 anew, from these and the bank's pours of the action, by both summaries of each image at
-once. The product over its trials is tempered as the campaign's is.
+once. The product over its trials is taken to the power that tells best of pours in its
+box that were left out.
 
 It is judged as ``around`` judges, in that box and on those pours (which are made there
 first): by the truth and the campaign's own images, and on parameters from which neither
@@ -17,7 +18,6 @@ Resumable; one row a campaign, in ``results/refined.csv``.
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +38,11 @@ from benchmarks.pouring.around import (
     pour_around,
 )
 from benchmarks.pouring.bank import Rows, read_parts
+from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import PARTS, ByAction, kept
 from benchmarks.pouring.power import best_power
-from benchmarks.pouring.run import RESULTS, TEMPERED
+from benchmarks.pouring.run import RESULTS
 from benchmarks.rows import append, read
 from sbi_active.plots import as_table
 from sbi_active.tasks import get_task
@@ -49,8 +50,10 @@ from sbi_active.tasks.pouring import images_of
 
 __all__ = ["of_bank", "summarize"]
 
+NUM_FOLDS = 3
 COLUMNS = [
-    *["target", "seed", "num_pours", "cpu_pours", "ours", "refined", "reference"],
+    *["target", "seed", "num_pours", "cpu_pours", "power"],
+    *["ours", "refined", "reference"],
     *["left_out_ours", "left_out_refined", "left_out_reference", "gap", "gap_se"],
     "num_left_out",
 ]
@@ -69,6 +72,26 @@ def joined(first: Pours, second: Pours) -> Pours:
     return Pours(theta, torch.cat([first.images, second.images]))
 
 
+def power_of(fresh: list[Pours], others: list[Pours], cells: np.ndarray) -> float:
+    """Return the power of a product over actions that tells left-out pours best.
+
+    Args:
+        fresh: Pours of the same parameters at each action.
+        others: More pours at each.
+        cells: Of the box that the parameters are from, shape (m, 3).
+    """
+    theta = fresh[0].theta
+    log_p = np.zeros((len(theta), len(cells)))
+    for fold in range(NUM_FOLDS):
+        out = np.arange(len(theta)) % NUM_FOLDS == fold
+        for pours, more in zip(fresh, others, strict=True):
+            both = joined(pours, more)
+            among = np.nonzero(~np.concatenate([out, np.zeros(len(more.theta), bool)]))
+            log_p[out] += both.learn(among[0]).at(cells, pours.images[out])
+    at = np.array([nearest(cells, one) for one in theta])
+    return best_power(log_p, log_p[np.arange(len(theta)), at])
+
+
 def row_of(
     bank: Path,
     target: str,
@@ -85,20 +108,20 @@ def row_of(
     narrow = box_around([belief])
     places = list(dict.fromkeys(own.places))
     deltas = [own.deltas[own.places.index(place)] for place in places]
-    start = time.process_time()
-    fresh = pour_around(
-        bank, f"{target}_{own.seed}", narrow, learned.actions[places], num, task
-    )
-    spent = time.process_time() - start
+    part = f"{target}_{own.seed}"
+    fresh = pour_around(bank, part, narrow, learned.actions[places], num, task)
+    spent = read_bank(bank, f"around_{part}").cpu_seconds
     stored = read_parts(bank, PARTS)
     theta, cells = known[places[0]].theta, box.cells()
     judged = np.nonzero(narrow.holds(theta[:NUM_JUDGED]))[0]
     rest = np.arange(NUM_JUDGED, len(theta))
+    by_bank_too = [of_bank(stored, learned.actions[place], task) for place in places]
+    refined_power = power_of(fresh, by_bank_too, narrow.cells())
     refined, reference, left_refined, left_reference = (
         np.zeros((n, len(cells))) for n in (1, 1, len(judged), len(judged))
     )
-    for place, pours in zip(places, fresh, strict=True):
-        both = joined(pours, of_bank(stored, learned.actions[place], task))
+    for place, pours, others in zip(places, fresh, by_bank_too, strict=True):
+        both = joined(pours, others)
         mine = both.learn(np.arange(len(both.theta)))
         other = known[place].learn(rest)
         seen = torch.stack(
@@ -110,11 +133,10 @@ def row_of(
         left_reference += other.at(cells, known[place].images[judged])
     at = np.array([nearest(cells, theta[i]) for i in judged])
     power = best_power(left_reference, left_reference[np.arange(len(at)), at])
-    tempered, few = len(own.places) ** -TEMPERED, len(places) ** -TEMPERED
     truth = nearest(cells, task.theta_true.double().numpy())
     told = [
         [density(scale * row, k, box.volume) for row, k in zip(rows, at, strict=True)]
-        for scale, rows in ((few, left_refined), (power, left_reference))
+        for scale, rows in ((refined_power, left_refined), (power, left_reference))
     ]
     middles = GridBelief.middles().double().numpy()
     inside = box.holds(middles)
@@ -133,8 +155,9 @@ def row_of(
         "seed": own.seed,
         "num_pours": sum(len(pours.theta) for pours in fresh),
         "cpu_pours": spent,
+        "power": refined_power,
         "ours": by_bank(own, images, task.theta_true.double().numpy()),
-        "refined": density(tempered * refined[0], truth, box.volume),
+        "refined": density(refined_power * refined[0], truth, box.volume),
         "reference": density(power * reference[0], truth, box.volume),
         "left_out_ours": float(np.mean(bank_told)),
         "left_out_refined": float(np.mean(told[0])),
