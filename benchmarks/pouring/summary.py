@@ -62,7 +62,7 @@ def summarize(cells: Cells) -> str:
                 " / ".join(f"{np.median(v):.2f}" for v in by_round),
                 f"{last.min():.2f} .. {last.max():.2f}",
                 PUBLISHED.get((method, target), "-"),
-                f"{column(rows, 'power', rounds[-1]).mean():.2f}",
+                f"{column(rows, 'power', rounds[-1]).mean():.2f}".replace("nan", "-"),
                 f"{seconds:.0f}",
             ]
         )
@@ -77,7 +77,9 @@ def summarize(cells: Cells) -> str:
                 label,
                 " / ".join(f"{v:.2f}" for v in low),
                 " / ".join(f"{v:.2f}" for v in mesh),
-                " / ".join(f"{v:+.2f}" for v in common),
+                "-"
+                if np.isnan(common).any()
+                else " / ".join(f"{v:+.2f}" for v in common),
             ]
         )
     first = as_table(
