@@ -6,7 +6,7 @@ r"""A reference posterior of whole campaigns, from many pours around the truth.
 How far is the belief of a campaign from what its images can tell? Around the final
 beliefs of a target's campaigns, in a box that holds nearly all of them, parameters are
 drawn uniformly and poured at every action that these campaigns chose: per volume of the
-prior, ten to forty times as many pours as the bank that the belief was learned from.
+prior, ten to thirty times as many pours as the bank that the belief was learned from.
 The reference learns a likelihood of each action from them and from both summaries at
 once (``likelihood``), multiplies it over a campaign's trials, and takes the product to
 the one power that tells left-out parameters best; nothing else tempers it.

@@ -12,7 +12,7 @@ from benchmarks.pouring.loop.emulator import (  # noqa: E402
     pictures_numbers,
 )
 from benchmarks.pouring.loop.picture import blocks, standardized  # noqa: E402
-from benchmarks.pouring.loop.run import poured, truth_of  # noqa: E402
+from benchmarks.pouring.loop.run import averaged, poured, truth_of  # noqa: E402
 from benchmarks.pouring.loop.summary import summarize  # noqa: E402
 from benchmarks.pouring.loop.worlds import draw, get_world, poured_effects  # noqa: E402
 from sbi_active.criticism import Context  # noqa: E402
@@ -54,6 +54,31 @@ def test_numbers_follow_a_picture_that_moves_and_grows():
     assert taller[2, : VOLUME[0]] == pytest.approx(x[2, : VOLUME[0]])
     ratio = (taller[2] ** 2 - 3 / 8) / (x[2] ** 2 - 3 / 8).clip(1e-9)
     assert ratio[list(VOLUME)] == pytest.approx([1.1, 1.1**2])
+
+
+def test_what_is_flat_tells_a_box_from_a_dome():
+    x, y = np.meshgrid(np.arange(150), np.arange(150), indexing="ij")
+    away = np.hypot(x - 70, y - 75) * 2.0  # mm
+    dome = np.sqrt(np.maximum(14.0**2 - away**2, 0))
+    box = np.where((abs(x - 70) < 9) & (abs(y - 75) < 9), 14.0, 0)
+    images = torch.from_numpy(np.stack([dome, box])).reshape(2, -1).float()
+    numbers = pictures_numbers(images, side=2.0)[:, SHIFTS.index(0)] ** 2 - 3 / 8
+    covered = numbers[:, :6].sum(1)
+    flat, gentle = (
+        numbers[:, VOLUME[0] - 2] / covered,
+        numbers[:, VOLUME[0] - 1] / covered,
+    )
+    assert flat[0] < 0.05 < 0.7 < flat[1]
+    assert flat[0] < gentle[0] < 0.3
+
+
+def test_an_outcome_is_the_mean_of_the_pours_of_an_action():
+    action = torch.tensor([[20.0, 0, 2]] * 4 + [[140.0, 0, 2]] * 4)
+    x = torch.arange(16.0).reshape(8, 2)
+    trials = averaged(action, x, ["fit", "fit", "held out", "held out"] * 2)
+    assert len(trials) == 4
+    fitted = trials.x[torch.tensor([r == "fit" for r in trials.role])]
+    assert fitted.tolist() == [[1.0, 2.0], [9.0, 10.0]]
 
 
 def test_offsets_between_shifts_are_interpolated():
