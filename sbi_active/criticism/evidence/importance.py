@@ -16,12 +16,14 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 #: Particles a round, rounds at most, and the effective number that ends them.
-ROUND, MAX_ROUNDS, ENOUGH = 150, 20, 60.0
+ROUND, MAX_ROUNDS, ENOUGH = 100, 30, 50.0
 #: Effective particles that suffice for an evidence far behind another.
 ENOUGH_BEHIND = 20.0
 #: Effective particles below which a round missed the shape, and rounds after which that
 #: is looked at.
 MISSED, LOOKS = 15.0, (0, 7)
+#: Share of effective particles below which they are looked at for the first time.
+POOR = 0.15
 #: Share of the particles that a later round spreads over all of its components, and
 #: the weight of the component that has the sample's own moments.
 DEFENSIVE, OVERALL = 0.5, 0.3
@@ -89,10 +91,11 @@ def importance_sample(
 ) -> ImportanceSample:
     r"""Return the evidence :math:`Z = E_q[p(x | z) p(z) / q(z)]`.
 
-    Where a round that is looked at leaves few effective particles, the next proposes
-    from ``local``; others propose from the same as before with the weights of its
-    components adapted, and with a component of the sample's own moments. All rounds
-    count, each particle weighted by the mixture of all their proposals.
+    Where a round that is looked at leaves few effective particles, and after the first
+    that does, the next proposes from ``local``; others propose from the same as before
+    with the weights of its components adapted, and with a component of the sample's own
+    moments. All rounds count, each particle weighted by the mixture of all their
+    proposals.
 
     Args:
         rival: The model.
@@ -100,7 +103,8 @@ def importance_sample(
         rng: Source of the draws.
         local: Returns such a round's proposal, given the sample so far and the round's
             number; None adapts the first.
-        looks: Rounds after which the effective particles are looked at.
+        looks: Rounds after which the effective particles are looked at, beside the
+            first that leaves few.
         missed: Number of them below which the proposal missed the shape.
         enough: Effective sample size that ends the rounds.
         dismissed: Log evidence below which a model hardly counts, so that 20 effective
@@ -115,7 +119,7 @@ def importance_sample(
     proposals: list[StudentMixture] = []
     particles, targets = np.empty((0, proposal.means.shape[1])), np.empty(0)
     log_q = np.empty(0)  # of each particle, summed over the proposals so far
-    basis = proposal
+    basis, first = proposal, True
     for i in range(MAX_ROUNDS):
         u = proposal.sample(ROUND, rng)
         target = rival.log_prior(u)
@@ -135,8 +139,11 @@ def importance_sample(
         if i == LOOKS[-1] and at_most < hopeless:
             break
         few = sample.effective_sample_size < missed
-        if local is not None and few and i in looks:
-            proposal = basis = local(sample, i)
+        # A first round that looked well may have missed all that counts.
+        few |= first and sample.effective_sample_size < POOR * len(particles)
+        if local is not None and few and (first or i in looks):
+            proposal, first = local(sample, i), False
+            basis = proposal
         else:
             proposal = _adapted(sample, basis)
     return sample

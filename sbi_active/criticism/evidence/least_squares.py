@@ -20,7 +20,7 @@ Array = NDArray[Any]
 #: Sum of squares a number beyond which a point is far from a fit.
 FAR = 5.0
 #: Points along what the data leave open, which spans this many deviations of the prior.
-NUM_POINTS, RANGE = 64, 4.0
+NUM_POINTS, RANGE = 32, 4.0
 #: Iterations that bring a point back to where the data put it.
 RETURN = 5
 #: Iterations of the first phase in two halves and of each later phase.

@@ -23,16 +23,11 @@ from sbi_active.criticism.evidence.importance import (
 )
 from sbi_active.criticism.evidence.jumps import look_for_jumps
 from sbi_active.criticism.evidence.laplace import laplace_sample
-from sbi_active.criticism.evidence.least_squares import (
-    NESTED,
-    ROUGH,
-    THOROUGH,
-    find_modes,
-)
+from sbi_active.criticism.evidence.least_squares import Modes
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.predicted_before import predicted_before
 from sbi_active.criticism.evidence.proposals import regressions, ridges
-from sbi_active.criticism.evidence.starts import starts_near_parents
+from sbi_active.criticism.evidence.searches import search
 from sbi_active.criticism.evidence.tempering import temper
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
@@ -55,7 +50,7 @@ TOO_FEW = 20.0
 #: Nats of a largest likelihood below another's evidence: its own need not be precise.
 HOPELESS = 30.0
 #: Nats by which Laplace's evidence stays below another's, so that nobody samples.
-FAR_BEHIND = 15.0
+FAR_BEHIND = 10.0
 #: The same, so that its evidence is worth no tempering.
 UNLIKELY = 10.0
 #: Particles and moves of the first cross-check by tempering, and the standard errors
@@ -104,6 +99,7 @@ class RivalSet:
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
+        modes: Of some that are not fitted yet.
         look: What least squares found before; None where nobody looked.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
@@ -147,6 +143,7 @@ class RivalSet:
         if self.roughness.any():
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
+        self.modes: dict[ModelKey, Modes] = {}
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -288,11 +285,7 @@ class RivalSet:
         return other.evidence
 
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
-        near = starts_near_parents(self.fits, rival, seed)
-        search = ROUGH
-        if self.is_smooth:
-            search = THOROUGH if near is None else NESTED
-        modes = find_modes(rival, step=self.step, seed=seed, near=near, search=search)
+        modes = self.modes.pop(rival.key, None) or search(self, rival, seed)
         rng = np.random.default_rng(seed)
         behind, best = self._behind(rival, modes.u), self._best_evidence()
         if self.is_smooth and rival.key != ModelKey() and behind > 0:

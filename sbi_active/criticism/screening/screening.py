@@ -66,14 +66,14 @@ def worth_fitting(
     """Return the models of the effects that are worth a fit, and what was set aside.
 
     Prior probabilities stay those of the whole library: what was looked at and set
-    aside counts. With forces of the dictionary fits come with it, since these are too
-    many for others.
+    aside counts. With forces of the dictionary, or with more than 24 effects, fits come
+    with it, since these are too many for others.
 
     Args:
         rivals: The models, with all effects.
     """
     sensor = sensor_error(rivals)
-    if any(map(is_force, rivals.library)) and sensor is not None:
+    if sensor is not None and _fits_with_few(rivals):
         unit, cells = sensor
         few = FewSimulations(rivals, unit, log_priors(rivals.library, ()), cells)
         found = None
@@ -98,6 +98,17 @@ def worth_fitting(
     )
     own.library = rivals.library
     return own, found, None
+
+
+def _fits_with_few(rivals: RivalSet) -> bool:
+    """Return whether models are fitted from their linearizations.
+
+    No column tells of effects on the noise, and unknowns of each trial need a search.
+    """
+    if any(map(is_force, rivals.library)):
+        return True
+    columns = all(e.hook != "noise" for e in rivals.library)
+    return len(rivals.effects) > MANY and columns and not rivals.nuisances
 
 
 def _with_kin(found: Screening, few: FewSimulations) -> Screening:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.searches import is_found_again, promise
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection, ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -36,9 +37,10 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     they are, and the chi-square does not ask. Its false alarms, 1 in 100, are those of
     one look at the data; the Bayes factor's bound holds at any stopping time.
 
-    Before an alarm, the bare model's evidence is computed again by tempering, since a
-    mode that the least-squares search missed would be a false alarm. Among the unknowns
-    of many trials particles are dear, and a second search by least squares is asked.
+    Before an alarm, the bare model is searched again from where other models have its
+    parameters, since a mode that the first search missed would be a false alarm. Where
+    the two disagree, or derivatives mean little, its evidence is computed again by
+    tempering.
 
     Args:
         rivals: The models.
@@ -48,14 +50,18 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
         Ville, Etude critique de la notion de collectif (1939), for any stopping time.
     """
     null = rivals.fit().evidence
-    # First what is likeliest, then what can explain anything: beside them, a hopeless
-    # effect is soon dismissed.
+    # First what is likeliest: beside it, a hopeless effect is soon dismissed.
     weights = alternatives([e.name for e in rivals.library], equivalent)
     look = rivals.look
     first = [] if look is None or look.likeliest is None else [look.likeliest]
+    promising = rivals.effects
+    if not (first or rivals.nuisances):
+        promising = sorted(
+            rivals.effects, key=lambda n: promise(rivals, ModelKey.of(n)), reverse=True
+        )
     found = {
         name: log_evidence(rivals, ModelKey.of(name))
-        for name in dict.fromkeys([*first, UNEXPLAINED, SCATTER, *rivals.effects])
+        for name in dict.fromkeys([*first, UNEXPLAINED, SCATTER, *promising])
     }
     others = [
         (found[name][0] + float(np.log(w)), found[name][1])
@@ -68,7 +74,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     level = LEVEL if rivals.has_known_noise else 0.0
     p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
     is_alarm = log_b - MARGIN * error > THRESHOLD or p_value < level
-    if is_alarm and not (rivals.nuisances and _found_twice(rivals)):
+    if is_alarm and not (rivals.is_smooth and _found_twice(rivals)):
         check = rivals.tempered().log_evidence
         null = rivals.fit().evidence
         log_b, error = bayes_factor(others, log_evidence(rivals))
@@ -93,10 +99,12 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
 
 def _found_twice(rivals: RivalSet) -> bool:
     """Return whether another search ended where the bare model was sampled."""
-    if rivals.look is None:
+    if rivals.look is not None:
+        own = rivals.fit().evidence.best_chi_square
+        return own < rivals.look.null_chi_square + 2 * THRESHOLD
+    if rivals.nuisances:
         return False
-    own = rivals.fit().evidence.best_chi_square
-    return own < rivals.look.null_chi_square + 2 * THRESHOLD
+    return is_found_again(rivals)
 
 
 def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:

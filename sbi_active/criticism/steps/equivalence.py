@@ -40,6 +40,8 @@ FAR = (0.3, 1.0)
 NUM_SEARCH = 6
 #: Share of the rest from which a step has not lowered it.
 ENDED = 0.99
+#: Distance, in noise units, at which a search has found what it looked for.
+FOUND = 1e-4
 #: Parameters at which a pair that is alike near its null is compared far from it.
 NUM_FAR = 2
 
@@ -81,7 +83,10 @@ def equivalent_effects(
         left = _left_over(simulator, coordinates, u, effects, unit, rivals)
         vote = _alike(left, local)
         for i, effect in enumerate(effects, 1):
-            if local[i - 1] and vote[0, 0, i]:
+            lost = votes[1, 0, i] - votes[0, 0, i] > (1 - AGREEMENT) * NUM_THETA
+            if lost:  # whatever the other parameters say
+                vote[0, 0, i] = vote[0, i, 0] = 0.0
+            elif local[i - 1] and vote[0, 0, i]:
                 size = left[i - 1][1]
                 near = _Neighborhood(simulator, coordinates, u, unit, rivals)
                 vote[0, 0, i] = vote[0, i, 0] = float(near.hides(effect, size))
@@ -207,6 +212,8 @@ class _Neighborhood:
             else:
                 promised = np.linalg.norm(rest - slope @ move)
                 has_ended = bool(promised > 0.5 * np.linalg.norm(rest))
+                break
+            if np.linalg.norm(rest) < FOUND:
                 break
         return rest, bool(((v > low) & (v < high)).all()), has_ended
 

@@ -58,7 +58,7 @@ def test_a_model_far_behind_ends_with_fewer_particles():
     assert rows(1e3) < rows(-np.inf)
 
 
-@pytest.mark.parametrize(("above", "rounds"), [(40.0, 8), (-np.inf, 20)])
+@pytest.mark.parametrize(("above", "rounds"), [(40.0, 8), (-np.inf, 30)])
 def test_a_hopeless_model_ends_once_its_shape_was_looked_at(above, rounds):
     """However few particles are effective; here more are asked for than any has."""
     rng, hopeless = np.random.default_rng(1), exact().log_evidence + above
@@ -66,6 +66,34 @@ def test_a_hopeless_model_ends_once_its_shape_was_looked_at(above, rounds):
         linear_rival(), start(1.0), rng=rng, enough=1e9, hopeless=hopeless
     )
     assert len(sample.u) == rounds * ROUND
+
+
+def test_a_first_round_that_looked_well_is_doubted_once_the_next_ones_are_poor():
+    """All its draws lie where the likelihood is flat; what counts is far from them."""
+    rival, asked = linear_rival(), []
+
+    def two(u):
+        near = -0.5 * ((u / 0.4) ** 2).sum(1)
+        far = 200.0 - 0.5 * (((u - 8.0) / 0.05) ** 2).sum(1)
+        return np.logaddexp(near, far)
+
+    rival.log_likelihood = two  # type: ignore[method-assign]
+
+    def local(sample, number):
+        asked.append(number)
+        return StudentMixture(np.full((1, 2), 8.0), 0.02 * np.eye(2)[None])
+
+    # No draw of the first round is of its second part, of a later one many are.
+    first = StudentMixture(
+        np.array([[0.0, 0.0], [8.0, 8.0]]),
+        np.stack([np.eye(2), 0.3 * np.eye(2)]),
+        np.array([0.996, 0.004]),
+    )
+    sample = importance_sample(
+        rival, first, rng=np.random.default_rng(1), local=local, enough=60.0
+    )
+    assert 0 < asked[0] < 7
+    assert (sample.weights @ sample.u) == pytest.approx([7.98, 7.98], abs=0.02)
 
 
 def test_a_likelihood_of_zero_has_no_evidence():

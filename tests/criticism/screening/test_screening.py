@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from torch.distributions import Normal
+from torch.distributions import HalfNormal, Normal
 
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.screening.screening import MANY, screen
+from sbi_active.criticism.screening.screening import MANY, screen, worth_fitting
 from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, TIMES, trials
 
@@ -26,6 +26,10 @@ def ripple(k):
         apply=apply,
         family="ripple",
     )
+
+
+def louder(sd, phi, action, context):
+    return sd * (1 + phi[:, :1])
 
 
 LIBRARY = [*EFFECTS, *[ripple(k) for k in range(MANY)]]
@@ -72,3 +76,13 @@ def test_a_small_library_is_fitted_as_a_whole():
 def test_clean_trials_of_a_large_library_say_none():
     loop = Criticism(MODEL, PRIOR, trials(seed=3), effects=LIBRARY, seed=0)
     assert loop.trace().verdict == "none"
+
+
+def test_a_large_library_takes_fewer_simulations_than_sampling_its_best():
+    own = trials(bias=0.05)
+    loop = Criticism(MODEL, PRIOR, own, effects=LIBRARY, seed=0)
+    loop.trace()
+    assert loop.rivals.simulator.num_simulations < 8_000
+    alone = Effect("noise", hook="noise", prior=HalfNormal(1.0), null=0.0, apply=louder)
+    _, _, few = worth_fitting(rivals(own, [*LIBRARY, alone]))
+    assert few is None  # no column tells of it

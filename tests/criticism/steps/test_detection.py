@@ -1,5 +1,7 @@
 """When the bare model raises an alarm: by its Bayes factor, or by its chi-square."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
@@ -8,6 +10,8 @@ from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.evidence.searches import is_found_again
+from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps import LEVEL, num_determined
 from sbi_active.simulation import estimate_noise
 
@@ -62,6 +66,29 @@ def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
     assert free.level == 0.0
     heavy = criticism(x, action, noise=StudentTNoise(NOISE, df=4.0)).detect()
     assert heavy.level == 0.0
+
+
+def test_the_bare_model_is_searched_again_before_an_alarm():
+    x, action = zigzag(0.0)
+    loop = criticism(x + 5 * NOISE * action**3, action)
+    assert loop.detect().by_evidence
+    assert loop.detect().null_cross_check is None  # two searches agree
+
+
+def test_a_mode_that_the_first_search_missed_is_no_alarm(monkeypatch):
+    """The bare model fits at a second slope, of which an effect's fit knows."""
+    action = torch.linspace(-2, 2, 8)[:, None]
+    gen = torch.Generator().manual_seed(0)
+    truth = torch.tensor([[0.5, 1.0]]).expand(8, -1)
+    x = line(truth, action) + NOISE * torch.randn(8, 1, generator=gen)
+    loop = criticism(x, action)
+    rivals = loop.rivals
+    right = rivals.fit()
+    assert is_found_again(rivals)
+    wrong = replace(right.sample, u=right.sample.u + 2.0)
+    monkeypatch.setitem(rivals.fits, ModelKey(), replace(right, sample=wrong))
+    rivals.fit(ModelKey(("cubic",)))
+    assert not is_found_again(rivals)
 
 
 def test_the_report_says_what_raised_the_alarm():

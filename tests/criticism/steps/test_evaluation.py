@@ -119,4 +119,4 @@ def test_each_trial_is_predicted_from_those_before_it():
         covariance = np.linalg.inv(precision)
         mean = design[t] @ covariance @ design[:t].T @ own[:t] / NOISE**2
         sd = np.sqrt(design[t] @ covariance @ design[t] + NOISE**2)
-        assert made.prequential[t, 0] == pytest.approx((own[t] - mean) / sd, abs=0.25)
+        assert made.prequential[t, 0] == pytest.approx((own[t] - mean) / sd, abs=0.2)
