@@ -95,6 +95,10 @@ TABLES = {
         "benchmarks.misfit.start_states --summary",
     ),
     "Forces that nobody declared": ("benchmarks.forces.run --summary",),
+    "Robots from their MJCF": (
+        "benchmarks.robots.hidden show",
+        "benchmarks.robots.coverage show",
+    ),
     "A chain of many parameters": (
         "benchmarks.chain.run --summary",
         "benchmarks.chain.run --campaign --summary",

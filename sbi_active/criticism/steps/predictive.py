@@ -111,7 +111,9 @@ def predict(
             for effect in rivals.nuisances:  # an unseen trial draws its own
                 fresh = effect.sample(num_draws * len(target))
                 phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
-    mean, unit, probability = simulator.predict(theta, phi)
+    known = trials is None and not simulator.is_stochastic  # are simulated already
+    source = rivals.simulator if known else simulator
+    mean, unit, probability = source.predict(theta, phi)
     at_best = None
     if trials is not None and sample.best is not None and not rivals.nuisances:
         at = rival.coordinates.split(sample.best[None])
@@ -121,8 +123,9 @@ def predict(
     factor = simulator.noise_scale(phi, num_draws)
     factor = np.ones_like(mean) if factor is None else factor
     factor = factor if unit is None else factor * unit
-    center, spread = rivals.prior_predictive(simulator)
-    missing = ~np.isfinite(mean)
+    missing, spread = ~np.isfinite(mean), None
+    if missing.any() or isinstance(rival.error, ResidualProcess):
+        center, spread = rivals.prior_predictive(simulator)
     if missing.any():  # all that is known of such a number is the prior predictive
         wide = spread / noise.typical_sd
         mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
