@@ -67,6 +67,7 @@ def test_a_reference_that_failed_is_no_gap():
     assert "0.20 +- 0.06, 0.29 (0.05), 1 of 4 unknown" in text  # gaps .1, .2, .3
 
 
+@pytest.mark.slow
 def test_references_are_added_to_recorded_trials(tmp_path, monkeypatch):
     task = get_task("box_collision", target=1)
     x = task.real_system(torch.tensor([4.0]), seed=0)

@@ -103,6 +103,7 @@ def test_tanks_err_as_others_found(names, found):
 
 
 @needs_tanks
+@pytest.mark.slow
 def test_pieces_of_the_tanks_tell_as_much_as_the_whole_record():
     records = cascaded_tanks.read_recordings(TANKS)
     pieces, scored = cascaded_tanks.split(records)

@@ -69,6 +69,7 @@ def test_what_is_smooth_is_thinned_with_a_sentence():
     assert np.isfinite(drawn).sum() == 240 // every
 
 
+@pytest.mark.slow
 def test_what_the_sensor_alone_gets_wrong_is_kept():
     criticism = loop(0.0)
     assert criticism.sampling.every == 1

@@ -284,8 +284,13 @@ class RivalSet:
             self.fits[key] = other
         return other.evidence
 
+    def search(self, key: ModelKey) -> Modes:
+        """Return the modes of a rival, from where smaller ones ended."""
+        rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
+        return search(rival, self.fits, self.step, self.is_smooth, seed=seed)
+
     def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
-        modes = self.modes.pop(rival.key, None) or search(self, rival, seed)
+        modes = self.modes.pop(rival.key, None) or self.search(rival.key)
         rng = np.random.default_rng(seed)
         behind, best = self._behind(rival, modes.u), self._best_evidence()
         if self.is_smooth and rival.key != ModelKey() and behind > 0:

@@ -7,17 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import chi2
 
+from sbi_active.criticism.evidence.least_squares import NESTED, find_modes
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.searches import is_found_again, promise
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection, ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
+from sbi_active.seeding import derive_seed
 
 #: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
 #: at any stopping time, with a probability of at most 1/20.
 THRESHOLD = float(np.log(20.0))
 #: Standard errors by which the Bayes factor must exceed the threshold.
 MARGIN = 2.0
+#: Standard error of the bare model's evidence that needs no other estimate, nats.
+SURE = 0.3
+#: Nats by which another search may end higher and count as having found the same.
+NO_MORE = 1.0
 #: Tail probability of the refitted chi-square that is an alarm by itself.
 LEVEL = 0.01
 #: That of what a verdict leaves over, below which it is not all that is missing.
@@ -39,8 +44,8 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
 
     Before an alarm, the bare model is searched again from where other models have its
     parameters, since a mode that the first search missed would be a false alarm. Where
-    the two disagree, or derivatives mean little, its evidence is computed again by
-    tempering.
+    the two disagree, derivatives mean little or the evidence has a large error, it is
+    computed again by tempering.
 
     Args:
         rivals: The models.
@@ -74,7 +79,8 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     level = LEVEL if rivals.has_known_noise else 0.0
     p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
     is_alarm = log_b - MARGIN * error > THRESHOLD or p_value < level
-    if is_alarm and not (rivals.is_smooth and _found_twice(rivals)):
+    sure = rivals.is_smooth and null.standard_error < SURE
+    if is_alarm and not (sure and _found_twice(rivals)):
         check = rivals.tempered().log_evidence
         null = rivals.fit().evidence
         log_b, error = bayes_factor(others, log_evidence(rivals))
@@ -105,6 +111,50 @@ def _found_twice(rivals: RivalSet) -> bool:
     if rivals.nuisances:
         return False
     return is_found_again(rivals)
+
+
+def promise(rivals: RivalSet, key: ModelKey) -> float:
+    """Return the largest log posterior density that a search finds of a model.
+
+    It costs a part of a fit, which then goes on from there.
+
+    Args:
+        rivals: All models.
+        key: Which of them.
+    """
+    if key in rivals.fits:
+        return np.inf
+    rival = rivals.rival(key)
+    modes = rivals.modes[key] = rivals.search(key)
+    return float((rival.log_prior(modes.u) + rival.log_likelihood(modes.u)).max())
+
+
+def is_found_again(rivals: RivalSet) -> bool:
+    """Return whether another search ends where the bare model was sampled.
+
+    It starts where other models have its parameters: what an effect that is there had
+    drawn the first search away from, the model that has it shows.
+
+    Args:
+        rivals: All models, of which some are fitted.
+    """
+    fit, seed = rivals.fit(), derive_seed(rivals.seed, "again")
+    rival = fit.rival
+    others = [other for key, other in rivals.fits.items() if key != ModelKey()]
+    others.sort(key=lambda other: -other.evidence.log_evidence)
+    near = None
+    if others:
+        z = [
+            other.rival.coordinates.to_z(other.likeliest)[:, : rival.dim]
+            for other in others[: NESTED.num_near]
+        ]
+        near = rival.coordinates.from_z(np.concatenate(z))
+    modes = find_modes(rival, step=rivals.step, seed=seed, near=near, search=NESTED)
+    own, again = (
+        float((rival.log_prior(u) + rival.log_likelihood(u)).max())
+        for u in (fit.sample.u, modes.u)
+    )
+    return again < own + NO_MORE
 
 
 def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:

@@ -68,6 +68,7 @@ def aliased():
     return criticism
 
 
+@pytest.mark.slow
 def test_left_out_trials_are_less_sure_of_an_alias():
     tracing = pushed().trace()
     assert tracing.verdict == "action gain + sensor gain"

@@ -49,6 +49,7 @@ def loop(hidden):
     return Criticism(MODEL, PRIOR, hidden, effects=effects, seed=0)
 
 
+@pytest.mark.slow
 def test_differences_of_evidence_are_those_of_samples(few):
     """Importance sampling of the simulator itself, with the prior as declared."""
     keys = [ModelKey((f"{n} of hinge",)) for n in ("sin 2q", "q^3", "v|v|")]
