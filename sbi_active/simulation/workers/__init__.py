@@ -6,7 +6,7 @@ Here lives how rows are run, lost and stored. What a row means does not.
 from sbi_active.simulation.workers.cluster import DaskPool
 from sbi_active.simulation.workers.idle import IDLE
 from sbi_active.simulation.workers.pace import Pace, pace_of
-from sbi_active.simulation.workers.pools import pickled
+from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
 

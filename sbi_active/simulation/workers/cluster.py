@@ -20,7 +20,8 @@ from typing_extensions import override
 
 from sbi_active.messages import warn
 from sbi_active.simulation.workers.calls import Call, Reply, answer
-from sbi_active.simulation.workers.pools import Pool, WorkerPool, pickled
+from sbi_active.simulation.workers.pickling import pickled
+from sbi_active.simulation.workers.pools import Pool, WorkerPool
 
 
 def configured_pool(simulator: Callable[..., Any], num_workers: int) -> Pool | None:

@@ -12,11 +12,11 @@ from math import inf
 from multiprocessing.connection import wait
 from typing import Any
 
-import cloudpickle
 from typing_extensions import override
 
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.idle import IDLE
+from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.processes import Worker, surroundings
 
 
@@ -182,22 +182,6 @@ class _Running:
     def start(self) -> None:
         if self.time_limit is not None:
             self.deadline = time.monotonic() + self.time_limit
-
-
-def pickled(simulator: Callable[..., Any]) -> bytes:
-    """Return the simulator as bytes.
-
-    Raises:
-        TypeError: If it cannot be pickled.
-    """
-    try:
-        return cloudpickle.dumps(simulator)
-    except Exception as error:
-        raise TypeError(
-            "expected a simulator that can travel to another process; got "
-            f"{type(error).__name__}: {error}; open files and engines in the setup "
-            "of a SimulatorModel, or run it here with num_workers=1 and no time_limit"
-        ) from error
 
 
 def _ending(code: int) -> str:
