@@ -17,7 +17,8 @@ Rows (results/coverage.csv): machine, condition, seed, way, CPU seconds of makin
 fitting, verdict of the loop, warnings, and for each parameter truth and interval. Those
 that are there are not run again. Choices were made on seeds below 1000; the table is of
 seeds from 2000 on. The leg needs ``GO2_IN_AIR``, the path of its MJCF, or the folder of
-measured data beside the project; "swimmer" needs gymnasium, whose MJCF it is.
+measured data beside the project; "swimmer" needs gymnasium, whose MJCF it is, and
+"reacher" dm_control.
 """
 
 from __future__ import annotations

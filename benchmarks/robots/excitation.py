@@ -13,11 +13,11 @@ half of the prior, encoders with white noise of 1 mrad at 50 Hz.
 at once, three times over (60 s), with the largest amplitude that keeps the limits of
 position, speed and torque at parameters of the prior.
 *Chosen*: three signals of 8.25 s, one after the other. Each is the best of 150 random
-ones (chirps and multisines of each joint about centers of its own, as large as the same
-limits permit) by the Gauss-Newton information under the belief of that time, the first
-under the prior. *Random* takes the
-first of pools made in the same way. Every belief is that of ``identify`` from the
-simulated recordings.
+ones (chirps and multisines of each joint about centers of its own, with the drives'
+gains as they are or a quarter of that, as large as the same limits permit) by the
+Gauss-Newton information under the belief of that time, the first under the prior.
+*Random* takes the first of pools made in the same way. Every belief is that of
+``identify`` from the simulated recordings.
 
 Recorded: standard deviations of all parameters after each, and whether 90 % intervals
 cover. Seeds below 1000 tune, those from 2000 on judge. Resumable.
@@ -30,7 +30,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -40,12 +40,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
 from benchmarks.rows import append, read
-from sbi_active import DiscreteActions, InformationGainDesigner
+from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
 from sbi_active.mujoco import MotionLimits, Robot, from_mjcf
+from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
 __all__ = ["MACHINES", "main", "score", "summary"]
@@ -57,6 +59,7 @@ SWEEP, SWEEPS, LENGTH, NUM_CHOSEN = 20.0, 3, 8.25, 3  # s
 BAND = 0.1, 10.0  # Hz
 POOL, NUM_SAMPLES = 150, 64
 SCALES = 1.0, 0.7, 0.5, 0.35, 0.25, 0.17, 0.12  # of all shares of a random signal
+SOFT = 0.25  # of a drive's stiffness, in the second model
 LEVEL = 0.9
 
 
@@ -65,7 +68,7 @@ class Machine:
     """A robot with drives, and what it may do.
 
     Attributes:
-        spec: Its MJCF, or a function that makes an ``MjSpec``.
+        spec: Makes an ``MjSpec``.
         joints: Names, in the order of the drives.
         drives: Actuators, whose inputs are goals, rad.
         last: Body whose mass is unknown.
@@ -76,7 +79,7 @@ class Machine:
         bounds: Of damping, armature, dry friction and mass.
     """
 
-    spec: Any
+    spec: Callable[[], Any]
     joints: tuple[str, ...]
     drives: tuple[str, ...]
     last: str
@@ -101,15 +104,13 @@ class Machine:
         return found
 
 
-def _leg() -> Any:
-    from benchmarks.robots.machines import go2_leg
-
-    return go2_leg()
+def _arm() -> Any:
+    return mujoco_of().MjSpec.from_string(ARM)
 
 
 MACHINES = {
     "arm": Machine(
-        ARM,
+        _arm,
         ("shoulder", "elbow"),
         ("shoulder servo", "elbow servo"),
         "lower",
@@ -125,7 +126,7 @@ MACHINES = {
         },
     ),
     "leg": Machine(
-        _leg,
+        go2_leg,
         ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"),
         ("FL_hip", "FL_thigh", "FL_calf"),
         "FL_calf",
@@ -150,7 +151,7 @@ class Played:
     An action has, for each joint, a kind (below .5 a chirp, else a multisine of four),
     the share of the reach that it takes, where its center lies in what is left, and two
     numbers that a chirp takes for the logarithms of its frequencies, a multisine for
-    the band of its own.
+    the band of its own. Behind them stands which gains the drives have.
     """
 
     machine: Machine
@@ -210,14 +211,25 @@ def robot_of(name: str, seconds: float) -> Robot:
         input_times=grid,
     )
     return from_mjcf(
-        machine.spec if isinstance(machine.spec, str) else machine.spec(),
+        [_spec(machine), _spec(machine, SOFT)],
         machine.parameters(),
         inputs=space,
+        actions=DiscreteActions([0.0, 1.0], names=["model"]),
         sensors=[*machine.joints],
         times=np.arange(1 / RATE, seconds, 1 / RATE),
         noise=NOISE,
         start=dict(zip(machine.joints, machine.center, strict=True)),
     )
+
+
+def _spec(machine: Machine, softness: float = 1.0) -> Any:
+    """Return a spec whose drives are softer, as well damped as they are."""
+    spec = machine.spec()
+    for drive in spec.actuators:
+        drive.gainprm[0] *= softness
+        drive.biasprm[1] *= softness
+        drive.biasprm[2] *= softness**0.5
+    return spec
 
 
 def limits_of(name: str, robot: Robot, belief: Any = None) -> MotionLimits:
@@ -239,7 +251,8 @@ def chirps(name: str) -> Tensor:
     robot = robot_of(name, SWEEP)
     num = len(MACHINES[name].joints)
     shares = torch.linspace(1.0, 0.05, 20)
-    action = torch.tensor([[0.0, 1.0, 0.0, 0.0, 1.0] * num]).repeat(len(shares), 1)
+    action = torch.tensor([[0.0, 1.0, 0.0, 0.0, 1.0] * num + [0.0]])
+    action = action.repeat(len(shares), 1)
     action[:, 1::5] = shares[:, None]
     permitted = limits_of(name, robot)(action)
     return action[permitted][:1]
@@ -266,7 +279,7 @@ def permitted_pool(name: str, robot: Robot, belief: Any, seed: int) -> Tensor:
 
 def recorded(robot: Robot, action: Tensor, theta: Tensor, seed: int) -> Trials:
     """Return trials of a simulated robot."""
-    assert isinstance(robot.actions, SignalActions)
+    assert isinstance(robot.actions, MixedActions)
     mean = robot.simulator.mean(theta.expand(len(action), -1), action).double()
     noise = robot.simulator.noise
     assert noise is not None

@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from math import pi
-from pathlib import Path
 from typing import Any
 
-from benchmarks.robots.machines import go2_leg
+from benchmarks.robots.machines import go2_leg, shipped
 from sbi_active.mujoco.models.spec import mujoco_of
 
 SERVO = """<mujoco model="servo">
@@ -50,24 +48,12 @@ class Public:
     seconds: float = 2.0
 
 
-def _shipped(package: str, path: str) -> Any:
-    """Return a spec that ships with a package, its actuators named."""
-    found = find_spec(package)
-    if found is None or found.origin is None:
-        raise ImportError(f"needs {package}; run pip install {package}")
-    spec = mujoco_of().MjSpec.from_file(str(Path(found.origin).parent / path))
-    for number, actuator in enumerate(spec.actuators):
-        if not actuator.name:
-            actuator.name = f"motor {number + 1}"
-    return spec
-
-
 def _suite(name: str) -> Callable[[], Any]:
-    return partial(_shipped, "dm_control", f"suite/{name}.xml")
+    return partial(shipped, "dm_control", f"suite/{name}.xml")
 
 
 def _gymnasium(name: str) -> Callable[[], Any]:
-    return partial(_shipped, "gymnasium", f"envs/mujoco/assets/{name}.xml")
+    return partial(shipped, "gymnasium", f"envs/mujoco/assets/{name}.xml")
 
 
 def _servo() -> Any:

@@ -98,6 +98,7 @@ TABLES = {
     "Robots from their MJCF": (
         "benchmarks.robots.hidden show",
         "benchmarks.robots.coverage show",
+        "benchmarks.robots.excitation --summary",
     ),
     "A chain of many parameters": (
         "benchmarks.chain.run --summary",

@@ -45,13 +45,24 @@ def test_a_pool_keeps_the_limits_and_is_as_large_as_they_permit(monkeypatch):
     robot = robot_of("arm", 2.0)
     limits = limits_of("arm", robot)
     pool = permitted_pool("arm", robot, None, seed=1)
-    assert pool.shape == (6, 10)
+    assert pool.shape == (6, 11)
+    assert {*pool[:, -1].tolist()} <= {0.0, 1.0}
     assert limits(pool).all()
     larger = pool.clone()
     larger[:, 1::5] *= 1 / 0.7  # the next scale above
     whole = (larger[:, 1::5] <= 1).all(1)
     assert whole.any()
     assert not limits(larger)[whole].all()
+
+
+def test_softer_drives_sag_four_times_as_far():
+    robot = robot_of("arm", 2.0)
+    still = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0] * 2])
+    action = torch.cat([still.repeat(2, 1), torch.tensor([[0.0], [1.0]])], 1)
+    theta = torch.tensor([[1.0, 0.05, 0.0, 1.0, 0.05, 0.0, 0.5]]).repeat(2, 1)
+    stiff, soft = robot.simulator.mean(theta, action)[:, -1].double()
+    # The arm is level where it does not sag; soft, gravity pulls it a little less.
+    assert ((soft / stiff > 3.5) & (soft / stiff <= 4.0)).all()
 
 
 def test_the_table_compares_with_the_chirps_of_the_same_case():
