@@ -230,6 +230,7 @@ def _found(
         time_scale=last.posterior.time_scale if m.is_sequence else np.nan,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in weights.items()},
+        instead=choice.instead,
     )
 
 
