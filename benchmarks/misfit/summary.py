@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ def summary(rows: Sequence[Row]) -> list[str]:
     for name, (own, hit) in _measures(groups).items():
         cells = [rate([hit(r, column) for r in own]) for column in ("cause", "helps")]
         lines.append(f"| {name} | {' | '.join(cells)} |")
+    lines += ["", _places(rows)]
     lines += ["", *_calibration(rows), "", *_coverage(groups), "", *_harm(rows)]
     return [*lines, "", *_cost(rows)]
 
@@ -74,6 +76,10 @@ def _measures(
         "CE: right": (of("CE"), _has_all),
         "CE: a wrong name": (of("CE"), _has_wrong),
         "P, where both matter: both": (of("P matters"), _has_all),
+        "P, where both matter: both, or in a stated place": (
+            of("P matters"),
+            _has_all_places,
+        ),
     }
 
 
@@ -96,8 +102,38 @@ def _has_all(row: Row, column: str) -> bool:
     return {*wanted} <= said
 
 
+def _has_all_places(row: Row, column: str) -> bool:
+    """Return whether the true effects are said, or said to be possible in a place.
+
+    Each in a place of its own: two do not stand in that of one.
+    """
+    places = [
+        {name, *json.loads(row["instead"]).get(name, ())} for name in _said(row, column)
+    ]
+    wanted = json.loads(row["true"])
+    return any(
+        all(name in place for name, place in zip(wanted, some, strict=True))
+        for some in permutations(places, len(wanted))
+    )
+
+
 def _has_wrong(row: Row, column: str) -> bool:
     return bool(_said(row, column) - _true(row))
+
+
+def _places(rows: Sequence[Row]) -> str:
+    """Return how many effects are said to be possible in the place of another."""
+    others = [
+        len(json.loads(row["instead"]).get(name, ()))
+        for row in rows
+        for name in json.loads(row["helps"])
+    ]
+    mean = f"{np.mean(others):.2f}" if others else "-"
+    none = rate([n == 0 for n in others])
+    return (
+        f"effects that may stand in the place of one that helps: mean {mean}, none for "
+        f"{none}"
+    )
 
 
 def _calibration(rows: Sequence[Row]) -> list[str]:

@@ -25,6 +25,7 @@ class Outcome:
         cause: Probability that an effect is a cause, by declared effect.
         named: Effects given as a cause.
         helps: Effects said to predict better, those named among them.
+        instead: Effects said to be possible in the place of one that helps.
         intervals: Of theta and phi by name, 90 %, given the effects asked for; empty
             where the loop has no such model.
     """
@@ -34,6 +35,7 @@ class Outcome:
     cause: Mapping[str, float]
     named: tuple[str, ...]
     helps: tuple[str, ...]
+    instead: Mapping[str, Sequence[str]] = field(default_factory=dict)
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -68,5 +70,6 @@ def read_report(report: Report, effects: Sequence[str]) -> Outcome:
         },
         named=tracing.chosen if misfit is None else misfit.named,
         helps=tracing.chosen,
+        instead={} if misfit is None else misfit.instead,
         intervals=intervals,
     )

@@ -57,6 +57,8 @@ class Misfit:
         weights: Of models by their errors on left-out parts, where probabilities are
             too sure; by name, largest first, without those that hardly count. A next
             action is to tell these apart.
+        instead: What may stand in the place of an effect that helps: left-out trials
+            are not surely predicted worse with it there.
     """
 
     models: tuple[ModelError, ...]
@@ -70,6 +72,7 @@ class Misfit:
     time_scale: float
     left_out: str = "trials"
     weights: dict[str, float] = field(default_factory=dict)
+    instead: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def named(self) -> tuple[str, ...]:

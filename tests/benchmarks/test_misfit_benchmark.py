@@ -176,6 +176,7 @@ def scored(kind, true, cause, *, bare=4.0, full=1.0, helps=(), **more):
         "held_verdict": str(bare),
         "held_single": "3.0",
         "helps": json.dumps(helps),
+        "instead": "{}",
         "cause": json.dumps(cause),
         "trial_simulations": "1",
         "cpu_seconds": "1",
@@ -207,3 +208,20 @@ def test_the_summary_counts_what_was_right(tmp_path):
     assert text.count("1.000 (1/1) [0.207, 1.000] |") >= 3
     assert "intervals of theta with misfit: 0.750 (3/4)" in text
     assert "claims of 0.9 to 1: mean 0.93, right 1.000 (2/2)" in text
+
+
+def test_each_of_two_effects_needs_a_place_of_its_own():
+    def text(helps, **instead):
+        row = scored("P", ["lag", "bias"], {"lag": 0.1}, helps=helps)
+        return "\n".join(summary([row | {"instead": json.dumps(instead)}]))
+
+    exact, stated = (
+        f"| P, where both matter: both{or_place} | 0.000 (0/1) [0.000, 0.793] | "
+        for or_place in ("", ", or in a stated place")
+    )
+    found = text(["lag", "gain"], gain=["bias", "drift"])
+    assert exact + "0.000" in found
+    assert stated + "1.000" in found
+    assert "may stand in the place of one that helps: mean 1.00" in found
+    assert stated + "0.000" in text(["lag"], lag=["bias"])
+    assert stated + "1.000" in text(["lag", "bias"], lag=["bias"])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -69,7 +70,7 @@ def lower_factors(cov: Array) -> Array:
     except np.linalg.LinAlgError:
         pass
     safe = np.where(np.isfinite(cov).all((-1, -2), keepdims=True), cov, 0.0)
-    values, vectors = np.linalg.eigh(0.5 * (safe + np.swapaxes(safe, -1, -2)))
+    values, vectors = eigh(0.5 * (safe + np.swapaxes(safe, -1, -2)))
     least = np.maximum(SINGULAR * values[..., -1:], SINGULAR**2)
     root = vectors * np.sqrt(np.maximum(values, least))[..., None, :]
     upper = np.linalg.qr(np.swapaxes(root, -1, -2), mode="r")

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.identification.errors import Grams, Hypotheses
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 
 Array = NDArray[Any]
@@ -227,7 +228,7 @@ def _moved(
     """Return u drawn along the eigenvectors of its precision, within its bounds."""
     full, rhs, free, _ = _conditional(precision, linear, p, present)
     u = np.where(free, u, p.null)
-    values, vectors = np.linalg.eigh(full)
+    values, vectors = eigh(full)
     for j in range(u.shape[1]):
         e = np.where(free, vectors[:, :, j], 0.0)
         e = np.where(np.abs(e) < 1e-12, 0.0, e)

@@ -15,6 +15,7 @@ from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.steps.evaluation import joined, scores, summary
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -89,7 +90,7 @@ def _prediction(misfit: Fitted, key: ModelKey, fold: int, place: int) -> Predict
         cov = cov - gain @ first[:, 1:] @ cov
     at, rows = whole[rest], rows[rest]
     unit = search.unit[at]
-    values, vectors = np.linalg.eigh(cov)
+    values, vectors = eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
     u = mean + rng.normal(size=(NUM_DRAWS, len(root))) @ root.T
     u = np.clip(u, candidate.model.low, candidate.model.high)

@@ -27,6 +27,7 @@ from scipy import stats
 from sbi_active.criticism.misfit.left_out import LeftOut
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import WIDTHS, Errors, Posterior, integrated
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -143,6 +144,6 @@ def _between(action: Array, num: int) -> list[tuple[Array, Array]]:
     for share in SHARES:
         for length in LENGTHS if some.any() else LENGTHS[-1:]:
             kernel = share * np.exp(-0.5 * square / length**2)
-            values, vectors = np.linalg.eigh(kernel + (1 - share) * np.eye(num))
+            values, vectors = eigh(kernel + (1 - share) * np.eye(num))
             found.append((np.clip(values, 0, None), vectors))
     return found

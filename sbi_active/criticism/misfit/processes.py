@@ -28,6 +28,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
 from sbi_active.criticism.steps.nuisances import is_first_part
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -257,7 +258,7 @@ class Errors:
             bases = []
             for kernel in self.kernels:
                 for tau in self.times:
-                    values, vectors = np.linalg.eigh(kernel(apart / tau))
+                    values, vectors = eigh(kernel(apart / tau))
                     bases.append((np.clip(values, 0, None), vectors))
             found.append((places, self.fold[places[:, 0]], bases))
         return found

@@ -34,6 +34,7 @@ from sbi_active.criticism.steps.tracing import (
 )
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -199,7 +200,7 @@ def keep_draws(
 def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:
     """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
     rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
-    values, vectors = np.linalg.eigh(cov)
+    values, vectors = eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
     u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
     return np.clip(u, model.low, model.high)
@@ -230,6 +231,7 @@ def _found(
         time_scale=last.posterior.time_scale if m.is_sequence else np.nan,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in weights.items()},
+        instead=choice.instead,
     )
 
 

@@ -5,9 +5,13 @@ r"""What helps, and what is the cause, when every model is wrong.
    from the others may hold most of a mean square. Without a time axis, where a trial
    is too few numbers to be sure of anything, it has to be within a fifth. The most
    probable of them by the shared evidence is the top.
-2. An effect of the top *helps* if it is more likely there than not, and predicts a
-   left-out trial better with a probability of .8, or the error is twice as large
-   without it; others are dropped, those first without which it is smallest.
+2. Another effect may *stand in the place* of one of a set if with it there a new trial
+   is not predicted worse with a probability of .9: left-out trials do not tell close
+   relatives apart, and evidence beside something undeclared does so for no good reason.
+   An effect of the top *helps* if it, or what may stand in its place, is more likely
+   there than not, and it predicts a left-out trial better with a probability of .8, or
+   the error is twice as large without it; others are dropped, those first without
+   which it is smallest.
 3. The probability that it is the *cause* is its inclusion probability times
    :math:`.85 (1 - u)`, with u the share of the excess error that remains,
 
@@ -86,6 +90,8 @@ class Choice:
         cause: Probability of each effect that helps of being the cause.
         better: Probability that a left-out trial is predicted better with it.
         remains: u, by effect that helps.
+        instead: What may stand in the place of an effect that helps, where anything
+            may (:func:`stand_ins`).
     """
 
     key: ModelKey
@@ -94,6 +100,7 @@ class Choice:
     cause: dict[str, float]
     better: dict[str, float]
     remains: dict[str, float]
+    instead: dict[str, tuple[str, ...]]
 
 
 def choose(
@@ -116,7 +123,10 @@ def choose(
     p = np.exp(log_p - log_sum_exp(log_p))
     order = np.argsort(-p, kind="stable")
     probabilities = {keys[i]: float(p[i]) for i in order}
+    top = next(iter(probabilities))
+    near = stand_ins(models, top, names)
     alike = {n: next((g for g in equivalent if n in g), frozenset({n})) for n in names}
+    alike = {n: group.union(near.get(n, ())) for n, group in alike.items()}
     inclusion = {
         n: sum(v for k, v in probabilities.items() if n in k.effects) for n in names
     }
@@ -124,7 +134,7 @@ def choose(
         n: sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
         for n in names
     }
-    key, better = _pruned(models, next(iter(probabilities)), pooled, BETTER)
+    key, better = _pruned(models, top, pooled, BETTER)
     surer, _ = _pruned(models, key, pooled, SURE)
     remains, cause = {}, {}
     for n in key.effects:
@@ -139,7 +149,40 @@ def choose(
         else:
             share = CERTAIN * (1 - remains[n])
         cause[n] = inclusion[n] * share
-    return Choice(key, probabilities, inclusion, cause, better, remains)
+    instead = stand_ins(models, key, names)
+    return Choice(key, probabilities, inclusion, cause, better, remains, instead)
+
+
+def stand_ins(
+    models: Mapping[ModelKey, Scored], key: ModelKey, names: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return what may stand in the place of each effect of a set, where anything may.
+
+    With it in the place of the effect, and the others as they are, a new trial is not
+    predicted worse with a probability of .9.
+
+    Args:
+        models: Fitted ones; sets that were not fitted do not count.
+        key: The set.
+        names: Of all effects, in the order of the sets.
+    """
+    square = models[key].square
+    found: dict[str, tuple[str, ...]] = {}
+    for n in key.effects:
+        rest = {*key.effects} - {n}
+        sets = {
+            other: ModelKey(tuple(m for m in names if m in {*rest, other}))
+            for other in names
+            if other not in key.effects
+        }
+        near = tuple(
+            other
+            for other, k in sets.items()
+            if k in models and predicts_better(square, models[k].square) < SURE
+        )
+        if near:
+            found[n] = near
+    return found
 
 
 def _pruned(

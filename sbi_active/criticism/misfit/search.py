@@ -33,6 +33,9 @@ Array = NDArray[Any]
 NUM_SCREENED, NUM_STARTS, NUM_KEPT = 128, 12, 4
 #: Draws of a further effect from which its fit starts, beside one near the null.
 NUM_DRAWN = 3
+#: Draws of the prior that are screened, and kept, for a set with an effect that no
+#: number makes vanish: parameters beside it lie far from those without it.
+NUM_FAR, NUM_KEPT_FAR = 32, 6
 #: Deviations of its prior by which a further effect is tried.
 TRIED = 0.3
 #: Iterations that follow a secant, and full ones; rounds of the latter at most.
@@ -236,11 +239,21 @@ class Search:
                 starts.append(u)
         if key in self.rivals.fits:  # what is flat at its null was found by sampling
             starts.append(self.rivals.fits[key].likeliest[0])
+        if not all(map(self._has_null, key.effects)):
+            starts += [*self._screened(key)]
         c = rival.coordinates
         u = np.clip(np.array(starts), c.low, c.high)
         scale = max(min(self.found[p].model.rms for p in parents), 1.0)
         u, cost = self._descend(rival, u, scale, SECANT, secant=True)
         return self._settle(key, u[np.argsort(cost)[:2]])
+
+    def _screened(self, key: ModelKey) -> Array:
+        """Return the draws of a set's prior that are nearest to the trials, (n, d)."""
+        rival = self._rival(key)
+        seed = derive_seed(self._seed, str(key), "screened")
+        u = rival.coordinates.sample(NUM_FAR, seed=seed)
+        square = ((rival.residual(u)[0] / self.unit) ** 2).sum(1)
+        return u[np.argsort(square)[:NUM_KEPT_FAR]]
 
     def _settle(self, key: ModelKey, u: Array) -> LinearModel:
         """Return a model linearized at the best fit from some starts."""

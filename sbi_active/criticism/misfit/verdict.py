@@ -21,6 +21,7 @@ from sbi_active.criticism.misfit.left_out import leave_out
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Posterior
 from sbi_active.criticism.misfit.rule import (
+    NEEDED,
     PASSES,
     SURE,
     Choice,
@@ -31,7 +32,7 @@ from sbi_active.criticism.misfit.rule import (
 from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
-from sbi_active.criticism.results import UNEXPLAINED, ModelKey
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.criticism.under_misfit import NAMED
@@ -94,13 +95,18 @@ class Misfit:
         """Return whether it says more than a verdict of numbers without a time axis.
 
         Numbers that scatter more than declared, each for itself, leave some effect that
-        predicts a few of them better: they give way to a probable cause alone, and so
-        do several effects, which fit much.
+        predicts a few of them better: they give way to a probable cause alone, or to
+        effects that halve the error, each of which surely predicts better. Several
+        effects, which fit much, give way to a probable cause.
         """
         choice = self.choice
         if verdict == UNEXPLAINED:
             return bool(choice.key.effects)
         surely = [n for n in choice.key.effects if choice.better[n] > SURE]
+        if verdict == SCATTER and surely == [*choice.key.effects]:
+            own, bare = (self.search.found[k].left for k in (choice.key, ModelKey()))
+            if bare.mean_square >= NEEDED**2 * own.mean_square:
+                return bool(surely)
         return any(choice.cause[n] > NAMED for n in surely)
 
     @cached_property

@@ -66,10 +66,21 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
             f"Probability of being the cause: {shares}; else something undeclared. Use "
             "it to predict inside the tried range, and do not read phi as physics."
         )
+    found += [
+        f"In place of {n}, {_either(others)} may be there: left-out {misfit.left_out} "
+        "are not surely predicted worse with it."
+        for n, others in misfit.instead.items()
+    ]
     if model.held_out is not None and bare.held_out is not None:
         change = _change(report, bare.held_out, model.held_out)
         found.append(f"On held-out trials: {change}.")
     return " ".join(found)
+
+
+def _either(names: Sequence[str]) -> str:
+    """Return names as in "a, b or c"."""
+    *first, last = names
+    return f"{', '.join(first)} or {last}" if first else last
 
 
 def _described(report: Contents, names: Sequence[str]) -> list[str]:

@@ -35,6 +35,7 @@ from sbi_active.criticism.rivals.error_models import (
     Whitener,
     drawn,
 )
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -106,7 +107,7 @@ class ResidualProcess(ErrorModel):
             features = units[relative][:, None] * _features(*points)
             for k, cell in enumerate(noise.cells):
                 whitened = cell.whiten(features.T).T
-                values, vectors = np.linalg.eigh(whitened.T @ whitened)
+                values, vectors = eigh(whitened.T @ whitened)
                 keep = values > NEGLIGIBLE * max(values.max(), 1e-300)
                 self._bases.append(
                     _Basis(
@@ -268,6 +269,6 @@ def _features(points: Array, channel: Array) -> Array:
     """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
     some = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
     few = points[some], channel[some]
-    values, vectors = np.linalg.eigh(_kernel(few, few))
+    values, vectors = eigh(_kernel(few, few))
     keep = values > NEGLIGIBLE * values.max()
     return _kernel((points, channel), few) @ (vectors[:, keep] / np.sqrt(values[keep]))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
     Proposal,
@@ -321,7 +322,7 @@ def _spread_responsibility(z: Array, k: int, rng: np.random.Generator) -> Array:
 
 def _positive(covariance: Array) -> Array:
     """Return the nearest positive semi-definite matrices; rounding leaves -1e-16."""
-    value, vector = np.linalg.eigh(covariance)
+    value, vector = eigh(covariance)
     return (vector * np.maximum(value, 0.0)[:, None]) @ np.swapaxes(vector, -1, -2)
 
 

@@ -1,5 +1,7 @@
 """The closed loop where every model misses by more than the sensor's error."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -61,6 +63,16 @@ def test_the_report_says_what_remains(named):
     assert report.evaluation.scheme == "leave one out"
     rmse = report.before_after.set_index("metric").loc["RMSE".lower()]
     assert rmse["ratio"] < 0.6
+
+
+def test_the_report_lists_what_may_stand_in_a_place(named):
+    report = named.report()
+    found = report.tracing.misfit
+    assert "lag" not in found.instead  # nothing else predicts as well
+    instead = {"lag": ("cubic", "friction", "coupling")}
+    tracing = replace(report.tracing, misfit=replace(found, instead=instead))
+    text = " ".join(str(replace(report, tracing=tracing)).split())
+    assert "In place of lag, cubic, friction or coupling may be there: left-out" in text
 
 
 def test_a_misfit_that_passes_for_the_sensor_is_known_once_nothing_explains_it(

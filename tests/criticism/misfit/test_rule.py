@@ -113,6 +113,33 @@ def test_effects_that_nothing_separates_share_their_mass():
     assert together.cause[together.key.effects[0]] < 0.5
 
 
+def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
+    """A relative is less probable, and predicts as well; the third effect does not."""
+    several = models(none=(0.0, 101.0), a=(0.0, 50.0), b=(0.0, 50.0), c=(0.0, 95.0))
+    several |= models(c_a=(40.0, 4.0), c_b=(0.0, 4.05), a_b=(0.0, 30.0))
+    several = {
+        ModelKey(tuple(n for n in "abc" if n in key.effects)): own
+        for key, own in several.items()
+    }
+    near = several[ModelKey(("b", "c"))].square[::-1].copy()
+    several[ModelKey(("b", "c"))] = Scored(0.0, near, False)
+    found = choose(several, "abc")
+    assert found.key == ModelKey(("a", "c"))
+    assert found.instead == {"a": ("b",)}
+    worse = {**several, ModelKey(("b", "c")): scored(0.0, 8.0)}
+    assert choose(worse, "abc").instead == {}
+
+
+def test_relatives_that_share_their_mass_help_together():
+    """Neither of two is more likely there than not, and one of them surely is."""
+    several = models(none=(0.0, 101.0), a=(0.0, 30.0), b=(0.0, 30.0), c=(19.5, 4.3))
+    several |= models(a_c=(20.0, 4.0), b_c=(20.1, 4.0))
+    found = choose(several, "abc")
+    assert {n: found.inclusion[n] < 0.5 for n in "ab"} == {"a": True, "b": True}
+    assert found.key == ModelKey(("b", "c"))
+    assert found.instead["b"] == ("a",)
+
+
 def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
     one, other = np.array([1.0, 2.0, 3.0, 4.0]), np.array([2.0, 3.0, 5.0, 4.5])
     assert predicts_better(one, other) > 0.9

@@ -1,6 +1,7 @@
 """Numbers that do not follow each other in time, beside what nobody declared."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -76,6 +77,17 @@ def test_the_report_speaks_of_no_time(beside):
     text = " ".join(str(beside.report(evaluate=False, plan=False)).split())
     assert "an error of unknown size in each number, beside the sensor's" in text
     assert "time scale" not in text
+
+
+def test_scatter_gives_way_to_effects_that_surely_halve_the_error(beside):
+    beside.trace()
+    misfit = beside._misfit
+    assert misfit.replaces("scatter")
+    unnamed = replace(misfit.choice, cause={"quadratic": 0.4})
+    assert replace(misfit, choice=unnamed).replaces("scatter")
+    assert not replace(misfit, choice=unnamed).replaces("step + quadratic")
+    unsure = replace(unnamed, better={"quadratic": 0.85})
+    assert not replace(misfit, choice=unsure).replaces("scatter")
 
 
 def test_a_model_that_fits_is_no_misfit():
