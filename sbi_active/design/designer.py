@@ -146,11 +146,10 @@ class InformationGainDesigner:
             simulator: ``simulator(theta, action)``; not used for the target "model".
             belief: Distribution of the parameters; None is ``model.belief``.
             target: "theta", all parameters; one or several names of the simulator's
-                parameters, the others being nuisances
-                (:class:`.ParameterGain`); or "model", the
-                index of the rivals
-                (:class:`.ModelIndexGain`). The estimates of
-                the latter two are lower bounds.
+                parameters, the others being nuisances (:class:`.ParameterGain`, or
+                :class:`.LinearGain` where the estimator is "linear"); or "model", the
+                index of the rivals (:class:`.ModelIndexGain`). The estimates of
+                ParameterGain and of the latter are lower bounds.
             simulations: Rows under the belief, such as those that the model was trained
                 on; then nothing is simulated. Half of them choose and half report, but
                 where the model has seen them, both are too high.

@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_active.information_gain import (
     InformationGainEstimator,
+    LinearGain,
     ModelIndexGain,
     ParameterGain,
     RivalSampler,
@@ -54,10 +55,11 @@ class Target:
         Raises:
             ValueError: If what the target needs is lacking.
         """
-        if name != "theta" and estimator != "auto":
+        own = ("auto",) if name == "model" else ("auto", "linear")
+        if name != "theta" and estimator not in own:
             raise ValueError(
-                f"expected estimator='auto' for target={name!r}, whose estimator is "
-                f"its own; got {estimator!r}; leave out estimator="
+                f"expected estimator={' or '.join(map(repr, own))} for "
+                f"target={name!r}; got {estimator!r}; leave out estimator="
             )
         if name == "model":
             if not isinstance(model, Sequence) or not simulates:
@@ -90,7 +92,9 @@ class Target:
         if self.name == "model":
             return None
         if self.name != "theta":
-            return ParameterGain(_parameters(self.name, self.simulator))
+            index = _parameters(self.name, self.simulator)
+            is_linear = self.estimator == "linear"
+            return LinearGain(index) if is_linear else ParameterGain(index)
         estimator = find_estimator(self.estimator)
         if estimator is not None and estimator.needs_model and self.model is None:
             raise ValueError(

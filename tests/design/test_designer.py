@@ -151,7 +151,7 @@ def test_named_parameters_are_the_target():
     with pytest.raises(ValueError, match="expected a simulator with parameter_names"):
         designer.select(None, simulator, belief=PRIOR, target="mass")
     nested = InformationGainDesigner(ACTIONS, estimator="nested")
-    with pytest.raises(ValueError, match="expected estimator='auto' for target='mass'"):
+    with pytest.raises(ValueError, match="'auto' or 'linear' for target='mass'"):
         nested.select(None, model, belief=PRIOR, target="mass")
     with pytest.raises(ValueError, match="expected a simulator; got None"):
         designer.select(None, belief=PRIOR)

@@ -2,6 +2,7 @@ r"""Information gain of outcomes of many numbers, as if linear in the parameters
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,8 +41,14 @@ class LinearGain(InformationGainEstimator):
     parameters (and a search of a box takes as many for a twelfth of ``num_samples``).
     Contributions are the jackknife's, whose mean is free of the largest bias.
 
+    For a subset S of the parameters J is the regression on these alone: what the others
+    do counts as noise, whose covariance is that which the belief gives them.
+
     Of heavy tails the standard deviation counts. That an outcome is lost, or a part of
     it, tells nothing here.
+
+    Args:
+        index: Parameters S; None are all.
 
     References:
         Chaloner & Verdinelli, Statistical Science 10 (1995), 273-304 (Bayesian D-
@@ -64,6 +71,9 @@ class LinearGain(InformationGainEstimator):
 
     needs_noise = True
     needs_model = False
+
+    def __init__(self, index: Sequence[int] | None = None) -> None:
+        self.index = None if index is None else list(index)
 
     @override
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
@@ -96,6 +106,7 @@ class LinearGain(InformationGainEstimator):
                 "SimulatorModel(fn, noise=...) around a noise-free fn"
             )
         theta = simulations.theta.double()
+        theta = theta if self.index is None else theta[:, self.index]
         gain = torch.full(mean.shape[:2], torch.nan, dtype=torch.float64)
         for a, row in enumerate(mean):
             y = _rows(noise, row)

@@ -152,3 +152,35 @@ def test_a_designer_takes_it_by_name_with_pending_actions():
     best = float(alone.expected_information_gain.max())
     assert best == pytest.approx(exact(3.0, torch.eye(NUM).double() / 0.01), abs=1.0)
     assert 0 < float(after.expected_information_gain.max()) < 0.3 * best
+
+
+def test_of_some_parameters_it_is_exact_with_the_others_as_nuisances():
+    """I(theta_S; x) = (log |S| - log |S after|) / 2 by the covariances of theta_S."""
+    gain = LinearGain([0, 2])(None, linear_case(GaussianNoise(0.1)), BELIEF)
+    prior = BELIEF.covariance_matrix.double()
+    for k, a in enumerate((0.5, 3.0)):
+        j = jacobian(a)
+        after = (prior.inverse() + j.T @ j / 0.01).inverse()
+        own = [torch.logdet(c[[0, 2]][:, [0, 2]]) for c in (prior, after)]
+        wanted = 0.5 * float(own[0] - own[1])
+        assert float(gain[k].mean()) == pytest.approx(wanted, abs=0.3)
+
+
+def test_a_designer_asks_about_named_parameters():
+    """One action shows the first parameter sharply, the other the second."""
+    model = SimulatorModel(
+        lambda t, a: (t * torch.cat([a, 1 - a], 1)) @ torch.ones(2, 40),
+        noise=GaussianNoise(0.1),
+        parameter_names=["mass", "drag"],
+    )
+    wide = MultivariateNormal(torch.zeros(2), torch.tensor([4.0, 1.0]).diag())
+    designer = InformationGainDesigner(
+        DiscreteActions([0.0, 1.0]), num_samples=100, estimator="linear"
+    )
+
+    def chosen(target):
+        return designer.select(None, model, belief=wide, target=target, seed=0)
+
+    assert [float(chosen(t).action) for t in ("theta", "mass", "drag")] == [1, 1, 0]
+    assert chosen("drag").estimator == "LinearGain"
+    assert abs(float(chosen("drag").expected_information_gain[1])) < 0.2
