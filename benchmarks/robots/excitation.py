@@ -12,11 +12,13 @@ half of the prior, encoders with white noise of 1 mrad at 50 Hz.
 *Chirps* are those of common practice: every joint sweeps from 0.1 to 10 Hz in 20 s, all
 at once, three times over (60 s), with the largest amplitude that keeps the limits of
 position, speed and torque at parameters of the prior.
-*Chosen*: three signals of 8.25 s, one after the other. Each is the best of 150 random
-ones (chirps and multisines of each joint about centers of its own, with the drives'
-gains as they are or a quarter of that, as large as the same limits permit) by the
-Gauss-Newton information under the belief of that time, the first under the prior.
-*Random* takes the first of pools made in the same way. Every belief is that of
+*Chosen*: three signals of 8.25 s, one after the other. Each is the best of some 150 by
+the Gauss-Newton information under the belief of that time, the first under the prior:
+100 random ones (a chirp or a multisine for each joint, about centers of their own) and
+52 plain ones, in which all joints do the same in one of 13 bands; with the drives'
+gains as they are or a quarter of that, and as large as the same limits permit. Asked
+for are the parameters whose deviations are not yet at most those of the chirps.
+*Random* takes the first of such a pool in a random order. Every belief is that of
 ``identify`` from the simulated recordings.
 
 Recorded: standard deviations of all parameters after each, and whether 90 % intervals
@@ -27,7 +29,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +43,7 @@ from torch import Tensor
 
 from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
+from benchmarks.robots.signals import SHARE, Played, largest, plain
 from benchmarks.rows import append, read
 from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
@@ -56,9 +58,7 @@ RESULT = Path(__file__).parent / "results" / "excitation.csv"
 COLUMNS = ["machine", "case", "arm", "seconds", "sds", "covered", "cpu_seconds"]
 NOISE, RATE, GRID = 0.001, 50.0, 200.0  # rad; Hz of encoders and of goals
 SWEEP, SWEEPS, LENGTH, NUM_CHOSEN = 20.0, 3, 8.25, 3  # s
-BAND = 0.1, 10.0  # Hz
-POOL, NUM_SAMPLES = 150, 64
-SCALES = 1.0, 0.7, 0.5, 0.35, 0.25, 0.17, 0.12  # of all shares of a random signal
+NUM_DRAWN, NUM_SAMPLES = 100, 64
 SOFT = 0.25  # of a drive's stiffness, in the second model
 LEVEL = 0.9
 
@@ -144,60 +144,6 @@ MACHINES = {
 }
 
 
-@dataclass(frozen=True)
-class Played:
-    """Goals of all joints, as a generator of signals.
-
-    An action has, for each joint, a kind (below .5 a chirp, else a multisine of four),
-    the share of the reach that it takes, where its center lies in what is left, and two
-    numbers that a chirp takes for the logarithms of its frequencies, a multisine for
-    the band of its own. Behind them stands which gains the drives have.
-    """
-
-    machine: Machine
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the entries."""
-        each = ("kind", "share", "center", "low", "high")
-        return [f"{drive} {what}" for drive in self.machine.drives for what in each]
-
-    def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:
-        """Return the goals, {drive: (n, m)}."""
-        t = input_times - input_times[0]
-        found = {}
-        parts = zip(
-            self.machine.drives,
-            action.split(5, 1),
-            self.machine.center,
-            self.machine.reach,
-            strict=True,
-        )
-        for j, (drive, entries, center, reach) in enumerate(parts):
-            kind, share, place, low, high = (e[:, None] for e in entries.unbind(1))
-            f0, f1 = (_hertz(e) for e in (low, high))
-            sweep = torch.sin(2 * math.pi * (f0 * t + (f1 - f0) * t**2 / (2 * t[-1])))
-            tones = [
-                torch.sin(
-                    2 * math.pi * _hertz(low + (high - low) * k / 3) * t
-                    + 1.7 * j
-                    + k**2
-                )
-                for k in range(4)
-            ]
-            signal = torch.where(kind < 0.5, sweep, torch.stack(tones).sum(0) / 2.5)
-            around = center + (1 - share) * place * reach
-            # The first second leads from rest to the signal.
-            found[drive] = center + t.clamp(max=1.0) * (
-                around - center + share * reach * signal
-            )
-        return found
-
-
-def _hertz(share: Tensor) -> Tensor:
-    return BAND[0] * (BAND[1] / BAND[0]) ** share
-
-
 @cache
 def robot_of(name: str, seconds: float) -> Robot:
     """Return a robot whose trials have a length, with its actions."""
@@ -205,9 +151,9 @@ def robot_of(name: str, seconds: float) -> Robot:
     num = len(machine.joints)
     grid = torch.arange(0, seconds, 1 / GRID, dtype=torch.float64)
     space = SignalActions(
-        Played(machine),
-        [0.0, 0.02, -1.0, 0.0, 0.0] * num,
-        [1.0, 1.0, 1.0, 1.0, 1.0] * num,
+        Played(machine.drives, machine.center, machine.reach),
+        [0.0, SHARE[0], -1.0, 0.0, 0.0] * num,
+        [1.0, SHARE[1], 1.0, 1.0, 1.0] * num,
         input_times=grid,
     )
     return from_mjcf(
@@ -248,33 +194,21 @@ def limits_of(name: str, robot: Robot, belief: Any = None) -> MotionLimits:
 
 def chirps(name: str) -> Tensor:
     """Return the largest permitted chirp of all joints, shape (1, action_dim)."""
-    robot = robot_of(name, SWEEP)
-    num = len(MACHINES[name].joints)
-    shares = torch.linspace(1.0, 0.05, 20)
-    action = torch.tensor([[0.0, 1.0, 0.0, 0.0, 1.0] * num + [0.0]])
-    action = action.repeat(len(shares), 1)
-    action[:, 1::5] = shares[:, None]
-    permitted = limits_of(name, robot)(action)
-    return action[permitted][:1]
+    each = [0.0, SHARE[1], 0.0, 0.0, 1.0]
+    action = torch.tensor([each * len(MACHINES[name].joints) + [0.0]])
+    return largest(action, limits_of(name, robot_of(name, SWEEP)))
 
 
 def permitted_pool(name: str, robot: Robot, belief: Any, seed: int) -> Tensor:
-    """Return random signals as large as the limits permit, (POOL, action_dim)."""
-    limits = limits_of(name, robot, belief)
+    """Return signals as large as the limits permit, in a random order."""
     assert robot.actions is not None
-    found, k = [], 0
-    while sum(map(len, found)) < POOL:
-        left = robot.actions.sample((POOL,), seed=derive_seed(seed, "pool", k))
-        for scale in SCALES:
-            tried = left.clone()
-            tried[:, 1::5] *= scale  # the shares of all joints
-            permitted = limits(tried)
-            found.append(tried[permitted])
-            left = left[~permitted]
-        k += 1
-    pool = torch.cat(found)
+    drawn = robot.actions.sample((NUM_DRAWN,), seed=derive_seed(seed, "pool"))
+    pool = largest(
+        torch.cat([drawn, plain(len(MACHINES[name].joints))]),
+        limits_of(name, robot, belief),
+    )
     with forked_generators(seed):
-        return pool[torch.randperm(len(pool))[:POOL]]
+        return pool[torch.randperm(len(pool))]
 
 
 def recorded(robot: Robot, action: Tensor, theta: Tensor, seed: int) -> Trials:
@@ -320,8 +254,10 @@ def score(name: str, case: int) -> list[dict[str, object]]:
     own = recorded(sweeps, chirps(name).repeat(SWEEPS, 1), theta, case)
     belief = identify(sweeps.simulator, sweeps.prior, own, seed=case)
     keep("chirps", belief, SWEEP * SWEEPS, begin)
+    wanted, names = belief.draws.std(0), robot.simulator.parameter_names or ()
     for arm in ("chosen", "random"):
         begin, action, belief = time.process_time(), [], robot.prior
+        left: list[str] = []
         for k in range(NUM_CHOSEN):
             pool = permitted_pool(name, robot, belief, derive_seed(case, k))
             if arm == "chosen":
@@ -331,12 +267,18 @@ def score(name: str, case: int) -> list[dict[str, object]]:
                     estimator="linear",
                 )
                 pool = designer.select(
-                    None, robot.simulator, belief=belief, seed=derive_seed(case, k)
+                    None,
+                    robot.simulator,
+                    belief=belief,
+                    target=left or "theta",
+                    seed=derive_seed(case, k),
                 ).action[None]
             action.append(pool[:1])
             trials = recorded(robot, torch.cat(action), theta, case)
             belief = identify(robot.simulator, robot.prior, trials, seed=case)
             keep(arm, belief, LENGTH * (k + 1), begin)
+            is_wide = belief.draws.std(0) > wanted
+            left = [name for name, wide in zip(names, is_wide, strict=True) if wide]
     return rows
 
 

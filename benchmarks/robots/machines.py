@@ -260,7 +260,7 @@ def go2_leg() -> Any:
             spec.delete(joint.parent)
     for motor in spec.actuators:
         motor.set_to_position(kp=20.0, kv=1.5)
-        motor.forcerange, motor.ctrlrange = motor.ctrlrange.copy(), [-4.0, 4.0]
+        motor.forcerange, motor.ctrlrange = motor.ctrlrange.copy(), [-8.0, 8.0]
     _read_joints(spec)
     spec.option.timestep = 0.002
     return spec

@@ -12,17 +12,17 @@ if find_spec("mujoco") is None:
 from benchmarks.robots import excitation
 from benchmarks.robots.excitation import (
     MACHINES,
-    Played,
     limits_of,
     permitted_pool,
     robot_of,
     summary,
 )
+from benchmarks.robots.signals import FACTORS, SHARE, Played, largest
 
 
-def test_goals_begin_at_rest_and_stay_within_reach():
+def test_goals_begin_at_rest_and_stay_within_their_share_of_the_reach():
     machine = MACHINES["arm"]
-    played = Played(machine)
+    played = Played(machine.drives, machine.center, machine.reach)
     torch.manual_seed(0)
     action = torch.rand(50, len(played.names))
     action[:, 2::5] = 2 * action[:, 2::5] - 1
@@ -41,18 +41,30 @@ def test_goals_begin_at_rest_and_stay_within_reach():
 
 
 def test_a_pool_keeps_the_limits_and_is_as_large_as_they_permit(monkeypatch):
-    monkeypatch.setattr(excitation, "POOL", 6)
+    monkeypatch.setattr(excitation, "NUM_DRAWN", 6)
     robot = robot_of("arm", 2.0)
     limits = limits_of("arm", robot)
     pool = permitted_pool("arm", robot, None, seed=1)
-    assert pool.shape == (6, 11)
-    assert {*pool[:, -1].tolist()} <= {0.0, 1.0}
+    assert 50 <= len(pool) <= 58
+    assert pool.shape[1] == 11
+    assert {*pool[:, -1].tolist()} == {0.0, 1.0}
     assert limits(pool).all()
     larger = pool.clone()
-    larger[:, 1::5] *= 1 / 0.7  # the next scale above
-    whole = (larger[:, 1::5] <= 1).all(1)
-    assert whole.any()
-    assert not limits(larger)[whole].all()
+    larger[:, 1::5] /= FACTORS[1]  # the next one
+    open_ = (larger[:, 1::5] <= SHARE[1]).all(1)
+    assert open_.any()
+    assert not limits(larger)[open_].any()
+
+
+def test_largest_finds_the_edge_of_a_limit_and_drops_what_has_none():
+    """The share permitted is below a number of each signal, its center."""
+    edges = torch.tensor([5.0, 1.0, 0.1, 0.01])
+    action = torch.tensor([[0.0, 2.0, float(e), 0.0, 1.0, 0.0] for e in edges])
+    found = largest(action, lambda a: a[:, 1] <= a[:, 2])
+    assert found[:, 2].tolist() == edges[:3].tolist()
+    assert float(found[0, 1]) == 2.0
+    for share, edge in zip(found[1:, 1], edges[1:], strict=False):
+        assert FACTORS[1] * edge < share <= edge
 
 
 def test_softer_drives_sag_four_times_as_far():
