@@ -40,7 +40,7 @@ FEWEST = 20.0
 #: Nats by which few draws may overestimate an evidence without a trial.
 OVERESTIMATED = 5.0
 #: Odds against a gross error from which one trial may speak for an effect alone.
-DECISIVE = 150.0
+DECISIVE = 50.0
 
 
 def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
@@ -71,7 +71,7 @@ def is_left_to_chance(tracing: Tracing) -> bool:
     """Return whether the effects of a verdict may be one trial's gross error.
 
     So it is where the verdict falls without the trial that a gross error would be in,
-    and the odds of declared effects against such an error are below 150.
+    and the odds of declared effects against such an error are below 50.
     """
     if not tracing.chosen or not tracing.outliers:
         return False
