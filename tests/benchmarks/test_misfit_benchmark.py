@@ -225,3 +225,13 @@ def test_each_of_two_effects_needs_a_place_of_its_own():
     assert "may stand in the place of one that helps: mean 1.00" in found
     assert stated + "0.000" in text(["lag"], lag=["bias"])
     assert stated + "1.000" in text(["lag", "bias"], lag=["bias"])
+
+
+def test_a_pair_that_was_lost_is_compared_by_its_held_out_error():
+    def text(helps, error):
+        row = scored("P", ["lag", "bias"], {"lag": 0.1}, helps=helps)
+        return "\n".join(summary([row | {"held_true": "2", "held_verdict": error}]))
+
+    assert "of both: median 1.05, at most 1.1 in 1.000 (1/1)" in text(["lag"], "2.1")
+    assert "of both: median 2.00, at most 1.1 in 0.000 (0/1)" in text(["lag"], "4")
+    assert "both are always said to help" in text(["lag", "bias"], "4")
