@@ -137,7 +137,7 @@ def _places(rows: Sequence[Row]) -> str:
 
 
 def _lost_pairs(rows: Sequence[Row]) -> str:
-    """Return what is lost in prediction where one of two effects is not said to help."""
+    """Return what prediction loses where one of two effects is not said to help."""
     lost = [r for r in rows if not _has_all(r, "helps")]
     if not lost:
         return "P, where both matter: both are always said to help"
