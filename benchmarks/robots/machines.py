@@ -211,10 +211,7 @@ READ_ARM = """<sensor><jointpos name="shoulder" joint="shoulder"/>
 
 
 def shipped(package: str, path: str) -> Any:
-    """Return a spec that ships with a package, its actuators named, without textures.
-
-    Textures take most of a compilation, sixty milliseconds of dm_control's models, and
-    move nothing.
+    """Return a spec that ships with a package, its actuators named.
 
     Args:
         package: Name of an installed one, which is not imported.
@@ -227,10 +224,6 @@ def shipped(package: str, path: str) -> Any:
     for number, actuator in enumerate(spec.actuators):
         if not actuator.name:
             actuator.name = f"motor {number + 1}"
-    for geom in spec.geoms:
-        geom.material = ""
-    for picture in [*spec.materials, *spec.textures]:
-        spec.delete(picture)
     return spec
 
 
