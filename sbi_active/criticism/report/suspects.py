@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from sbi_active.criticism.results import OUTLIER, Detection, Tracing
+from sbi_active.criticism.steps.detection import TOO_SMALL
 
 #: Share of the probability that the suspects hold together.
 MASS = 0.9
-#: Tail probability of a chi-square that is too small for the declared noise.
-TOO_SMALL = 1e-4
 
 
 def suspects(tracing: Tracing) -> tuple[float, ...]:
