@@ -33,6 +33,8 @@ def number(value: float) -> str:
 def estimated(mean: float, sd: float, draws: float) -> str:
     """Return a mean with its deviation, or alone where few draws are behind them.
 
+    Nothing for NaN.
+
     Args:
         mean: Of the draws.
         sd: Of the draws.
@@ -42,7 +44,7 @@ def estimated(mean: float, sd: float, draws: float) -> str:
         >>> estimated(0.35992, 0.00071, 400), estimated(0.35992, 0.00071, 3)
         ('0.35992 +- 0.00071', 'about 0.36')
     """
-    if draws >= FEWEST_DRAWS:
+    if draws >= FEWEST_DRAWS or np.isnan(mean):
         return with_error(mean, sd)
     return f"about {mean:.2g}"
 

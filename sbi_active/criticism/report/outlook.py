@@ -9,7 +9,12 @@ import numpy as np
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import METRICS
 from sbi_active.criticism.report.headline import added
-from sbi_active.criticism.report.numbers import number, probability, with_error
+from sbi_active.criticism.report.numbers import (
+    FEWEST_DRAWS,
+    estimated,
+    number,
+    probability,
+)
 from sbi_active.criticism.report.section import Section, called, joined, setting
 from sbi_active.criticism.results import (
     NONE,
@@ -85,16 +90,29 @@ def errors(report: Contents) -> Section:
 def parameters(report: Contents) -> Section:
     """Return theta before and after, and phi."""
     units = {e.name: e.units for e in report.tracing.estimates if e.units}
+    evidences = report.tracing.evidences
+    draws = [
+        evidences[name].effective_sample_size if name in evidences else np.inf
+        for name in (NONE, report.tracing.model)
+    ]
     header = ["parameter", "bare model", f"with {added(report)}"]
     rows = []
     for name, before, before_sd, after, after_sd in report.parameters.itertuples(
         index=False
     ):
         label = f"{name} [{units[name]}]" if name in units else str(name)
-        cells = with_error(before, before_sd), with_error(after, after_sd)
+        cells = (
+            estimated(before, before_sd, draws[0]),
+            estimated(after, after_sd, draws[1]),
+        )
         rows.append((label, *cells))
     together = report.combinations
     text = (f"Of parameters together, {together}.",) if together else ()
+    if min(draws) < FEWEST_DRAWS:
+        text += (
+            f'"about": below {FEWEST_DRAWS:.0f} effective samples are behind it, too '
+            "few for a deviation.",
+        )
     if report.verdict == NONE:
         return Section(
             "Parameters",

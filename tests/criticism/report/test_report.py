@@ -1,6 +1,7 @@
 """The report from its parts: what is printed when, and what the page contains."""
 
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -202,6 +203,18 @@ def test_a_deviation_of_phi_needs_draws_behind_it():
     assert "0.123 +- 0.011 1/m" not in text
     assert "about 0.12 1/m" in text
     assert "below 50 too few for a deviation of phi" in text
+
+
+def test_a_deviation_of_a_parameter_needs_draws_behind_it():
+    made = tracing()
+    few = replace(made.evidences["none"], effective_sample_size=2.2)
+    whole = flat(report())
+    text = flat(report(tracing=replace(made, evidences=made.evidences | {"none": few})))
+    before, after = re.search(r"mu_1 (\S+ \+- \S+) (\S+ \+- \S+)", whole).groups()
+    about = f"about {float(before.split()[0]):.2g}"
+    assert f"mu_1 {about} {after}" in text
+    assert '"about": below 50 effective samples' in text
+    assert "below 50 effective samples" not in whole
 
 
 def test_leaving_one_out_stands_beside_the_evidence():
