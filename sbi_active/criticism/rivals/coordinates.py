@@ -57,7 +57,7 @@ class SearchCoordinates:
     ) -> None:
         self.joint = JointPrior(prior, effects)
         self.nuisances, self.num_trials = [*nuisances], num_trials
-        z = self._raw(NUM_DRAWS, seed=0)
+        z = self._for_units()
         self.dim = z.shape[1]
         low, high = self._bounds()
         q = np.quantile(z, [0.05, 0.95], axis=0)
@@ -152,6 +152,22 @@ class SearchCoordinates:
         for effect in self.nuisances:
             parts.append(np.repeat(np.arange(self.num_trials), effect.phi_dim))
         return np.concatenate(parts).astype(np.int64)
+
+    def _for_units(self) -> Array:
+        """Return draws by which each part has the same units beside any others.
+
+        A null, or an end of another search, is carried from one rival to the next.
+        """
+        with forked_generators(0):
+            parts = [self.joint.prior.sample(torch.Size([NUM_DRAWS])).double()]
+        for effect in self.joint.effects:
+            with forked_generators(0, effect.name):
+                parts.append(effect.sample(NUM_DRAWS).double())
+        for effect in self.nuisances:
+            with forked_generators(0, effect.name):
+                own = effect.sample(NUM_DRAWS * self.num_trials).double()
+            parts.append(own.reshape(NUM_DRAWS, -1))
+        return torch.cat([part.reshape(NUM_DRAWS, -1) for part in parts], -1).numpy()
 
     def _raw(self, num: int, *, seed: int) -> Array:
         with forked_generators(seed):
