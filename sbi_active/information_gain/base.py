@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -191,3 +192,17 @@ class InformationGainEstimator(ABC):
         self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
         """Return the contributions, shape (a, n)."""
+
+
+def distinct(index: Sequence[int]) -> list[int]:
+    """Return the places of some parameters.
+
+    Raises:
+        ValueError: If there is none, or one twice.
+    """
+    if not index or len(set(index)) < len(index):
+        raise ValueError(
+            f"expected one or more different parameters; got {list(index)}; "
+            "name each once"
+        )
+    return list(index)

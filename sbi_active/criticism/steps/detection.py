@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from sbi_active.criticism.evidence.least_squares import NESTED, find_modes
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection, ModelKey
+from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 #: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
 #: at any stopping time, with a probability of at most 1/20.
@@ -30,9 +26,9 @@ SURE = 0.3
 NO_MORE = 1.0
 #: Tail probability of the refitted chi-square that is an alarm by itself.
 LEVEL = 0.01
-#: That of a chi-square which is too small for the declared noise, and steps to the
-#: smallest one then.
-TOO_SMALL, MOST_STEPS = 1e-4, 10
+#: That of a chi-square which is too small for the declared noise; rounds of steps to
+#: the smallest one then.
+TOO_SMALL, ROUNDS, MOST_STEPS = 1e-4, 2, 10
 #: That of what a verdict leaves over, below which it is not all that is missing.
 REFUTED = 0.001
 
@@ -183,24 +179,17 @@ def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
     df = noise.cells[0].df
     core = df / (df - 2) if np.isfinite(df) else 1.0
     p = float(chi2.cdf(core * least, spare))
-    if p >= TOO_SMALL:
+    if not p < TOO_SMALL:
         return least, p
-
     # Where the noise is far too large the draws lie far apart by the trials' own error.
-    def residuals(u: Array) -> Array:
-        return white(rival.residual(np.atleast_2d(u), penalized=False)[0])
-
-    def jacobian(u: Array) -> Array:
-        rows = residuals(np.concatenate([u[None], u + rivals.step * np.eye(len(u))]))
-        return ((rows[1:] - rows[0]) / rivals.step).T
-
-    found = least_squares(
-        lambda u: residuals(u)[0],
-        sample.u[k],
-        jac=jacobian,  # pyright: ignore[reportArgumentType]
-        max_nfev=MOST_STEPS,
-    )
-    least = min(least, 2 * float(found.cost))
+    best = sample.u[[k]]
+    for _ in range(ROUNDS):
+        unit = np.sqrt(least / spare)
+        best, _ = descend(
+            rival, best, lambda r, unit=unit: white(r) / unit, rivals.step, MOST_STEPS
+        )
+        rest = white(rival.residual(best, penalized=False)[0])
+        least = min(least, float((rest**2).sum()))
     return least, float(chi2.cdf(core * least, spare))
 
 

@@ -12,6 +12,7 @@ from typing_extensions import override
 from sbi_active.information_gain.base import (
     CandidateSimulations,
     InformationGainEstimator,
+    distinct,
 )
 from sbi_active.simulation import NoiseModel
 from sbi_active.simulation.noise.whitening import whitened
@@ -50,6 +51,9 @@ class LinearGain(InformationGainEstimator):
     Args:
         index: Parameters S; None are all.
 
+    Raises:
+        ValueError: If no parameter or one twice is named.
+
     References:
         Chaloner & Verdinelli, Statistical Science 10 (1995), 273-304 (Bayesian D-
         optimality); Saerkkae, Bayesian Filtering and Smoothing (2013), section 5
@@ -73,7 +77,7 @@ class LinearGain(InformationGainEstimator):
     needs_model = False
 
     def __init__(self, index: Sequence[int] | None = None) -> None:
-        self.index = None if index is None else list(index)
+        self.index = None if index is None else distinct(index)
 
     @override
     def remarks(self, simulations: CandidateSimulations) -> list[str]:

@@ -15,6 +15,7 @@ from sbi_active.information_gain.base import (
     Bound,
     CandidateSimulations,
     InformationGainEstimator,
+    distinct,
 )
 from sbi_active.information_gain.fits.conditional_density import (
     conditional_members,
@@ -72,12 +73,7 @@ class ParameterGain(InformationGainEstimator):
     needs_model = False
 
     def __init__(self, index: Sequence[int]) -> None:
-        if not index or len(set(index)) < len(index):
-            raise ValueError(
-                f"expected one or more different parameters; got {list(index)}; "
-                "name each once"
-            )
-        self.index = list(index)
+        self.index = distinct(index)
 
     def _contributions(
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
