@@ -290,7 +290,7 @@ def test_signals_out_of_range_and_unknown_actuators_are_said():
     other = SignalActions(
         step("pull", length=1.0), [-1.0, 0.1], [1.0, 0.5], input_times=grid
     )
-    with pytest.raises(ValueError, match="name of a actuator|did you mean 'push'"):
+    with pytest.raises(ValueError, match="name of an actuator|did you mean 'push'"):
         from_mjcf(CART_POLE, {"cart.mass": (0.5, 2)}, inputs=other)
 
 

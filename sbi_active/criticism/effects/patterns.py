@@ -8,6 +8,11 @@ from fnmatch import fnmatchcase
 from sbi_active.criticism.effects.effect import Effect
 
 
+def as_patterns(given: str | Iterable[str]) -> list[str]:
+    """Return a list of patterns, of one or of several."""
+    return [given] if isinstance(given, str) else [*given]
+
+
 def unmatched(effects: Iterable[Effect], patterns: Sequence[str]) -> list[str]:
     """Return the patterns that fit no effect."""
     names = [e.name for e in effects]

@@ -27,8 +27,10 @@ from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
 
-#: Draws of the prior that are screened, starts among them, and those that go on.
+#: Draws of the prior that are screened, starts among them, and those that go on; of
+#: each at least as many a parameter: the more there are, the more optima.
 NUM_SCREENED, NUM_STARTS, NUM_KEPT = 40, 4, 2
+SCREENED_EACH, STARTS_EACH, KEPT_EACH = 13, 1.25, 0.5
 #: Trials in which effects are compared with the simulator at their null.
 NUM_CHECKED = 4
 #: Iterations along a secant, full ones, how often at most the channels' sizes follow,
@@ -248,13 +250,16 @@ def _searched(bare: Rival, spread: Array, seed: int) -> tuple[Array, Array]:
     """Return the best fit without effects, and the size of each channel's residual."""
     c = bare.coordinates
     unit = spread[bare.simulator.measurements.channel]
-    u = np.concatenate([np.zeros((1, c.dim)), c.sample(NUM_SCREENED, seed=seed)])
+    dim = bare.theta_dim
+    screened = max(NUM_SCREENED, SCREENED_EACH * dim)
+    starts, kept = max(NUM_STARTS, STARTS_EACH * dim), max(NUM_KEPT, KEPT_EACH * dim)
+    u = np.concatenate([np.zeros((1, c.dim)), c.sample(screened, seed=seed)])
     u = np.clip(u, c.low, c.high)
     r = bare.residual(u)[0] / unit
-    u = u[np.argsort((r**2).sum(1))[:NUM_STARTS]]
+    u = u[np.argsort((r**2).sum(1))[: int(starts)]]
     rough = 0.1 * unit
     u, cost = descend(bare, u, lambda r: r / rough, STEP, SECANT, secant=True)
-    return _improved(bare, u[np.argsort(cost)[:NUM_KEPT]], unit)
+    return _improved(bare, u[np.argsort(cost)[: int(kept)]], unit)
 
 
 def _improved(rival: Rival, u: Array, unit: Array) -> tuple[Array, Array]:

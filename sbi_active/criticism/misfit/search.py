@@ -36,8 +36,9 @@ NUM_DRAWN = 3
 #: Draws of the prior that are screened, and kept, for a set with an effect that no
 #: number makes vanish: parameters beside it lie far from those without it.
 NUM_FAR, NUM_KEPT_FAR = 32, 6
-#: Deviations of its prior by which a further effect is tried.
-TRIED = 0.3
+#: Deviations of its prior by which a further effect is tried, and the share of them
+#: that hardly acts.
+TRIED, FAINT = 0.3, 0.03
 #: Iterations that follow a secant, and full ones; rounds of the latter at most.
 SECANT, FULL, ROUNDS = 5, 5, 3
 #: A fall of the sum of squares that is worth another round, in units of the residual's
@@ -245,7 +246,26 @@ class Search:
         u = np.clip(np.array(starts), c.low, c.high)
         scale = max(min(self.found[p].model.rms for p in parents), 1.0)
         u, cost = self._descend(rival, u, scale, SECANT, secant=True)
-        return self._settle(key, u[np.argsort(cost)[:2]])
+        found = self._settle(key, u[np.argsort(cost)[:2]])
+        best = min(parents, key=lambda p: self.found[p].model.rms)
+        if found.rms > self.found[best].model.rms:
+            again = self._settle(key, self._faint(key, best)[None])
+            found = again if again.rms < found.rms else found
+        return found
+
+    def _faint(self, key: ModelKey, parent: ModelKey) -> Array:
+        """Return a fit with further effects that hardly act, shape (d,).
+
+        A set fits no worse than its part. Where it seems to, its fit was lost where an
+        effect as strong as its prior holds the machine still, or throws it about.
+        """
+        rival, model = self._rival(key), self.found[parent].model
+        u, columns = np.empty(rival.dim), rival.columns()
+        u[self.columns(key, parent)] = model.u
+        for name in {*key.effects} - {*parent.effects}:
+            null, step = self._null(name)
+            u[columns[name]] = null + FAINT * step
+        return u
 
     def _screened(self, key: ModelKey) -> Array:
         """Return the draws of a set's prior that are nearest to the trials, (n, d)."""

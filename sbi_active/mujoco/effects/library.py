@@ -12,7 +12,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.effects.patterns import picked, unmatched
+from sbi_active.criticism.effects.patterns import as_patterns, picked, unmatched
 from sbi_active.mujoco.effects.actuators import of_actuators
 from sbi_active.mujoco.effects.joints import of_joints
 from sbi_active.mujoco.effects.nominal import Nominal, nominal
@@ -47,8 +47,8 @@ def mjcf_effects(
     *,
     trials: Trials | None = None,
     actions: ActionSpace | None = None,
-    include: Sequence[str] = ("*",),
-    exclude: Sequence[str] = (),
+    include: str | Sequence[str] = "*",
+    exclude: str | Sequence[str] = (),
 ) -> list[Effect]:
     r"""Return what a plain model may lack, with names, units, nulls and priors.
 
@@ -77,8 +77,8 @@ def mjcf_effects(
         trials: Whose actions and inputs say how the robot moves; None takes those of
             a robot, else its signals or actions, else it is released around its start.
         actions: In place of the robot's.
-        include: Patterns of names that are kept, as in "\* friction loss".
-        exclude: Patterns of names that are not.
+        include: Pattern of names that are kept, as in "\* friction loss", or several.
+        exclude: Those that are not.
 
     Raises:
         ValueError: If a pattern fits no effect.
@@ -86,10 +86,11 @@ def mjcf_effects(
     simulator, actions, trials = _simulator(model, actions, trials)
     sizes, call = nominal(simulator, trials, actions)
     every = [*_all(simulator, sizes, trials)]
-    for pattern in unmatched(every, [*include, *exclude]):
+    wanted, without = as_patterns(include), as_patterns(exclude)
+    for pattern in unmatched(every, [*wanted, *without]):
         names = [e.name for e in every]
         require_name(pattern, names, "effect, or a pattern of some,")
-    kept = picked(every, include, exclude)
+    kept = picked(every, wanted, without)
     return _that_matter(simulator, kept, call)
 
 

@@ -24,6 +24,9 @@ Array = NDArray[Any]
 
 #: Rows that are looked at, and states in each.
 NUM_ROWS, NUM_STATES = 4, 200
+#: Share of the states that are usual, and times their root mean square that others
+#: count for at most.
+USUAL, JOLT = 0.95, 10.0
 #: Where nothing says how the robot moves: rad or m from the start, s.
 SPREAD, SECONDS = 0.5, 1.0
 
@@ -210,7 +213,16 @@ def _zeros(model: Any) -> Array:
 
 
 def _rms(value: Array) -> Array:
-    return np.sqrt((value**2).mean(0))
+    """Return root mean squares over states, which no jolt decides, shape (k,).
+
+    A robot that starts beyond a joint's limit is thrown back by hundreds of times what
+    moves it afterwards, and priors as wide would have its fits begin out there.
+    """
+    size = np.abs(value)
+    usual = size <= np.quantile(size, USUAL, axis=0)
+    rms = np.sqrt(np.where(usual, size**2, 0.0).sum(0) / usual.sum(0))
+    most = np.where(rms > 0, JOLT * rms, np.inf)
+    return np.sqrt((np.minimum(size, most) ** 2).mean(0))
 
 
 def _positive(value: Array, otherwise: float) -> Array:

@@ -58,8 +58,10 @@ def require_name(name: str, known: Iterable[str], what: str) -> None:
     hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "correct it"
     listed = ", ".join(map(repr, known[:12])) or "none"
     more = f" and {len(known) - 12} more" if len(known) > 12 else ""
+    article = "an" if what[0] in "aeiou" else "a"
     raise ValueError(
-        f"expected the name of a {what} among {listed}{more}; got {name!r}; {hint}"
+        f"expected the name of {article} {what} among {listed}{more}; got {name!r}; "
+        f"{hint}"
     )
 
 
