@@ -220,7 +220,8 @@ def _rms(value: Array) -> Array:
     """
     size = np.abs(value)
     usual = size <= np.quantile(size, USUAL, axis=0)
-    rms = np.sqrt(np.where(usual, size**2, 0.0).sum(0) / usual.sum(0))
+    count = np.maximum(usual.sum(0), 1)  # none where a state diverged
+    rms = np.sqrt(np.where(usual, size**2, 0.0).sum(0) / count)
     most = np.where(rms > 0, JOLT * rms, np.inf)
     return np.sqrt((np.minimum(size, most) ** 2).mean(0))
 
