@@ -4,7 +4,8 @@ r"""What helps, and what is the cause, when every model is wrong.
    smallest, or is not larger on a new trial with a probability of .9: one trial far
    from the others may hold most of a mean square. Without a time axis, where a trial
    is too few numbers to be sure of anything, it has to be within a fifth. The most
-   probable of them by the shared evidence is the top.
+   probable of them by the shared evidence is the top; with a further effect, where the
+   sets with it or with what may stand in its place are together more probable.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
@@ -13,20 +14,20 @@ r"""What helps, and what is the cause, when every model is wrong.
    the error is twice as large without it; others are dropped, those first without
    which it is smallest.
 3. The probability that it is the *cause* is its inclusion probability times
-   :math:`.85 (1 - u)`, with u the share of the excess error that remains,
+   :math:`.85^k (1 - u)`, with u the share of the excess error that remains,
 
 .. math::
     u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
 
-from mean squared errors M on left-out trials in sensor variances: of the model, of the
-model without the effect and of the bare one. It is the smaller u of two sets: of what
-helps, and of what is left of it where each must predict better with a probability of
-.9, since two that imitate each other both look dispensable. Where the chi-square of a
-model of k effects passes against the sensor nothing remains, and the factor is
-:math:`.85^{k - 1}`: one hardly imitates something undeclared to the sensor's error,
-several do. Without a time axis it is :math:`.85 / (1 + (u / .2)^2)` in either case.
-The thresholds, the .85 and the .2 are empirical: evidence alone, or prediction alone,
-names a stand-in as surely as a cause.
+from mean squared errors M on left-out trials in sensor variances: of the model of k
+effects, of the model without the effect and of the bare one. It is the smaller u of two
+sets: of what helps, and of what is left of it where each must predict better with a
+probability of .9, since two that imitate each other both look dispensable. Several
+effects imitate more easily than one what nobody declared, and each beyond the first
+costs .85. Where the chi-square passes against the sensor nothing remains, and the
+factor is :math:`.85^{k - 1}`. Without a time axis it is
+:math:`.85^k / (1 + (u / .2)^2)` in either case. The thresholds, the .85 and the .2 are
+empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
 from __future__ import annotations
@@ -118,12 +119,8 @@ def choose(
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
     """
-    keys = admitted(models, timed=timed)
-    log_p = np.array([models[key].log_p for key in keys])
-    p = np.exp(log_p - log_sum_exp(log_p))
-    order = np.argsort(-p, kind="stable")
-    probabilities = {keys[i]: float(p[i]) for i in order}
-    top = next(iter(probabilities))
+    probabilities = _probabilities(models, timed=timed)
+    top = _grown(models, probabilities, names)
     near = stand_ins(models, top, names)
     alike = {n: next((g for g in equivalent if n in g), frozenset({n})) for n in names}
     alike = {n: group.union(near.get(n, ())) for n, group in alike.items()}
@@ -139,18 +136,70 @@ def choose(
     remains, cause = {}, {}
     for n in key.effects:
         # Beside one that hardly helps an effect may be missed less than it is alone.
-        found = [_remains(models, k, n) for k in (key, surer) if n in k.effects]
-        remains[n] = min(found)
+        sets = [k for k in (key, surer) if n in k.effects]
+        remains[n], num = min((_remains(models, k, n), len(k.effects)) for k in sets)
         # Few numbers a trial are fitted to the sensor's error by much that is wrong.
         if not timed:
             share = CERTAIN / (1 + (remains[n] / HALF) ** 2)
-        elif models[key].passes:  # several may imitate what nobody declared
-            share = CERTAIN ** (len(key.effects) - 1)
+        elif models[key].passes:
+            share = 1.0
         else:
             share = CERTAIN * (1 - remains[n])
-        cause[n] = inclusion[n] * share
+        # Several imitate more easily than one what nobody declared.
+        cause[n] = inclusion[n] * share * CERTAIN ** (num - 1)
     instead = stand_ins(models, key, names)
     return Choice(key, probabilities, inclusion, cause, better, remains, instead)
+
+
+def likeliest(
+    models: Mapping[ModelKey, Scored], names: Sequence[str], *, timed: bool = True
+) -> ModelKey:
+    """Return the set that the rule starts from; :func:`choose` needs all its parts.
+
+    Args:
+        models: Fitted ones.
+        names: Of all effects.
+        timed: Whether x has a time axis.
+    """
+    return _grown(models, _probabilities(models, timed=timed), names)
+
+
+def _probabilities(
+    models: Mapping[ModelKey, Scored], *, timed: bool
+) -> dict[ModelKey, float]:
+    """Return the probabilities of the admitted models, most probable first."""
+    keys = admitted(models, timed=timed)
+    log_p = np.array([models[key].log_p for key in keys])
+    p = np.exp(log_p - log_sum_exp(log_p))
+    return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
+
+
+def _grown(
+    models: Mapping[ModelKey, Scored],
+    probabilities: Mapping[ModelKey, float],
+    names: Sequence[str],
+) -> ModelKey:
+    """Return the most probable set, with what its relatives say together.
+
+    Relatives share the probability of a further effect. Where the sets with one of
+    them are together more probable than the set without, the likeliest is taken.
+
+    Args:
+        models: Fitted ones.
+        probabilities: Of the admitted ones, most probable first.
+        names: Of all effects.
+    """
+    top = next(iter(probabilities))
+    while True:
+        larger = [k for k in probabilities if top in k.parts]
+        if not larger:
+            return top
+        (new,) = {*larger[0].effects} - {*top.effects}
+        near = {new, *stand_ins(models, larger[0], names).get(new, ())}
+        alike = [k for k in larger if near & {*k.effects}]
+        if sum(probabilities[k] for k in alike) <= probabilities[top]:
+            return top
+        top = larger[0]
 
 
 def stand_ins(

@@ -26,8 +26,8 @@ from sbi_active.criticism.misfit.rule import (
     SURE,
     Choice,
     Scored,
-    admitted,
     choose,
+    likeliest,
 )
 from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
@@ -237,8 +237,7 @@ def settled(
         for key, candidate in search.found.items():
             if key not in scored:
                 scored[key] = score(candidate)
-        likely = admitted(scored, timed=timed)
-        top = max(likely, key=lambda key: scored[key].log_p)
+        top = likeliest(scored, search.names, timed=timed)
         missing = _missing(search, top)
         if not missing:
             return choose(scored, search.names, equivalent, timed=timed)

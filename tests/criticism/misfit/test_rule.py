@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.misfit.rule import Scored, choose, predicts_better
+from sbi_active.criticism.misfit.rule import (
+    Scored,
+    choose,
+    likeliest,
+    predicts_better,
+)
 from sbi_active.criticism.results import ModelKey
 
 WIGGLE = 1 + 0.05 * np.sin(np.arange(8))
@@ -138,6 +143,25 @@ def test_relatives_that_share_their_mass_help_together():
     assert {n: found.inclusion[n] < 0.5 for n in "ab"} == {"a": True, "b": True}
     assert found.key == ModelKey(("b", "c"))
     assert found.instead["b"] == ("a",)
+
+
+def test_relatives_together_more_likely_than_the_set_without_are_in_the_top():
+    """Each is less probable than c alone, one of both is more probable than it."""
+    several = models(none=(0.0, 101.0), a=(0.0, 30.0), b=(0.0, 30.0), c=(20.2, 4.4))
+    several |= models(a_c=(19.9, 4.0), b_c=(20.0, 4.0))
+    assert likeliest(several, "abc") == choose(several, "abc").key
+    assert choose(several, "abc").key == ModelKey(("b", "c"))
+    apart = {**several, ModelKey(("a", "c")): scored(19.9, 4.4)}  # no relative of b
+    assert choose(apart, "abc").key == ModelKey(("c",))
+
+
+def test_a_cause_beside_another_effect_is_less_sure():
+    alone = models(none=(0.0, 101.0), a=(20.0, 11.0), b=(0.0, 101.0))
+    both = alone | models(a_b=(40.0, 5.0))
+    found, one = choose(both, "ab"), choose(alone, "ab")
+    left = 1 - found.remains["a"]
+    assert found.cause["a"] == pytest.approx(0.85**2 * left, abs=1e-3)
+    assert found.cause["a"] < one.cause["a"]
 
 
 def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
