@@ -115,7 +115,7 @@ class OneOutlier(ErrorModel):
         joint = np.moveaxis(self._joint(residual), 2, 3)  # (n, cells, scales, ...)
         log_p = log_sum_exp(joint.reshape(*joint.shape[:3], -1), axis=3)
         cell, scale = drawn(log_p, rng)
-        return cell, self.noise.scales[scale]
+        return cell, self.noise.sizes(self.noise.scales[scale])
 
     @override
     def start(self) -> Whitener:

@@ -30,6 +30,7 @@ from sbi_active.criticism.evidence.proposals import regressions, ridges
 from sbi_active.criticism.evidence.searches import search
 from sbi_active.criticism.evidence.tempering import temper
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
+from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
@@ -190,9 +191,10 @@ class RivalSet:
     def one_outlier(self) -> OneOutlier:
         """Return the noise with a gross error in one trial."""
         if not hasattr(self, "_outlier"):
-            off = np.abs(self.measurements.x - self.center) / self.noise.typical_sd
+            noise = self._common_noise()
+            off = np.abs(self.measurements.x - self.center) / noise.typical_sd
             self._outlier = OneOutlier(
-                self.noise, self.measurements, largest=float(off.max())
+                noise, self.measurements, largest=float(off.max())
             )
         return self._outlier
 
@@ -205,9 +207,10 @@ class RivalSet:
     def residual_process(self) -> ResidualProcess:
         """Return the noise with a smooth function of the action and time."""
         if not hasattr(self, "_process"):
-            sd = self.noise.typical_sd
+            noise = self._common_noise()
+            sd = noise.typical_sd
             self._process = ResidualProcess(
-                self.noise,
+                noise,
                 self.measurements,
                 action=self.scaled_actions(),
                 order=self.scaled_order(),
@@ -215,6 +218,13 @@ class RivalSet:
                 spread=None if self.simulator.is_stochastic else self.spread,
             )
         return self._process
+
+    def _common_noise(self) -> NoiseGrid:
+        """Return the noise, with one unknown size where each channel has its own."""
+        if not isinstance(self.noise, ChannelNoise):
+            return self.noise
+        residual = self.rival(ModelKey()).residual(self.fit().likeliest)[0]
+        return self.noise.settled(residual[0])
 
     def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.

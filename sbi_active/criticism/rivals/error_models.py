@@ -48,14 +48,15 @@ class ErrorModel(ABC):
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], Array]:
-        """Return a cell and a scale of the noise for each residual, at random.
+        """Return a cell and a size of the noise for each residual, at random.
 
         Args:
             residual: Shape (n, N).
             rng: Source of the draws.
 
         Returns:
-            Shapes (n,).
+            Cells, shape (n,), and factors on their deviations, shape (n,), or (n, c)
+            where each channel has its own.
         """
 
     def regimes(self, residual: Array) -> list[Whitener]:
@@ -184,7 +185,15 @@ class NoiseGrid(ErrorModel):
         self, residual: Array, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], Array]:
         cell, scale = drawn(self.joint(residual), rng)
-        return cell, self.scales[scale]
+        return cell, self.sizes(self.scales[scale])
+
+    def sizes(self, scales: Array) -> Array:
+        """Return the sizes of :meth:`noise_posterior` that scales (n,) stand for."""
+        return scales
+
+    def by_number(self, sizes: Array) -> Array:
+        """Return the size of each number, shape (n, N), from those of draws."""
+        return np.broadcast_to(sizes[:, None], (len(sizes), len(self.cells[0].sd)))
 
     @property
     def typical_sd(self) -> Array:
@@ -205,6 +214,15 @@ class NoiseGrid(ErrorModel):
     def with_extra(self, sd: Array) -> NoiseGrid:
         """Return this noise with an independent error of deviation sd, shape (N,)."""
         cells = [replace(cell, sd=np.hypot(cell.sd, sd)) for cell in self.cells]
+        return self.of_cells(cells)
+
+    def part(self, at: NDArray[np.bool_]) -> NoiseGrid:
+        """Return this noise of some of the numbers, shape (N,)."""
+        cells = [replace(c, sd=c.sd[at], rho=c.rho[at]) for c in self.cells]
+        return self.of_cells(cells)
+
+    def of_cells(self, cells: list[NoiseCell]) -> NoiseGrid:
+        """Return noise of other cells, and sizes as here."""
         return NoiseGrid(cells, scales=self.scales, log_weights=self.log_scale_prior)
 
     def _typical(self) -> tuple[NoiseCell, float]:

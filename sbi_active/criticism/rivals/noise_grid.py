@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel, declared_sds
@@ -42,14 +43,12 @@ def declared_noise(
         seed: Of the draws of the posterior.
 
     Raises:
-        ValueError: If a declared standard deviation is zero, or those of several
-            channels are unknown.
+        ValueError: If a declared standard deviation is zero.
     """
     if noise is None:
         one = np.ones(len(measurements))
         return NoiseGrid(_correlated(measurements, one))
     names = noise.parameter_names
-    _require_one_size(noise.posterior)
     if "correlation_time" in names:
         grid = _product(noise.posterior, measurements)
         if grid is not None:
@@ -88,49 +87,35 @@ def declared_noise(
     return NoiseGrid(cells)
 
 
-def _require_one_size(posterior: Distribution | None) -> None:
-    """Raise where several channels have errors of which only the bounds are known."""
-    if not isinstance(posterior, NoisePosterior) or posterior.shared is None:
-        return
-    sd = posterior.sd
-    if not isinstance(sd, SdGrid) or sd.num_channels == 1:
-        return
-    if bool((sd.log_weight == sd.log_weight[:1, :, :1]).all()):
-        raise ValueError(
-            "expected errors of known size in several channels; got bounds of "
-            f"{sd.num_channels}; pass AutocorrelatedNoise(sd=[...], "
-            "correlation_time=...) with one standard deviation a channel, or bring "
-            "the channels to one unit and pass one pair of bounds"
-        )
-
-
 def _product(
     posterior: Distribution | None, measurements: Measurements
 ) -> NoiseGrid | None:
-    """Return the sum over a grid of one standard deviation times a correlation time.
+    """Return the sum over a grid of standard deviations times a correlation time.
 
     None unless the posterior is such a grid with independent parts, as one is that
-    stands for noise of unknown size: a few draws of it would miss what the trials tell
-    of the size to some percent.
+    stands for noise of unknown size, in all channels or in each: a few draws of it
+    would miss what the trials tell of the size to some percent.
     """
     if not isinstance(posterior, NoisePosterior) or posterior.shared is None:
         return None
     sd, shared = posterior.sd, posterior.shared
-    if not isinstance(sd, SdGrid) or sd.num_channels > 1:
+    if not isinstance(sd, SdGrid):
         return None
-    weights = sd.log_weight[:, 0]
+    weights = sd.log_weight
     if not torch.equal(weights, weights[:1].expand_as(weights)):
         return None
-    nodes = sd.nodes[0]
-    middle = float((weights[0].exp() * nodes.log()).sum().exp())
-    unit = np.full(len(measurements), middle)
+    middle = (weights[0].exp() * sd.nodes.log()).sum(1).exp()
+    factors, log_p = (sd.nodes / middle[:, None]).numpy(), weights[0].numpy()
+    channel = _channel_of(measurements, sd.num_channels)
+    unit = middle.numpy()[channel]
     times = (shared.edges[1:] * shared.edges[:-1]).sqrt().tolist()
     cells = [
         NoiseCell.of(measurements, sd=unit, correlation_time=tau, log_weight=w)
         for tau, w in zip(times, shared.log_weight.tolist(), strict=True)
     ]
-    scales = (nodes / middle).numpy()
-    return NoiseGrid(cells, scales=scales, log_weights=weights[0].numpy())
+    if sd.num_channels == 1:
+        return NoiseGrid(cells, scales=factors[0], log_weights=log_p[0])
+    return ChannelNoise(cells, channel=channel, factors=factors, log_factor_prior=log_p)
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:

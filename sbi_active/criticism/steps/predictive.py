@@ -143,8 +143,9 @@ def predict(
             spread=spread,
         )
         mean = mean + shift
-    cells, scales = rival.error.noise_posterior(own_residual, rng)
-    errors, sd = _errors(noise, cells, scales, mean.shape, rng)
+    cells, sizes = rival.error.noise_posterior(own_residual, rng)
+    sizes = noise.by_number(sizes)
+    errors, sd = _errors(noise, cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
@@ -156,7 +157,7 @@ def predict(
         else:
             log_scale = np.log(factor[:, at]).sum(1)
             e = residual / factor[:, at]
-            each[:, t] = _log_density(noise, cells, scales, e, at) - log_scale
+            each[:, t] = _log_density(noise, cells, sizes, e, at) - log_scale
         each[:, t] += flags[t]
     return Prediction(
         mean[:, ~drops],
@@ -174,11 +175,18 @@ def predict(
 def _errors(
     noise: NoiseGrid,
     cells: Array,
-    scales: Array,
-    shape: tuple[int, ...],
+    sizes: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return errors along each trial, and their deviations, shape (n, N)."""
+    """Return errors along each trial, and their deviations, shape (n, N).
+
+    Args:
+        noise: Of the numbers.
+        cells: Of each draw, shape (n,).
+        sizes: Factors on the cell's deviations, shape (n, N).
+        rng: Source of the errors.
+    """
+    shape = sizes.shape
     e = rng.normal(size=shape)
     for i, cell in enumerate(cells):
         df = noise.cells[cell].df
@@ -192,22 +200,20 @@ def _errors(
         for k in range(1, shape[1]):
             step = np.sqrt(1 - rho[:, k] ** 2) * e[:, k]
             u[:, k] = rho[:, k] * u[:, k - 1] + step
-    sd = np.stack([noise.cells[c].sd for c in cells]) * scales[:, None]
+    sd = np.stack([noise.cells[c].sd for c in cells]) * sizes
     return u * sd, sd
 
 
 def _log_density(
-    noise: NoiseGrid, cells: Array, scales: Array, residual: Array, at: Array
+    noise: NoiseGrid, cells: Array, sizes: Array, residual: Array, at: Array
 ) -> Array:
     """Return log densities of one trial's residuals, each in its cell, shape (n,)."""
-    log_p = np.empty(len(residual))
-    for cell, scale in {*zip(cells.tolist(), scales.tolist(), strict=True)}:
-        whole = noise.cells[cell]
-        part = NoiseCell(0.0, whole.sd[at], whole.rho[at], whole.df)
-        own = (cells == cell) & (scales == scale)
-        grid = NoiseGrid([part], scales=np.array([scale]))
-        log_p[own] = grid.log_likelihood(residual[own])
-    return log_p
+    log_p, own_sizes = np.empty(len(residual)), sizes[:, at]
+    for cell in np.unique(cells):
+        whole, own = noise.cells[cell], cells == cell
+        part = NoiseGrid([NoiseCell(0.0, whole.sd[at], whole.rho[at], whole.df)])
+        log_p[own] = part.log_likelihood(residual[own] / own_sizes[own])
+    return log_p - np.log(own_sizes).sum(1)
 
 
 def _independent(residual: Array, sd: Array) -> Array:

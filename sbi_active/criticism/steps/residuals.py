@@ -12,7 +12,6 @@ from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.importance import INFLATION, lower_factors
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
-from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.steps.predictive import Prediction, predict
 from sbi_active.inference.sampling.least_squares import floored
 from sbi_active.inference.sampling.student_mixture import StudentMixture
@@ -123,11 +122,7 @@ def _prequential(rivals: RivalSet, key: ModelKey) -> Array:
     for t, before in zip(order, seen, strict=True):
         log_w = log_p - log_m
         if before.any():
-            cells = [
-                type(c)(c.log_weight, c.sd[before], c.rho[before], c.df)
-                for c in noise.cells
-            ]
-            part = NoiseGrid(cells, scales=noise.scales)
+            part = noise.part(before)
             log_w = log_w + part.log_likelihood(residual[:, before])
         w = np.exp(log_w - log_sum_exp(log_w))
         at = m.trial == t

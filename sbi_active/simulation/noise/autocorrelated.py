@@ -89,8 +89,7 @@ class AutocorrelatedNoise(ScaleNoise):
 
         Args:
             sd: Bounds of the standard deviation, in the units of x; or a pair a
-                channel, whose sizes are then unknown one by one. The closed loop takes
-                one pair alone.
+                channel, whose sizes are then unknown one by one.
             correlation_time: Bounds, s; well below the distance of samples, errors are
                 independent.
             measurement_sd: Of the sensor alone, where it is known, a number or one a

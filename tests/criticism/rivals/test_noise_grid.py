@@ -154,15 +154,6 @@ def test_errors_that_are_known_by_channel_have_their_units_along_a_trajectory():
     assert measurement_sds(AutocorrelatedNoise(1.0, 0.4, measurement_sd=0.2), m) == 0.2
 
 
-def test_sizes_that_are_unknown_by_channel_are_refused():
-    m = Measurements.of(Trials([0.0], torch.zeros(1, 5, 2), sample_times=TIMES))
-    noise = AutocorrelatedNoise.unknown(
-        sd=[(0.1, 3.0), (1.0, 30.0)], correlation_time=(0.05, 2.0)
-    )
-    with pytest.raises(ValueError, match="got bounds of 2; pass AutocorrelatedNoise"):
-        declared_noise(noise, m)
-
-
 def test_scatter_is_a_half_normal_inflation():
     m = Measurements.of(Trials([0.0, 1.0, 2.0, 3.0], [1.0, -3.0, 2.0, 0.5]))
     noise = declared_noise(GaussianNoise(0.5), m)
