@@ -4,15 +4,17 @@ r"""What helps, and what is the cause, when every model is wrong.
    smallest, or is not larger on a new trial with a probability of .9: one trial far
    from the others may hold most of a mean square. Without a time axis, where a trial
    is too few numbers to be sure of anything, it has to be within a fifth. The most
-   probable of them by the shared evidence is the top; with a further effect, where the
-   sets with it or with what may stand in its place are together more probable.
+   probable of them by the shared evidence is the top.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
    An effect of the top *helps* if it, or what may stand in its place, is more likely
    there than not, and it predicts a left-out trial better with a probability of .8, or
    the error is twice as large without it; others are dropped, those first without
-   which it is smallest.
+   which it is smallest. Relatives share the probability of a further effect: where the
+   sets with it, or with what may stand in its place, are together more probable than
+   the top, the likeliest of them is tried as the top, and counts where it adds to what
+   helps.
 3. The probability that it is the *cause* is its inclusion probability times
    :math:`.85^k (1 - u)`, with u the share of the excess error that remains,
 
@@ -120,18 +122,27 @@ def choose(
         timed: Whether x has a time axis.
     """
     probabilities = _probabilities(models, timed=timed)
-    top = _grown(models, probabilities, names)
-    near = stand_ins(models, top, names)
-    alike = {n: next((g for g in equivalent if n in g), frozenset({n})) for n in names}
-    alike = {n: group.union(near.get(n, ())) for n, group in alike.items()}
     inclusion = {
         n: sum(v for k, v in probabilities.items() if n in k.effects) for n in names
     }
-    pooled = {
-        n: sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
-        for n in names
-    }
-    key, better = _pruned(models, top, pooled, BETTER)
+    alike = {n: next((g for g in equivalent if n in g), frozenset({n})) for n in names}
+
+    def helping(top: ModelKey) -> tuple[ModelKey, dict[str, float], dict[str, float]]:
+        near = stand_ins(models, top, names)
+        groups = {n: group.union(near.get(n, ())) for n, group in alike.items()}
+        pooled = {
+            n: sum(v for k, v in probabilities.items() if groups[n] & {*k.effects})
+            for n in names
+        }
+        return *_pruned(models, top, pooled, BETTER), pooled
+
+    top, *larger = starts(models, names, timed=timed)
+    key, better, pooled = helping(top)
+    for start in larger:
+        again = helping(start)
+        # What a further effect drives out was not there for it.
+        if {*again[0].effects} > {*key.effects}:
+            key, better, pooled = again
     surer, _ = _pruned(models, key, pooled, SURE)
     remains, cause = {}, {}
     for n in key.effects:
@@ -151,17 +162,31 @@ def choose(
     return Choice(key, probabilities, inclusion, cause, better, remains, instead)
 
 
-def likeliest(
+def starts(
     models: Mapping[ModelKey, Scored], names: Sequence[str], *, timed: bool = True
-) -> ModelKey:
-    """Return the set that the rule starts from; :func:`choose` needs all its parts.
+) -> list[ModelKey]:
+    """Return the sets that the rule prunes; :func:`choose` needs all their parts.
 
     Args:
         models: Fitted ones.
         names: Of all effects.
         timed: Whether x has a time axis.
+
+    Returns:
+        The most probable set. Relatives share the probability of a further effect:
+        where the sets with one of them are together more probable than the set
+        without, that with the likeliest of them follows.
     """
-    return _grown(models, _probabilities(models, timed=timed), names)
+    probabilities = _probabilities(models, timed=timed)
+    found = [next(iter(probabilities))]
+    while larger := [k for k in probabilities if found[-1] in k.parts]:
+        (new,) = {*larger[0].effects} - {*found[-1].effects}
+        near = {new, *stand_ins(models, larger[0], names).get(new, ())}
+        alike = [k for k in larger if near & {*k.effects}]
+        if sum(probabilities[k] for k in alike) <= probabilities[found[-1]]:
+            break
+        found.append(larger[0])
+    return found
 
 
 def _probabilities(
@@ -172,34 +197,6 @@ def _probabilities(
     log_p = np.array([models[key].log_p for key in keys])
     p = np.exp(log_p - log_sum_exp(log_p))
     return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
-
-
-def _grown(
-    models: Mapping[ModelKey, Scored],
-    probabilities: Mapping[ModelKey, float],
-    names: Sequence[str],
-) -> ModelKey:
-    """Return the most probable set, with what its relatives say together.
-
-    Relatives share the probability of a further effect. Where the sets with one of
-    them are together more probable than the set without, the likeliest is taken.
-
-    Args:
-        models: Fitted ones.
-        probabilities: Of the admitted ones, most probable first.
-        names: Of all effects.
-    """
-    top = next(iter(probabilities))
-    while True:
-        larger = [k for k in probabilities if top in k.parts]
-        if not larger:
-            return top
-        (new,) = {*larger[0].effects} - {*top.effects}
-        near = {new, *stand_ins(models, larger[0], names).get(new, ())}
-        alike = [k for k in larger if near & {*k.effects}]
-        if sum(probabilities[k] for k in alike) <= probabilities[top]:
-            return top
-        top = larger[0]
 
 
 def stand_ins(

@@ -27,7 +27,7 @@ from sbi_active.criticism.misfit.rule import (
     Choice,
     Scored,
     choose,
-    likeliest,
+    starts,
 )
 from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
 from sbi_active.criticism.misfit.sensor import sensor_error
@@ -237,8 +237,8 @@ def settled(
         for key, candidate in search.found.items():
             if key not in scored:
                 scored[key] = score(candidate)
-        top = likeliest(scored, search.names, timed=timed)
-        missing = _missing(search, top)
+        tops = starts(scored, search.names, timed=timed)
+        missing = [key for top in tops for key in _missing(search, top)]
         if not missing:
             return choose(scored, search.names, equivalent, timed=timed)
         for key in missing:

@@ -6,8 +6,8 @@ import pytest
 from sbi_active.criticism.misfit.rule import (
     Scored,
     choose,
-    likeliest,
     predicts_better,
+    starts,
 )
 from sbi_active.criticism.results import ModelKey
 
@@ -149,10 +149,23 @@ def test_relatives_together_more_likely_than_the_set_without_are_in_the_top():
     """Each is less probable than c alone, one of both is more probable than it."""
     several = models(none=(0.0, 101.0), a=(0.0, 30.0), b=(0.0, 30.0), c=(20.2, 4.4))
     several |= models(a_c=(19.9, 4.0), b_c=(20.0, 4.0))
-    assert likeliest(several, "abc") == choose(several, "abc").key
+    tops = [ModelKey(("c",)), ModelKey(("b", "c"))]
+    assert starts(several, "abc") == tops
     assert choose(several, "abc").key == ModelKey(("b", "c"))
     apart = {**several, ModelKey(("a", "c")): scored(19.9, 4.4)}  # no relative of b
     assert choose(apart, "abc").key == ModelKey(("c",))
+
+
+def test_relatives_that_drive_out_what_helps_are_not_taken():
+    """With b a left-out trial is predicted no worse without a, which helps alone."""
+    several = models(none=(0.0, 101.0), a=(20.3, 11.0), c=(0.0, 60.0))
+    several |= models(a_b=(20.0, 10.0), a_c=(19.95, 10.0))
+    share = np.array([1.04, 0.9] * 4)
+    imitated = several[ModelKey(("a", "b"))].square * share
+    several[ModelKey(("b",))] = Scored(0.0, imitated, False)
+    tops = [ModelKey(("a",)), ModelKey(("a", "b"))]
+    assert starts(several, "abc") == tops
+    assert choose(several, "abc").key == ModelKey(("a",))
 
 
 def test_a_cause_beside_another_effect_is_less_sure():
