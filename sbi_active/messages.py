@@ -53,6 +53,7 @@ ANCHORS = {
     "had a measurement, or none, where": "no-way-to-fail",
     "the amortized network is": "network-blunt",
     "single trials disagree about": "trials-disagree",
+    "times the declared error": "beyond-declared",
     # Of trials and tables.
     "told numbers are infinite and count as": "infinite",
     "x is inf in trial": "infinite",

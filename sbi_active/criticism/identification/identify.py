@@ -35,6 +35,8 @@ NUM_CHECKED, LINEAR, NUM_WEIGHED = 16, 0.5, 400
 FEWEST, FEWEST_KEPT = 50, 100
 #: From a bound, in deviations of the prior.
 INSIDE = 1e-6
+#: Multiple of the declared deviation from which errors are no longer the sensor's.
+BEYOND = 3.0
 #: Share of the draws within this share of the prior's range from a bound that is told.
 EDGE, AT_EDGE = 0.01, 0.05
 
@@ -156,6 +158,9 @@ def identify(
             "linear model; use Campaign, or a narrower prior"
         )
     notes += _at_bounds(found, u, names)
+    errors = _errors(found, model)
+    if known_sd is not None:
+        notes += _beyond(errors, known_sd)
     belief.diagnostics = (
         Diagnostics(trustworthy=True)
         .warned(*notes)
@@ -164,7 +169,7 @@ def identify(
             effective_sample_size=effective,
             beside=_beside(found),
             aliases=found.aliases,
-            errors=_errors(found, model),
+            errors=errors,
             disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
             is_linear=is_linear,
         )
@@ -261,6 +266,21 @@ def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]
             "time": float(np.median(np.where(h > 0, known.time[h], 0.0))),
         }
     return said
+
+
+def _beyond(errors: dict[str, dict[str, float]], declared: Array) -> list[str]:
+    """Return in which channels residuals are far larger than the declared error."""
+    ratios = {
+        name: own["sd"] / sd
+        for (name, own), sd in zip(errors.items(), declared.tolist(), strict=True)
+    }
+    return [
+        f"residuals of {name} are {ratio:.0f} times the declared error: the model "
+        "lacks something, or the error is declared too small; ask close_loop what it "
+        "lacks"
+        for name, ratio in ratios.items()
+        if ratio > BEYOND
+    ]
 
 
 def _at_bounds(found: Fitted, u: Array, names: Sequence[str]) -> list[str]:

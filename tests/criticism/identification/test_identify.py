@@ -67,6 +67,20 @@ def test_errors_are_told_by_channel():
     assert spread.numpy() == pytest.approx(belief.draws.std(0).numpy(), rel=0.1)
 
 
+def test_residuals_far_beyond_the_declared_error_are_told():
+    """A bend of a third of the amplitude, beside the channel that has none."""
+    bend = 0.3 * torch.stack([torch.sin(3 * TIMES), 0 * TIMES], -1)
+    sd = torch.tensor([0.02, 1.0])
+    found = identify(
+        model(GaussianNoise(sd)), PRIOR, Trials(ACTION, recorded(extra=bend))
+    )
+    (said,) = (w for w in found.diagnostics.warnings if "declared error" in w)
+    assert "channel 0 are " in said
+    assert not found.diagnostics.trustworthy
+    right = identify(model(GaussianNoise(sd)), PRIOR, Trials(ACTION, recorded()))
+    assert not any("declared error" in w for w in right.diagnostics.warnings)
+
+
 def test_declared_white_errors_have_their_size():
     """Three times what it is in truth: intervals are three times as wide."""
     trials = Trials(ACTION, recorded())
