@@ -4,7 +4,8 @@ r"""What helps, and what is the cause, when every model is wrong.
    smallest, or is not larger on a new trial with a probability of .9: one trial far
    from the others may hold most of a mean square. Without a time axis, where a trial
    is too few numbers to be sure of anything, it has to be within a fifth. The most
-   probable of them by the shared evidence is the top.
+   probable of them by the shared evidence is the top, where each effect beyond the
+   second has to gain a Bayes factor of 100: several imitate one that is not there.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
@@ -55,6 +56,7 @@ NEEDED = 2.0  # times the error on left-out trials without an effect
 HALF = 0.2  # u that leaves half of P(cause) without a time axis
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
+DECISIVE = float(np.log(100.0))  # evidence for each effect beyond the second, nats
 
 
 @dataclass(frozen=True)
@@ -194,9 +196,14 @@ def _probabilities(
 ) -> dict[ModelKey, float]:
     """Return the probabilities of the admitted models, most probable first."""
     keys = admitted(models, timed=timed)
-    log_p = np.array([models[key].log_p for key in keys])
+    log_p = np.array([models[key].log_p - _cost(key) for key in keys])
     p = np.exp(log_p - log_sum_exp(log_p))
     return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
+
+
+def _cost(key: ModelKey) -> float:
+    """Return what a set is to gain for being so large, nats."""
+    return DECISIVE * max(len(key.effects) - 2, 0)
 
 
 def stand_ins(

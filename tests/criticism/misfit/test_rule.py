@@ -168,6 +168,14 @@ def test_relatives_that_drive_out_what_helps_are_not_taken():
     assert choose(several, "abc").key == ModelKey(("a",))
 
 
+def test_a_third_effect_needs_decisive_evidence():
+    several = models(none=(0.0, 101.0), a=(5.0, 60.0), b=(5.0, 60.0), c=(5.0, 60.0))
+    several |= models(a_b=(20.0, 10.0), a_c=(10.0, 50.0), b_c=(10.0, 50.0))
+    few, many = (models(a_b_c=(20.0 + gain, 9.5)) for gain in (4.0, 5.0))
+    assert starts(several | few, "abc")[0] == ModelKey(("a", "b"))
+    assert starts(several | many, "abc")[0] == ModelKey(("a", "b", "c"))
+
+
 def test_a_cause_beside_another_effect_is_less_sure():
     alone = models(none=(0.0, 101.0), a=(20.0, 11.0), b=(0.0, 101.0))
     both = alone | models(a_b=(40.0, 5.0))
