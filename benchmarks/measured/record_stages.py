@@ -32,7 +32,15 @@ from benchmarks.measured.record_verdicts import read_report
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 
-__all__ = ["Bench", "aliases", "run_command", "run_stages", "table"]
+__all__ = [
+    "Bench",
+    "aliases",
+    "judge",
+    "run_command",
+    "run_stages",
+    "said",
+    "table",
+]
 
 Errors = dict[str, float]
 
@@ -262,11 +270,8 @@ def table(rows: dict[str, Any], unit: str) -> str:
             continue
         likely = {n: p for n, p in row["cause"].items() if p > 0.05 and row["alarm"]}
         causes = ", ".join(f"{n} {p:.2f}" for n, p in likely.items())
-        verdict = row["verdict"]
-        if row["helps"] and not row["named"]:
-            verdict += f", {' + '.join(row['helps'])} helps"
         lines.append(
-            f"| {name} | {verdict} | {causes} | {_errors(row.get('before'))} | "
+            f"| {name} | {said(row)} | {causes} | {_errors(row.get('before'))} | "
             f"{_errors(row.get('after'))} | {row['trial_simulations']:,} | "
             f"{row['cpu_seconds']:.0f} |"
         )
@@ -277,6 +282,13 @@ def table(rows: dict[str, Any], unit: str) -> str:
     for name, row in rows.get("least squares", {}).items():
         lines.append(f"| {name} | {row['fitted']:.3f} | {_errors(row['held'])} |")
     return "\n".join(lines)
+
+
+def said(row: dict[str, Any]) -> str:
+    """Return the verdict of a stage, and what else helps to predict."""
+    beside = [name for name in row["helps"] if name not in row["named"]]
+    helps = f", {' + '.join(beside)} helps" if beside else ""
+    return f"{row['verdict']}{helps}"
 
 
 def _replays(rows: dict[str, Any]) -> list[str]:

@@ -61,7 +61,7 @@ TABLE = (
         "compression",
         "amplifier",
         "1/V",
-        0.2,
+        1.0,
         "the amplifier's gain falls with the command",
     ),
     (

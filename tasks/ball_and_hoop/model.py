@@ -14,6 +14,8 @@ With effects it is
     \dot w = a\, (g(u) + u_0) - b\, w - c\, w |w| - c_3\, w^3
         - \operatorname{sign}(w)\, (f + s\, e^{-|w| / w_0}).
 
+where g is a dead zone and a gain :math:`1 / (1 + k |u|)`.
+
 By steps of the input's grid: what brakes is shared between both ends of a step, and dry
 friction is an impulse that can stop the hoop and hold it, never turn it around.
 """
@@ -53,7 +55,7 @@ SENSOR_SD = 0.01  # V: two quanta of the converter
 #: Bounds of a factor of five around a time constant of a second or so and a speed of
 #: 10 V at 1 V.
 DRIVE, DAMPING = (1.0, 30.0), (0.0, 3.0)
-OFFSET_SD = 0.05  # V, of an amplifier whose commands reach 1 V
+OFFSET_SD = 0.01  # V: 1 % of the largest command
 #: What a simulator gets wrong: from the sensor's error to a third of the range, V, and
 #: from a step to a piece, s.
 SD, CORRELATION_TIME = (0.005, 3.0), (0.05, 30.0)
@@ -97,7 +99,7 @@ def spin(
         cubic: :math:`c_3`, 1/(V^2 s).
         warm_up: Relative growth of the damping in 300 s.
         dead_zone: Of the amplifier, V: commands act smaller by it.
-        compression: Relative loss of a command of 1 V, in proportion to the command.
+        compression: k in a gain of :math:`1 / (1 + k |u|)`, 1/V.
         asymmetry: Relative excess of the gain forward, and loss of it backward.
         delay: Of the command, s.
         motor_lag: Time constant of the torque, s.
@@ -127,7 +129,7 @@ def spin(
     u = inputs["voltage"].double().nan_to_num()
     u = _late(u, rows(delay))
     u = u.sign() * (u.abs() - rows(dead_zone)[:, None]).clamp(min=0)
-    u = u * (1 - rows(compression)[:, None] * u.abs())
+    u = u / (1 + rows(compression)[:, None] * u.abs())
     u = u * (1 + rows(asymmetry)[:, None] * u.sign())
     push = (STEP * drive[:, None] * (u + offset[:, None])).T.contiguous()
     dry, creep = STEP * rows(coulomb), STEP * rows(stribeck)
@@ -178,14 +180,18 @@ def _late(u: Tensor, delay: Tensor) -> Tensor:
     return (1 - share) * now + share * before
 
 
-def make_prior() -> Distribution:
-    """Return the prior of theta; that of the offset is an amplifier's."""
+def make_prior(*, offset_sd: float = OFFSET_SD) -> Distribution:
+    """Return the prior of theta; that of the offset is an amplifier's.
+
+    Args:
+        offset_sd: Its standard deviation, V.
+    """
     drive, damping = (torch.tensor(edges)[:, None] for edges in (DRIVE, DAMPING))
     return Product(
         [
             Uniform(drive[0], drive[1]),
             Uniform(damping[0], damping[1]),
-            Normal(torch.zeros(1), torch.tensor([OFFSET_SD])),
+            Normal(torch.zeros(1), torch.tensor([offset_sd])),
         ]
     )
 
