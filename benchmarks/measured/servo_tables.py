@@ -112,7 +112,7 @@ def _pairs(table: dict[str, list[float]]) -> list[tuple[float, float]]:
 
 
 def _parameters(row: dict[str, Any]) -> str:
-    before, after = row["parameters"]["none"], row["parameters"].get(row["verdict"], {})
+    before, after = row["parameters"]["none"], row["parameters"].get(row["model"], {})
     lines = ["| parameter | bare model | " + row["model"] + " |", "|---|---|---|"]
     for name in dict.fromkeys([*before, *after]):
         cells = [
