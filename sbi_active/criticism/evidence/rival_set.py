@@ -30,7 +30,6 @@ from sbi_active.criticism.evidence.proposals import regressions, ridges
 from sbi_active.criticism.evidence.searches import search
 from sbi_active.criticism.evidence.tempering import temper
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
-from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
@@ -191,11 +190,9 @@ class RivalSet:
     def one_outlier(self) -> OneOutlier:
         """Return the noise with a gross error in one trial."""
         if not hasattr(self, "_outlier"):
-            noise = self._common_noise()
+            noise = self.noise.settled(self._bare_residual)
             off = np.abs(self.measurements.x - self.center) / noise.typical_sd
-            self._outlier = OneOutlier(
-                noise, self.measurements, largest=float(off.max())
-            )
+            self._outlier = OneOutlier(noise, self.measurements, largest=off.max())
         return self._outlier
 
     @property
@@ -207,24 +204,19 @@ class RivalSet:
     def residual_process(self) -> ResidualProcess:
         """Return the noise with a smooth function of the action and time."""
         if not hasattr(self, "_process"):
-            noise = self._common_noise()
-            sd = noise.typical_sd
+            noise = self.noise.settled(self._bare_residual)
             self._process = ResidualProcess(
                 noise,
                 self.measurements,
                 action=self.scaled_actions(),
                 order=self.scaled_order(),
-                largest=float(np.median(self.spread / sd)),
+                largest=float(np.median(self.spread / noise.typical_sd)),
                 spread=None if self.simulator.is_stochastic else self.spread,
             )
         return self._process
 
-    def _common_noise(self) -> NoiseGrid:
-        """Return the noise, with one unknown size where each channel has its own."""
-        if not isinstance(self.noise, ChannelNoise):
-            return self.noise
-        residual = self.rival(ModelKey()).residual(self.fit().likeliest)[0]
-        return self.noise.settled(residual[0])
+    def _bare_residual(self) -> Array:
+        return self.rival(ModelKey()).residual(self.fit().likeliest)[0][0]
 
     def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.

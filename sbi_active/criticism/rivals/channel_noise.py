@@ -13,6 +13,7 @@ ratio of the sizes from the bare model's best fit, and sums over their common fa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -123,9 +124,9 @@ class ChannelNoise(NoiseGrid):
     def of_cells(self, cells: list[NoiseCell]) -> ChannelNoise:
         return self._like(cells, self.channel, self)
 
-    def settled(self, residual: Array) -> SettledNoise:
-        """Return this noise with the ratio of sizes that a residual (N,) points to."""
-        return SettledNoise(self, residual)
+    @override
+    def settled(self, residual: Callable[[], Array]) -> SettledNoise:
+        return SettledNoise(self, residual())
 
     def _like(
         self, cells: list[NoiseCell], channel: NDArray[np.int64], common: NoiseGrid

@@ -216,6 +216,14 @@ class NoiseGrid(ErrorModel):
         cells = [replace(cell, sd=np.hypot(cell.sd, sd)) for cell in self.cells]
         return self.of_cells(cells)
 
+    def settled(self, residual: Callable[[], Array]) -> NoiseGrid:
+        """Return this noise with one unknown size, where each channel has its own.
+
+        Args:
+            residual: Returns one that tells the ratio of sizes, shape (N,).
+        """
+        return self
+
     def part(self, at: NDArray[np.bool_]) -> NoiseGrid:
         """Return this noise of some of the numbers, shape (N,)."""
         cells = [replace(c, sd=c.sd[at], rho=c.rho[at]) for c in self.cells]

@@ -106,7 +106,7 @@ def test_a_common_factor_is_summed_beside_the_sizes():
 def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
     m = measured()
     grid = declared_noise(noise_of(), m)
-    settled = grid.settled(m.x)
+    settled = grid.settled(lambda: m.x)
     assert settled.log_likelihood(m.x[None])[0] == pytest.approx(
         grid.log_likelihood(m.x[None])[0]
     )
