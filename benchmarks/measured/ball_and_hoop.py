@@ -13,14 +13,14 @@ What the fitted samples cannot tell: the hoop turns one way only in them, so tha
 Coulomb friction is an offset of the input. A fit that is free to choose both can put
 them anywhere on a line, with one error on what was fitted and any on what was not: with
 Coulomb friction alone, plain least squares gets 2.5 to 5.5 V on the rest of the first
-record. The prior of the offset, .05 V of a command of 1 V, is what decides. Least
-squares is therefore given with the offset at zero, and with the offset free beside it.
+record. The prior of the offset, 1 % of the largest command, is what decides
+(:mod:`benchmarks.measured.hoop_offset`). Least squares is therefore given with the
+offset at zero, and with the offset free beside it.
 
 Besides friction the library has an amplifier whose gain falls with the command. Least
-squares given it alone fits better (.38 V) than given quadratic drag and Coulomb
-friction (.50 V), and predicts the three records to .39 / .33 / .35 V (.48 / .37 / .37);
-with quadratic drag beside it, .38 / .29 / .32 V. ``without compression`` is the library
-of friction alone.
+squares given it alone fits better than given quadratic drag and Coulomb friction, and
+predicts the three records better. ``without compression`` is the library of friction
+alone.
 """
 
 from __future__ import annotations

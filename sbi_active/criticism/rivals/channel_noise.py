@@ -106,8 +106,6 @@ class ChannelNoise(NoiseGrid):
 
     @override
     def by_number(self, sizes: Array) -> Array:
-        if sizes.ndim == 1:
-            return super().by_number(sizes)
         return sizes[:, self.channel]
 
     @override
@@ -171,14 +169,12 @@ class SettledNoise(NoiseGrid):
 
     def __init__(self, noise: ChannelNoise, residual: Array) -> None:
         _, self.ratio = noise.likeliest(residual)
-        self.channel = noise.channel
-        unit = self.ratio[self.channel]
+        unit = self.ratio[noise.channel]
         cells = [replace(cell, sd=cell.sd * unit) for cell in noise.cells]
         scales = np.geomspace(1 / REACH, REACH, NUM_FACTORS)
         super().__init__(cells, scales=scales)
-        apart = noise.log_likelihood(residual[None]) - self.log_likelihood(
-            residual[None]
-        )
+        one = residual[None]
+        apart = noise.log_likelihood(one) - self.log_likelihood(one)
         self.log_prior = self.log_prior + apart[0]
 
     @override

@@ -98,9 +98,17 @@ def test_a_common_factor_is_summed_beside_the_sizes():
     each = [grid.log_likelihood(m.x[None] / s)[0] - len(m) * np.log(s) for s in scales]
     assert wide.log_likelihood(m.x[None])[0] == pytest.approx(logsumexp(each + p))
     some = m.trial > 0
-    part, alone = wide.part(some), declared_noise(noise_of(), measured()).part(some)
-    assert part.log_likelihood(m.x[None, some]).shape == (1,)
-    assert alone.channel.shape == (int(some.sum()),)
+    later = Measurements.of(
+        Trials(
+            torch.arange(2.0),
+            m.x.reshape(3, 2, 4)[1:].transpose(0, 2, 1),
+            sample_times=TIMES,
+        )
+    )
+    expected = declared_noise(noise_of(), later).scaled(scales, p)
+    assert wide.part(some).log_likelihood(m.x[None, some])[0] == pytest.approx(
+        expected.log_likelihood(later.x[None])[0]
+    )
 
 
 def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
