@@ -111,7 +111,8 @@ def identify(
         trials.
 
     Raises:
-        ValueError: If x has no time axis, or the simulator is random.
+        ValueError: If x has no time axis, the simulator is random, or an error is
+            declared that is 0.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -199,6 +200,13 @@ def _with_noise(
     if not isinstance(noise, GaussianNoise) or noise.posterior is not None:
         return model, None
     sd = np.broadcast_to(np.asarray(noise.sd, dtype=float).reshape(-1), (num,))
+    if not (sd > 0).all():  # errors are told in its units
+        got = ", ".join(f"{value:g}" for value in sd)
+        raise ValueError(
+            f"expected an error above 0 in each channel; got {got}; declare the "
+            "sensor's standard deviation, or pass a model without noise, whose size "
+            "is then found with the rest"
+        )
     return model, sd
 
 

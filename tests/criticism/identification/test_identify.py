@@ -164,6 +164,9 @@ def test_what_it_does_not_take():
     x[..., 1] = torch.nan
     with pytest.raises(ValueError, match="got none in channel 1; leave it out"):
         identify(model(), PRIOR, Trials(ACTION, x))
+    silent = model(GaussianNoise(torch.tensor([0.02, 0.0])))
+    with pytest.raises(ValueError, match="above 0 in each channel; got 0.02, 0;"):
+        identify(silent, PRIOR, trials)
     belief = identify(model(), PRIOR, trials)
     with pytest.raises(ValueError, match="between 0 and 1; got 95"):
         belief.interval(95)
