@@ -6,11 +6,12 @@
 
 The hoop and the tanks have such stages in their own commands
 (:mod:`benchmarks.measured.record_stages`). The servo is judged by its twelve powered
-trials, without load-dependent friction and none, one or two of the other three forms,
-and once without torque-dependent friction alone. Of each ball whose drops show drag, or
-something, all three forms of drag are removed. An *alias* is an
-effect that is named then. Each row is added to ``results/removals.json`` unless it is
-there.
+trials, and by them with the motor-off trial that they ask for
+(:mod:`benchmarks.measured.servo_pendulum`), each without load-dependent friction and
+none, one or two of the other three forms, and once without torque-dependent friction
+alone. Of each ball whose drops show drag, or something, all three forms of drag are
+removed. An *alias* is an effect that is named then. Each row is added to
+``results/removals.json`` unless it is there.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.measured.record_stages import SHARE_LEFT
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.tasks import ball_drops, servo_pendulum  # pyright: ignore
@@ -36,6 +35,8 @@ __all__ = ["main", "removed", "table"]
 
 BALLS = Path("../shared/data/ball_drops")
 RESULT = Path(__file__).parent / "results" / "removals.json"
+#: The servo's stages, by the name that its rows have here and there.
+STAGES = {"servo": "powered", "servo, motor off": "motor off"}
 #: Friction that the powered trials of the servo show, and another that helps.
 CAUSE, BESIDE = "load-dependent", "torque-dependent"
 #: Balls whose verdict with the whole library is a drag, or "unexplained".
@@ -88,16 +89,17 @@ def removed(
 
 def _servo(data: Path) -> Iterator[Job]:
     task = servo_pendulum.ServoPendulumTask(data=data)
-    off = np.flatnonzero(task.recordings.motor_off)
-    trials = task.trials([i for i in range(len(task.recordings)) if i not in off])
+    rows = json.loads(RESULT.with_name("servo_pendulum.json").read_text())
     effects = task.effects()
     others = [e.name for e in effects if e.name != CAUSE]
     sets = [(BESIDE,)]
     for size in range(len(others)):  # not all: nothing would be left to name
         sets += [(CAUSE, *more) for more in combinations(others, size)]
-    for gone in sets:
-        left = [e for e in effects if e.name not in gone]
-        yield "servo", " + ".join(gone), task.simulator, task.prior, trials, left
+    for which, stage in STAGES.items():
+        trials = task.trials(rows[stage]["fitted"])
+        for gone in sets:
+            left = [e for e in effects if e.name not in gone]
+            yield which, " + ".join(gone), task.simulator, task.prior, trials, left
 
 
 def _balls(data: Path) -> Iterator[Job]:
@@ -113,7 +115,11 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the rows in Markdown, and how many aliases were named in each set."""
     head = "| removed | verdict | P(cause) | simulated trials | CPU s |"
     lines: list[str] = []
-    for which, title in (("servo", "servo, from"), ("balls", "drag, from the")):
+    for which, title in (
+        ("servo", "servo, from"),
+        ("servo, motor off", "servo with a motor-off trial, from"),
+        ("balls", "drag, from the"),
+    ):
         own = {k: row for k, row in rows.items() if k.startswith(f"{which}: ")}
         if not own:
             continue
@@ -128,7 +134,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
                 f"| {name} | {verdict} | {causes} | {row['trial_simulations']:,} | "
                 f"{row['cpu_seconds']:.0f} |"
             )
-        real = {CAUSE} if which == "servo" else set()
+        real = {CAUSE} if which in STAGES else set()
         alias = [row for row in own.values() if {*row["named"]} - real]
         told = sum(row["share_said"] for row in alias)
         lines += [

@@ -31,6 +31,8 @@ class LeftOut:
     Attributes:
         square: Mean squared error of each part, in sensor variances, shape (f,); NaN
             for parts that do not count.
+        standard: The same in units of what the refit without the part expects of it:
+            a part that it can only extrapolate to counts for less, shape (f,).
         error: Of each number by the fit without its part, sensor deviations, (N,); NaN
             where it told of the part's nuisances.
         refits: Coordinates without each part, shape (f, d).
@@ -38,6 +40,7 @@ class LeftOut:
     """
 
     square: Array
+    standard: Array
     error: Array
     refits: Array
     fit: Array
@@ -60,7 +63,11 @@ class LeftOut:
 
 
 def leave_out(
-    model: LinearModel, errors: Errors, folds: NDArray[np.bool_] | None = None
+    model: LinearModel,
+    errors: Errors,
+    folds: NDArray[np.bool_] | None = None,
+    *,
+    weight: Array | float = 1.0,
 ) -> LeftOut:
     """Return a model's errors on each part of the trials that it was not fitted to.
 
@@ -68,12 +75,13 @@ def leave_out(
         model: Linear.
         errors: Which says what the parts are.
         folds: Parts that count, shape (f,); None takes all.
+        weight: Of each squared error, in refits and in what is returned, (N,).
     """
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
-    rows = model.rows.copy()
+    rows = model.rows * np.sqrt(weight)[..., None]
     rows[:, 0] -= rows[:, 1:] @ model.center
-    scaled = rows / max(model.rms, 1.0)
+    scaled = rows / max(float(np.sqrt(np.mean(weight * model.residual**2))), 1.0)
     gram = np.stack([_gram(scaled[errors.fold == j]) for j in range(f)])
     gram[~use] = 0.0
     total = gram.sum(0)
@@ -89,8 +97,10 @@ def leave_out(
     error = np.where(kept, error, np.nan)
     count = np.bincount(errors.fold[kept], minlength=f)
     square = np.bincount(errors.fold[kept], error[kept] ** 2, f) / count
+    expected = _expected(scaled, error, errors, total[1:, 1:] + prior) / count
     return LeftOut(
         np.where(use, square, np.nan),
+        np.where(use, square - expected, np.nan),
         error,
         refits + model.center,
         fit + model.center,
@@ -137,6 +147,31 @@ def _with_nuisances(
         # From the prior's center, where the refit without the part left them.
         refits[fold, own] += np.linalg.solve(part.T @ part + precision, part.T @ rest)
     return refits
+
+
+def _expected(rows: Array, error: Array, errors: Errors, precision: Array) -> Array:
+    r"""Return what of the squared errors of parts the refits were unsure of, (f,).
+
+    Without a part coordinates have the covariance :math:`P_{-f}`, and by Woodbury's
+    identity with :math:`P` of the fit to all
+
+    .. math::
+        e^T (I + S P_{-f} S^T)^{-1} e = e^T e - e^T S P S^T e.
+
+    Args:
+        rows: In units of the model's own error, shape (N, 1 + d).
+        error: On left-out parts, shape (N,).
+        errors: Which says what the parts are.
+        precision: Of the fit to all, the inverse of P, shape (d, d).
+    """
+    kept = errors.is_scored
+    pull = np.stack(
+        [
+            rows[own, 1:].T @ error[own]
+            for own in (kept & (errors.fold == j) for j in range(errors.num_folds))
+        ]
+    )
+    return (pull * np.linalg.solve(precision, pull.T).T).sum(1)
 
 
 def _gram(rows: Array) -> Array:

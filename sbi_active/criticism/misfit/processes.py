@@ -8,8 +8,10 @@ r"""The errors that all models share: the sensor's alone, or beside a residual p
 in each trial and channel, with :math:`\sigma` of the sensor. The size s (from .3 up)
 and the time scale :math:`\tau` (from a sample to most of a trial) are log-uniform and
 summed out, in *every* model: what a simulator gets wrong along a trajectory is no
-evidence for whichever model is a little less wrong. Models are linear here
-(:mod:`.linear`), so that all of it is algebra of Gram matrices.
+evidence for whichever model is a little less wrong. Or a parameter differs from trial
+to trial, with :math:`K = j j^T` in each trial across its channels and j the derivative
+of the bare model by it, mean square one: this and a process are equally likely. Models
+are linear here (:mod:`.linear`), so that all of it is algebra of Gram matrices.
 
 References:
     Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
@@ -40,6 +42,8 @@ WIDTHS = (1 / 3, 1.0, 3.0)
 #: this share of a sample to this share of a trial, about a factor apart.
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 SAMPLE, TRIAL, APART = 0.8, 0.8, 2.1
+#: Every so many of the sizes is one of what differs from trial to trial.
+THINNED = 2
 #: Trials below which parts of them are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
 
@@ -76,11 +80,15 @@ class Posterior:
 
     Attributes:
         log_sensor: With the sensor's error alone, nats.
-        log_process: With a residual process beside it, nats.
+        log_process: With a residual process beside it, or a parameter that differs from
+            trial to trial, nats.
         mean: Of u given the process, shape (d,).
         cov: Of u given the process, shape (d, d).
-        size: s, posterior mean.
-        time_scale: tau, posterior median.
+        size: s of the process, posterior mean.
+        time_scale: tau of it, posterior median.
+        variances: Mean square of the process, and of what each parameter does that may
+            differ from trial to trial, each times its probability; sensor variances,
+            shape (1 + v,).
     """
 
     log_sensor: float
@@ -89,6 +97,7 @@ class Posterior:
     cov: Array
     size: float
     time_scale: float
+    variances: Array
 
     @property
     def log_evidence(self) -> float:
@@ -107,6 +116,8 @@ class Errors:
             deviations: the process may be twice as large.
         warm_up: Time from its first sample in which a left-out trial tells of its
             nuisances, and is not scored.
+        varying: Derivatives by what may differ from trial to trial, shape (N, v); it
+            counts where parts are trials.
 
     Attributes:
         fold: Part that each number belongs to, shape (N,): trials, or with fewer than
@@ -116,6 +127,7 @@ class Errors:
         cells: The sensor's error in its units, with what is unknown of its correlation.
         log_cells: Log prior probability of each, shape (c,).
         is_scored: Numbers that are predicted where their part is left out, bool, (N,).
+        varying: Derivatives of mean square one, zero where nothing depends on it.
     """
 
     def __init__(
@@ -126,6 +138,7 @@ class Errors:
         *,
         largest: float,
         warm_up: float = 0.0,
+        varying: Array | None = None,
     ) -> None:
         m = self.measurements = measurements
         self.unit = unit
@@ -148,16 +161,32 @@ class Errors:
         total = log_sum_exp(np.array([c.log_weight for c in self.cells]))
         self.log_cells = np.array([c.log_weight for c in self.cells]) - total
         self.patterns = self._by_pattern()
+        if varying is None or not self.is_by_trial:
+            varying = np.empty((len(m), 0))
+        size = np.sqrt((varying**2).mean(0))
+        self.varying = varying / np.where(size > 0, size, 1.0)
 
     @property
     def num_processes(self) -> int:
         """Errors with a process: kernels, time scales and sizes."""
         return len(self.kernels) * len(self.times) * len(self.sizes)
 
+    @property
+    def spreads(self) -> Array:
+        """Sizes of what differs from trial to trial, in sensor deviations."""
+        return self.sizes[::THINNED]
+
+    @property
+    def log_prior(self) -> Array:
+        """Log prior probability of each error beside the sensor's, shape (h - c,)."""
+        counts = self.num_processes, self.varying.shape[1] * len(self.spreads)
+        each = [np.full(n, -np.log(n)) for n in counts if n]
+        return np.concatenate(each) - np.log(len(each))
+
     def grams(self, rows: Array) -> Grams:
         """Return the Gram matrices of rows (N, k), the sensor's errors first."""
         k, f = rows.shape[1], self.num_folds
-        num = len(self.cells) + self.num_processes
+        num = len(self.cells) + len(self.log_prior)
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
         for i, cell in enumerate(self.cells):
             white = cell.whiten(rows.T).T
@@ -180,6 +209,17 @@ class Errors:
                     gram[own, fold] += weighted[:, b].reshape(-1, k, k)
                     log_det[own, fold] += logs
                 at += len(self.sizes)
+        at = len(self.cells) + self.num_processes
+        for j in range(f) if self.varying.size else ():
+            own = rows[self.fold == j]
+            plain = own.T @ own
+            for v, column in enumerate(self.varying[self.fold == j].T):
+                # Sherman and Morrison: of the whole trial one direction counts less.
+                pull, square = own.T @ column, column @ column
+                growth = self.spreads**2 / (1 + self.spreads**2 * square)
+                to = slice(at + v * len(growth), at + (v + 1) * len(growth))
+                gram[to, j] = plain - growth[:, None, None] * np.outer(pull, pull)
+                log_det[to, j] = np.log1p(self.spreads**2 * square)
         return Grams(gram, log_det, np.bincount(self.fold, minlength=f))
 
     def posterior(
@@ -211,7 +251,7 @@ class Errors:
         log_z = log_z - 0.5 * (log_det[:, None] + const) - np.log(len(WIDTHS))
         n = len(self.cells)
         by_sensor = (log_z[:n] + self.log_cells[:, None]).ravel()
-        by_process = (log_z[n:] - np.log(self.num_processes)).ravel()
+        by_process = (log_z[n:] + self.log_prior[:, None]).ravel()
         log_sensor = float(log_sum_exp(by_sensor))
         log_process = float(log_sum_exp(by_process))
         log_p = by_process if process else by_sensor
@@ -225,8 +265,14 @@ class Errors:
         cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
         if not process:
             center = mean + model.center
-            return Posterior(log_sensor, log_process, center, cov, 0.0, 1.0)
-        each = p.reshape(len(self.kernels), len(self.times), len(self.sizes), -1)
+            nothing = np.zeros(1 + self.varying.shape[1])
+            return Posterior(log_sensor, log_process, center, cov, 0.0, 1.0, nothing)
+        end = self.num_processes * len(WIDTHS)
+        shape = len(self.kernels), len(self.times), len(self.sizes), len(WIDTHS)
+        process = p[:end].reshape(shape).sum((0, 1, 3)) @ self.sizes**2
+        differ = p[end:].reshape(-1, len(self.spreads), len(WIDTHS)).sum(2)
+        log_p = by_process[:end]
+        each = np.exp(log_p - log_sum_exp(log_p)).reshape(shape)
         sizes, times = each.sum((0, 1, 3)), each.sum((0, 2, 3))
         middle = int(np.searchsorted(np.cumsum(times), 0.5))
         return Posterior(
@@ -236,7 +282,24 @@ class Errors:
             cov,
             float(sizes @ self.sizes),
             float(self.times[min(middle, len(self.times) - 1)]),
+            np.append(process, differ @ self.spreads**2),
         )
+
+    def weight(self, posterior: Posterior) -> Array:
+        """Return how much the squared errors of a trial count, mean one, shape (N,).
+
+        By the inverse of their mean variance: where a parameter differs from trial to
+        trial, a trial that depends on it more tells less of everything else.
+
+        Args:
+            posterior: Of a model.
+        """
+        process, *differ = posterior.variances
+        variance = 1 + process + self.varying**2 @ np.array(differ)
+        count = np.bincount(self.fold, minlength=self.num_folds)
+        mean = np.bincount(self.fold, variance, self.num_folds) / count
+        weight = 1 / mean[self.fold]
+        return weight / weight.mean()
 
     def _blocks(self) -> list[NDArray[np.intp]]:
         """Return the numbers of each part and channel, in the order of time."""

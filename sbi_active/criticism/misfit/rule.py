@@ -3,9 +3,10 @@ r"""What helps, and what is the cause, when every model is wrong.
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
    smallest, or is not larger on a new trial with a probability of .9: one trial far
    from the others may hold most of a mean square. Without a time axis, where a trial
-   is too few numbers to be sure of anything, it has to be within a fifth. The most
-   probable of them by the shared evidence is the top, where each effect beyond the
-   second has to gain a Bayes factor of 100: several imitate one that is not there.
+   is too few numbers to be sure of anything, it has to be within a fifth. Errors below
+   the sensor's are no better than it. The most probable of them by the shared evidence
+   is the top, where each effect beyond the second has to gain a Bayes factor of 100:
+   several imitate one that is not there.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
@@ -16,8 +17,9 @@ r"""What helps, and what is the cause, when every model is wrong.
    sets with it, or with what may stand in its place, are together more probable than
    the top, the likeliest of them is tried as the top, and counts where it adds to what
    helps.
-3. The probability that it is the *cause* is its inclusion probability times
-   :math:`.85^k (1 - u)`, with u the share of the excess error that remains,
+3. The probability that it is the *cause* is its inclusion probability, with that of
+   what no action tells from it, times :math:`.85^k (1 - u)^{1.5}`, with u the share of
+   the excess error that remains,
 
 .. math::
     u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
@@ -29,8 +31,9 @@ probability of .9, since two that imitate each other both look dispensable. Seve
 effects imitate more easily than one what nobody declared, and each beyond the first
 costs .85. Where the chi-square passes against the sensor nothing remains, and the
 factor is :math:`.85^{k - 1}`. Without a time axis it is
-:math:`.85^k / (1 + (u / .2)^2)` in either case. The thresholds, the .85 and the .2 are
-empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
+:math:`.85 \cdot .75^{k - 1} / (1 + (u / .25)^2)` in either case. All of these numbers
+are empirical: evidence alone, or prediction alone, names a stand-in as surely as a
+cause.
 """
 
 from __future__ import annotations
@@ -53,7 +56,9 @@ ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 ADMITTED_FEW = 1.2  # likewise, without a time axis
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-HALF = 0.2  # u that leaves half of P(cause) without a time axis
+HALF = 0.25  # u that leaves half of P(cause) without a time axis
+FURTHER = 0.75  # what each further effect leaves of it there
+STEEP = 1.5  # power of what is removed, with one
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 DECISIVE = float(np.log(100.0))  # evidence for each effect beyond the second, nats
@@ -65,7 +70,9 @@ class Scored:
 
     Attributes:
         log_p: Unnormalized log posterior probability.
-        square: Mean squared error on each left-out part, in sensor variances, (f,).
+        square: Mean squared error on each left-out part, in sensor variances and units
+            of what is expected of it, (f,): trials to which a fit can but extrapolate
+            tell little of a model.
         passes: Whether its chi-square passes against the sensor.
     """
 
@@ -151,15 +158,17 @@ def choose(
         # Beside one that hardly helps an effect may be missed less than it is alone.
         sets = [k for k in (key, surer) if n in k.effects]
         remains[n], num = min((_remains(models, k, n), len(k.effects)) for k in sets)
-        # Few numbers a trial are fitted to the sensor's error by much that is wrong.
+        # Several imitate more easily than one what nobody declared, and few numbers a
+        # trial are fitted to the sensor's error by much that is wrong.
         if not timed:
-            share = CERTAIN / (1 + (remains[n] / HALF) ** 2)
+            share = CERTAIN * FURTHER ** (num - 1) / (1 + (remains[n] / HALF) ** 2)
         elif models[key].passes:
-            share = 1.0
+            share = CERTAIN ** (num - 1)
         else:
-            share = CERTAIN * (1 - remains[n])
-        # Several imitate more easily than one what nobody declared.
-        cause[n] = inclusion[n] * share * CERTAIN ** (num - 1)
+            share = CERTAIN**num * (1 - remains[n]) ** STEEP
+        # Which of several that no action separates it is nobody can tell.
+        either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
+        cause[n] = either * share
     instead = stand_ins(models, key, names)
     return Choice(key, probabilities, inclusion, cause, better, remains, instead)
 
@@ -276,13 +285,14 @@ def admitted(
 ) -> list[ModelKey]:
     """Return the models that predict left-out trials about as well as the best."""
     best = min(models.values(), key=lambda m: m.error)
+    smallest = max(best.error, 1.0)  # below the sensor's, by chance
     if not timed:
-        most = ADMITTED_FEW**2 * best.error
+        most = ADMITTED_FEW**2 * smallest
         return [key for key, m in models.items() if m.error <= most]
     return [
         key
         for key, m in models.items()
-        if m.error <= ADMITTED**2 * best.error
+        if m.error <= ADMITTED**2 * smallest
         or predicts_better(best.square, m.square) < SURE
     ]
 

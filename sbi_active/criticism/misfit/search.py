@@ -107,6 +107,7 @@ class Search:
             self.cells,
             largest=bare.rms,
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
+            varying=bare.jacobian[:, bare.trial_of < 0],
         )
         self.keep(bare)
 

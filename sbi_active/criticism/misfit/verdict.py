@@ -21,7 +21,7 @@ from sbi_active.criticism.misfit.left_out import leave_out
 from sbi_active.criticism.misfit.linear import LinearModel
 from sbi_active.criticism.misfit.processes import Posterior
 from sbi_active.criticism.misfit.rule import (
-    NEEDED,
+    DECISIVE,
     PASSES,
     SURE,
     Choice,
@@ -94,19 +94,17 @@ class Misfit:
     def replaces(self, verdict: str) -> bool:
         """Return whether it says more than a verdict of numbers without a time axis.
 
-        Numbers that scatter more than declared, each for itself, leave some effect that
-        predicts a few of them better: they give way to a probable cause alone, or to
-        effects that halve the error, each of which surely predicts better. Several
-        effects, which fit much, give way to a probable cause.
+        All models have numbers that scatter more than declared, each for itself: beside
+        them effects that help gain a Bayes factor of 100, or one is probably the cause.
+        Several effects, which fit much, give way to a probable cause.
         """
         choice = self.choice
         if verdict == UNEXPLAINED:
             return bool(choice.key.effects)
+        own, bare = (self.search.found[k].log_p for k in (choice.key, ModelKey()))
+        if verdict == SCATTER and own - bare > DECISIVE:
+            return True
         surely = [n for n in choice.key.effects if choice.better[n] > SURE]
-        if verdict == SCATTER and surely == [*choice.key.effects]:
-            own, bare = (self.search.found[k].left for k in (choice.key, ModelKey()))
-            if bare.mean_square >= NEEDED**2 * own.mean_square:
-                return bool(surely)
         return any(choice.cause[n] > NAMED for n in surely)
 
     @cached_property
@@ -140,27 +138,44 @@ class Misfit:
         errors = self.search.errors
         use = np.ones(errors.num_folds, bool)
         use[fold] = False
+        weight = trial_weights(self.search, use)
 
         def score(c: Candidate) -> Scored:
             posterior = errors.posterior(c.model, c.grams, use)
-            square = leave_out(c.model, errors, use).square
-            return Scored(c.log_prior + posterior.log_process, square, passes(c.model))
+            left = leave_out(c.model, errors, use, weight=weight)
+            log_p = c.log_prior + posterior.log_process
+            return Scored(log_p, left.standard, passes(c.model))
 
         return settled(self.search, score, self.equivalent).key
 
     def is_robust(self) -> bool:
         """Return whether effect priors of another scale leave what helps."""
-        errors = self.search.errors
+        errors, weight = self.search.errors, trial_weights(self.search)
         for factor in RESCALED:
 
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
+                left = leave_out(c.model, errors, weight=weight)
                 log_p = c.log_prior + posterior.log_process
-                return Scored(log_p, c.left.square, passes(c.model))
+                return Scored(log_p, left.standard, passes(c.model))
 
             if settled(self.search, score, self.equivalent).key != self.choice.key:
                 return False
         return True
+
+
+def trial_weights(search: Search, use: NDArray[np.bool_] | None = None) -> Array:
+    """Return how much each squared error counts by the likeliest model, shape (N,).
+
+    Args:
+        search: The models.
+        use: Parts of the trials that tell of it; None takes all.
+    """
+    best = max(search.found.values(), key=lambda c: c.log_p)
+    posterior = best.posterior
+    if use is not None:
+        posterior = search.errors.posterior(best.model, best.grams, use)
+    return search.errors.weight(posterior)
 
 
 def passes(model: LinearModel) -> bool:
@@ -209,8 +224,11 @@ def find_misfit(
         if (has_forces and not misses) or _is_one_trial(search, most):
             return None
 
+    weight = trial_weights(search)
+
     def score(c: Candidate) -> Scored:
-        return Scored(c.log_p, c.left.square, passes(c.model))
+        left = leave_out(c.model, search.errors, weight=weight)
+        return Scored(c.log_p, left.standard, passes(c.model))
 
     choice = settled(search, score, equivalent)
     log_p = [c.log_p for c in search.found.values()]

@@ -124,6 +124,8 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
     else:
         error = "a residual process of unknown size and time scale"
         name, scale = "the process", f" and a time scale of {number(misfit.time_scale)}"
+    if misfit.left_out == "trials":  # fewer of them do not tell
+        error += ", or a parameter that differs from trial to trial"
     text = [
         f"Every model carries {error}, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "

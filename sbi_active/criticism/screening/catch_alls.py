@@ -47,12 +47,13 @@ def log_one_part(bare: Candidate, errors: Errors) -> Array:
         errors: That its Gram matrices are of.
     """
     n, grams = len(errors.cells), bare.grams
+    some = slice(n, n + errors.num_processes)
     own = int(np.argmax(errors.log_cells))
     gram, log_det = grams.gram[own].sum(0), grams.log_det[own].sum()
     found = []
     for k in range(errors.num_folds):
-        with_process = gram - grams.gram[own, k] + grams.gram[n:, k]
-        dets = log_det - grams.log_det[own, k] + grams.log_det[n:, k]
+        with_process = gram - grams.gram[own, k] + grams.gram[some, k]
+        dets = log_det - grams.log_det[own, k] + grams.log_det[some, k]
         log_z = _log_evidence(bare, with_process, dets, grams.count.sum())
         found.append(log_sum_exp(log_z) - np.log(len(log_z)))
     return np.array(found)

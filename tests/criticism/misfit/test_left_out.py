@@ -1,10 +1,14 @@
 """Refits without a part of the trials stay within bounds, and are the best there."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from sbi_active.criticism.misfit.left_out import bounded
+from sbi_active.criticism.misfit.left_out import bounded, leave_out
+from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.results import ModelKey
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -35,3 +39,38 @@ def test_where_no_bound_matters_it_is_the_plain_solution():
     far = np.full(4, 1e6)
     plain = np.linalg.solve(system, right[..., None])[..., 0]
     assert (bounded(system, right, -far, far) == plain).all()
+
+
+def test_a_trial_that_is_extrapolated_to_counts_in_units_of_what_is_expected():
+    """Against the plain covariance of a prediction, and the leverage of one number."""
+    rng = np.random.default_rng(1)
+    fold = np.repeat(np.arange(8), 2)
+    x = np.append(rng.normal(size=14), [30.0, 30.0])
+    jacobian = np.stack([np.ones(16), x], 1)
+    noise = rng.normal(size=16)
+    everywhere = np.full(2, np.inf)
+    model = LinearModel(
+        key=ModelKey(),
+        u=np.zeros(2),
+        residual=noise,
+        jacobian=jacobian,
+        center=np.zeros(2),
+        sd=np.full(2, 1e3),
+        scaled=np.zeros(2, bool),
+        low=-everywhere,
+        high=everywhere,
+        own=2,
+        trial_of=np.full(2, -1),
+    )
+    errors = SimpleNamespace(fold=fold, num_folds=8, is_scored=np.ones(16, bool))
+    left = leave_out(model, errors)
+    scale = max(model.rms, 1.0)
+    for j in range(8):
+        own, rest = jacobian[fold == j], jacobian[fold != j]
+        cov = np.linalg.inv(rest.T @ rest / scale**2 + np.eye(2) / 1e6)
+        expected = np.eye(2) + own @ cov @ own.T / scale**2
+        error = left.error[fold == j]
+        square = error @ np.linalg.solve(expected, error) / 2
+        assert left.standard[j] == pytest.approx(square, rel=1e-6)
+    assert left.standard[-1] < 0.3 * left.square[-1]
+    assert (left.standard <= left.square).all()
