@@ -1,5 +1,6 @@
 """Refits without a part of the trials stay within bounds, and are the best there."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -41,19 +42,17 @@ def test_where_no_bound_matters_it_is_the_plain_solution():
     assert (bounded(system, right, -far, far) == plain).all()
 
 
-def test_a_trial_that_is_extrapolated_to_counts_in_units_of_what_is_expected():
-    """Against the plain covariance of a prediction, and the leverage of one number."""
+@pytest.fixture
+def line():
+    """A line through trials of two numbers, the last of which is far away."""
     rng = np.random.default_rng(1)
-    fold = np.repeat(np.arange(8), 2)
     x = np.append(rng.normal(size=14), [30.0, 30.0])
-    jacobian = np.stack([np.ones(16), x], 1)
-    noise = rng.normal(size=16)
     everywhere = np.full(2, np.inf)
     model = LinearModel(
         key=ModelKey(),
         u=np.zeros(2),
-        residual=noise,
-        jacobian=jacobian,
+        residual=2 * rng.normal(size=16),
+        jacobian=np.stack([np.ones(16), x], 1),
         center=np.zeros(2),
         sd=np.full(2, 1e3),
         scaled=np.zeros(2, bool),
@@ -62,15 +61,38 @@ def test_a_trial_that_is_extrapolated_to_counts_in_units_of_what_is_expected():
         own=2,
         trial_of=np.full(2, -1),
     )
+    fold = np.repeat(np.arange(8), 2)
     errors = SimpleNamespace(fold=fold, num_folds=8, is_scored=np.ones(16, bool))
+    return model, errors
+
+
+def test_a_trial_that_is_extrapolated_to_counts_in_units_of_what_is_expected(line):
+    """Against the plain covariance of a prediction."""
+    model, errors = line
     left = leave_out(model, errors)
-    scale = max(model.rms, 1.0)
+    assert model.rms > 1
     for j in range(8):
-        own, rest = jacobian[fold == j], jacobian[fold != j]
-        cov = np.linalg.inv(rest.T @ rest / scale**2 + np.eye(2) / 1e6)
-        expected = np.eye(2) + own @ cov @ own.T / scale**2
-        error = left.error[fold == j]
+        at = errors.fold == j
+        own, rest = model.jacobian[at], model.jacobian[~at]
+        cov = np.linalg.inv(rest.T @ rest / model.rms**2 + np.eye(2) / 1e6)
+        expected = np.eye(2) + own @ cov @ own.T / model.rms**2
+        error = left.error[at]
         square = error @ np.linalg.solve(expected, error) / 2
         assert left.standard[j] == pytest.approx(square, rel=1e-6)
     assert left.standard[-1] < 0.3 * left.square[-1]
     assert (left.standard <= left.square).all()
+
+
+def test_weights_are_those_of_least_squares(line):
+    model, errors = line
+    weight = 1.5 + np.sin(errors.fold)
+    root = np.sqrt(weight)
+    same = replace(
+        model,
+        residual=root * model.residual,
+        jacobian=root[:, None] * model.jacobian,
+    )
+    found, plain = leave_out(model, errors, weight=weight), leave_out(same, errors)
+    assert found.standard == pytest.approx(plain.standard)
+    assert found.refits == pytest.approx(plain.refits)
+    assert found.square == pytest.approx(plain.square)
