@@ -92,6 +92,7 @@ def main() -> None:
     groups = (arguments.group,) if arguments.group else (*GROUPS,)
     kinds = (arguments.kind,) if arguments.kind else KINDS
     is_judged = arguments.first >= FIRST_JUDGED
+    seeds, pooled = "judging" if is_judged else "tuning", []
     for group in groups:
         rows = []
         for kind in kinds:
@@ -101,9 +102,11 @@ def main() -> None:
                 run_kind(group, kind, arguments.first, arguments.cases)
             every = rows_of(group, kind)
             rows += [r for r in every if (int(r["case"]) >= FIRST_JUDGED) == is_judged]
+        pooled += rows
         if rows and not arguments.truth:
-            seeds = "judging" if is_judged else "tuning"
             print(f"\n## {group}, {seeds} seeds", *summary(rows), sep="\n")
+    if len(groups) > 1 and pooled:
+        print(f"\n## {' and '.join(groups)}, {seeds} seeds", *summary(pooled), sep="\n")
 
 
 if __name__ == "__main__":

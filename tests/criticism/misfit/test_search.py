@@ -12,6 +12,8 @@ from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_priors
+from tests.criticism.misfit.oscillator import EFFECTS as OSCILLATOR
+from tests.criticism.misfit.oscillator import MODEL, PRIOR, trials
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
 
@@ -69,3 +71,33 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
     both = search.fit_set(ModelKey(("limit", "drift"))).model.rms
     assert alone > 5
     assert both < 1 + 3 / np.sqrt(2 * NUM_TRIALS)
+
+
+def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
+    """A friction that holds the machine still has no slope that leads back."""
+    loop = Criticism(MODEL, PRIOR, trials(cubic=0.5), effects=OSCILLATOR, seed=0)
+    sensor = sensor_error(loop.rivals, needs_time=False)
+    assert sensor is not None
+    search = Search(loop.rivals, sensor[0], log_priors(loop.effects, ()), sensor[1])
+    search.fit_singles()
+    part = search.found[ModelKey(("cubic",))].model
+    descend, faint, again = search._descend, search._faint, []
+
+    def lost(rival, u, *arguments, **options):
+        if again:
+            return descend(rival, u, *arguments, **options)
+        u = u.copy()
+        u[:, rival.columns()["friction"]] = 20.0
+        return u, (rival.residual(u)[0] ** 2).sum(1)
+
+    def from_its_part(key, parent):
+        again.append(parent)
+        u = faint(key, parent)
+        assert (u[search.columns(key, parent)] == part.u).all()
+        return u
+
+    monkeypatch.setattr(search, "_descend", lost)
+    monkeypatch.setattr(search, "_faint", from_its_part)
+    both = search.fit_set(ModelKey(("cubic", "friction"))).model
+    assert again == [ModelKey(("cubic",))]
+    assert both.rms <= part.rms * (1 + 1e-6)
