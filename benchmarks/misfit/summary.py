@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 
 from benchmarks.criticism.intervals import rate
+from benchmarks.misfit.machines import get_machine
 from sbi_active.criticism.under_misfit import NAMED
 
 __all__ = ["summary"]
@@ -96,25 +98,36 @@ def _true(row: Row) -> set[str]:
 
 
 def _has_all(row: Row, column: str) -> bool:
-    said, wanted = _said(row, column), json.loads(row["true"])
-    if len(wanted) == 1:
-        return bool(said & _true(row))
-    return {*wanted} <= said
+    return _has_all_in(row, [{name} for name in _said(row, column)])
 
 
 def _has_all_places(row: Row, column: str) -> bool:
-    """Return whether the true effects are said, or said to be possible in a place.
+    """Return whether the true effects are said, or said to be possible in a place."""
+    instead = json.loads(row["instead"])
+    return _has_all_in(
+        row, [{name, *instead.get(name, ())} for name in _said(row, column)]
+    )
 
-    Each in a place of its own: two do not stand in that of one.
-    """
-    places = [
-        {name, *json.loads(row["instead"]).get(name, ())} for name in _said(row, column)
-    ]
-    wanted = json.loads(row["true"])
+
+def _has_all_in(row: Row, places: Sequence[set[str]]) -> bool:
+    """Return whether each true effect, or an equivalent one, has a place of its own."""
+    wanted = _alike(row["machine"], row["true"])
     return any(
-        all(name in place for name, place in zip(wanted, some, strict=True))
+        all(names & place for names, place in zip(wanted, some, strict=True))
         for some in permutations(places, len(wanted))
     )
+
+
+@lru_cache
+def _alike(machine: str, true: str) -> list[frozenset[str]]:
+    """Return the effects that nothing separates from each true one, itself among them.
+
+    Args:
+        machine: Its name.
+        true: The names of the true effects, as a row has them.
+    """
+    equivalent = get_machine(machine).equivalent
+    return [frozenset(equivalent(name)) for name in json.loads(true)]
 
 
 def _has_wrong(row: Row, column: str) -> bool:

@@ -227,6 +227,18 @@ def test_each_of_two_effects_needs_a_place_of_its_own():
     assert stated + "1.000" in text(["lag", "bias"], lag=["bias"])
 
 
+def test_what_nothing_separates_from_a_true_effect_is_right_in_a_pair_too():
+    def both(helps, machine="A"):
+        row = scored("P", ["action offset", "drift"], {"drift": 0.1}, helps=helps)
+        text = "\n".join(summary([row | {"machine": machine}]))
+        return "both matter: both | 0.000 (0/1) [0.000, 0.793] | 1.000" in text
+
+    assert both(["action offset", "drift"])
+    assert both(["bias", "drift"])
+    assert not both(["bias", "action offset"])  # one of them twice
+    assert not both(["bias", "drift"], machine="B")
+
+
 def test_a_pair_that_was_lost_is_compared_by_its_held_out_error():
     def text(helps, error):
         row = scored("P", ["lag", "bias"], {"lag": 0.1}, helps=helps)

@@ -120,18 +120,19 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         rows.append((*cells, *held))
     if isnan(misfit.time_scale):  # x has no time axis
         error = "an error of unknown size in each number, beside the sensor's"
-        name, scale = "that error", ""
+        name, scale, near = "that error", "", "fifth"
     else:
         error = "a residual process of unknown size and time scale"
         name, scale = "the process", f" and a time scale of {number(misfit.time_scale)}"
+        near = "tenth"
     if misfit.left_out == "trials":  # fewer of them do not tell
         error += ", or a parameter that differs from trial to trial"
     text = [
         f"Every model carries {error}, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "
-        "error on left-out "
-        f"{misfit.left_out} is within a tenth of the smallest; P is among them. Errors "
-        "are root mean squares of models fitted without what they predict. The "
+        f"error on left-out {misfit.left_out}, in units of what the others let expect, "
+        f"is within a {near} of the smallest; P is among them. Errors below are root "
+        "mean squares of models fitted without what they predict. The "
         f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
         "beyond it, as a share of the bare model's.",
         f"Beside the verdict's model {name} has {misfit.size:.2g} times the "
