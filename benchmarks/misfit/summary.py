@@ -173,8 +173,13 @@ def _calibration(rows: Sequence[Row]) -> list[str]:
         dtype=float,
     )
     claimed, right = pairs.T
-    brier = float(((claimed - right) ** 2).mean())
-    lines = [f"Brier score of P(cause): {brier:.3f} over {len(pairs)} effects"]
+    square = (claimed - right) ** 2
+    kinds = np.array([row["kind"] for row in rows for _ in json.loads(row["cause"])])
+    alike = np.mean([square[kinds == kind].mean() for kind in np.unique(kinds)])
+    lines = [
+        f"Brier score of P(cause): {square.mean():.3f} over {len(pairs)} effects; each "
+        f"kind counted alike: {alike:.3f}"
+    ]
     for low, high in BINS:
         at = (claimed >= low) & (claimed < high)
         mean = f"{claimed[at].mean():.2f}" if at.any() else "-"

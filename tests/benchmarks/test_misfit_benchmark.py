@@ -208,6 +208,14 @@ def test_the_summary_counts_what_was_right(tmp_path):
     assert text.count("1.000 (1/1) [0.207, 1.000] |") >= 3
     assert "intervals of theta with misfit: 0.750 (3/4)" in text
     assert "claims of 0.9 to 1: mean 0.93, right 1.000 (2/2)" in text
+    own = [
+        [0.05**2, 0.1**2, 0.8**2, 0.7**2, 0.3**2, 0],
+        [0.6**2],
+        [0.1**2, 0.9**2],
+        [0],
+    ]
+    alike = sum(sum(squares) / len(squares) for squares in own) / len(own)
+    assert f"over 10 effects; each kind counted alike: {alike:.3f}" in text
 
 
 def test_each_of_two_effects_needs_a_place_of_its_own():
