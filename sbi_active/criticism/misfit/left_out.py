@@ -97,7 +97,9 @@ def leave_out(
     error = np.where(kept, error, np.nan)
     count = np.bincount(errors.fold[kept], minlength=f)
     square = np.bincount(errors.fold[kept], error[kept] ** 2, f) / count
-    expected = _expected(scaled, error, errors, total[1:, 1:] + prior) / count
+    is_free = (refits > low) & (refits < high)
+    precision = total[1:, 1:] + prior
+    expected = _expected(scaled, error, errors, precision, is_free) / count
     return LeftOut(
         np.where(use, square, np.nan),
         np.where(use, square - expected, np.nan),
@@ -149,7 +151,13 @@ def _with_nuisances(
     return refits
 
 
-def _expected(rows: Array, error: Array, errors: Errors, precision: Array) -> Array:
+def _expected(
+    rows: Array,
+    error: Array,
+    errors: Errors,
+    precision: Array,
+    is_free: NDArray[np.bool_],
+) -> Array:
     r"""Return what of the squared errors of parts the refits were unsure of, (f,).
 
     Without a part coordinates have the covariance :math:`P_{-f}`, and by Woodbury's
@@ -163,15 +171,15 @@ def _expected(rows: Array, error: Array, errors: Errors, precision: Array) -> Ar
         error: On left-out parts, shape (N,).
         errors: Which says what the parts are.
         precision: Of the fit to all, the inverse of P, shape (d, d).
+        is_free: Coordinates within their bounds without each part, shape (f, d); at a
+            bound a coordinate is as good as known.
     """
-    kept = errors.is_scored
-    pull = np.stack(
-        [
-            rows[own, 1:].T @ error[own]
-            for own in (kept & (errors.fold == j) for j in range(errors.num_folds))
-        ]
-    )
-    return (pull * np.linalg.solve(precision, pull.T).T).sum(1)
+    found = np.empty(errors.num_folds)
+    for j, free in enumerate(is_free):
+        own = errors.is_scored & (errors.fold == j)
+        pull = rows[own, 1:][:, free].T @ error[own]
+        found[j] = pull @ np.linalg.solve(precision[np.ix_(free, free)], pull)
+    return found
 
 
 def _gram(rows: Array) -> Array:

@@ -96,3 +96,22 @@ def test_weights_are_those_of_least_squares(line):
     assert found.standard == pytest.approx(plain.standard)
     assert found.refits == pytest.approx(plain.refits)
     assert found.square == pytest.approx(plain.square)
+
+
+def test_a_coordinate_at_its_bound_is_no_excuse_for_an_error(line):
+    """An effect that its bound keeps away leaves errors as they are without it."""
+    model, errors = line
+    x = model.jacobian[:, 1]
+    wide = replace(
+        model,
+        jacobian=np.concatenate([model.jacobian, -(x**2)[:, None]], 1),
+        u=np.zeros(3),
+        center=np.zeros(3),
+        sd=np.full(3, 1e3),
+        scaled=np.zeros(3, bool),
+        low=np.append(model.low, 0.0),
+        high=np.append(model.high, 0.0 + 1e-12),
+        trial_of=np.full(3, -1),
+    )
+    found = leave_out(wide, errors).standard
+    assert found == pytest.approx(leave_out(model, errors).standard, rel=1e-6)
