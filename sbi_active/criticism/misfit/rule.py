@@ -61,7 +61,7 @@ FURTHER = 0.75  # what each further effect leaves of it there
 STEEP = 1.5  # power of what is removed, with one
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
-DECISIVE = float(np.log(100.0))  # evidence for each effect beyond the second, nats
+DECISIVE = float(np.log(100.0))  # for each effect beyond the second, nats
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,8 @@ class Misfit:
         rivals: They are made of.
         equivalent: Groups of effects that nothing separates.
         choice: What helps.
+        standard: Returns a model's squared errors on left-out parts, as the rule takes
+            them.
         log_bayes_factor: Of anything with a residual process against the bare model
             with the sensor's error alone, nats.
     """
@@ -62,6 +64,7 @@ class Misfit:
     rivals: RivalSet
     equivalent: Sequence[frozenset[str]]
     choice: Choice
+    standard: Callable[[Candidate], Array]
     log_bayes_factor: float
 
     def model(self, key: ModelKey) -> LinearModel:
@@ -95,8 +98,8 @@ class Misfit:
         """Return whether it says more than a verdict of numbers without a time axis.
 
         All models have numbers that scatter more than declared, each for itself: beside
-        them effects that help gain a Bayes factor of 100, or one is probably the cause.
-        Several effects, which fit much, give way to a probable cause.
+        them effects that help have odds of 100, or one is probably the cause. Several
+        effects, which fit much, give way to a probable cause.
         """
         choice = self.choice
         if verdict == UNEXPLAINED:
@@ -138,44 +141,56 @@ class Misfit:
         errors = self.search.errors
         use = np.ones(errors.num_folds, bool)
         use[fold] = False
-        weight = trial_weights(self.search, use)
+        standard = standard_errors(self.search, use)
 
         def score(c: Candidate) -> Scored:
             posterior = errors.posterior(c.model, c.grams, use)
-            left = leave_out(c.model, errors, use, weight=weight)
             log_p = c.log_prior + posterior.log_process
-            return Scored(log_p, left.standard, passes(c.model))
+            return Scored(log_p, standard(c), passes(c.model))
 
         return settled(self.search, score, self.equivalent).key
 
     def is_robust(self) -> bool:
         """Return whether effect priors of another scale leave what helps."""
-        errors, weight = self.search.errors, trial_weights(self.search)
+        errors = self.search.errors
         for factor in RESCALED:
 
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
-                left = leave_out(c.model, errors, weight=weight)
                 log_p = c.log_prior + posterior.log_process
-                return Scored(log_p, left.standard, passes(c.model))
+                return Scored(log_p, self.standard(c), passes(c.model))
 
             if settled(self.search, score, self.equivalent).key != self.choice.key:
                 return False
         return True
 
 
-def trial_weights(search: Search, use: NDArray[np.bool_] | None = None) -> Array:
-    """Return how much each squared error counts by the likeliest model, shape (N,).
+def standard_errors(
+    search: Search, use: NDArray[np.bool_] | None = None
+) -> Callable[[Candidate], Array]:
+    """Return what gives a model's squared errors on left-out parts, once each, (f,).
+
+    Trials count as much as the likeliest model has them vary, the same for all models.
 
     Args:
         search: The models.
         use: Parts of the trials that tell of it; None takes all.
     """
+    errors = search.errors
     best = max(search.found.values(), key=lambda c: c.log_p)
     posterior = best.posterior
     if use is not None:
-        posterior = search.errors.posterior(best.model, best.grams, use)
-    return search.errors.weight(posterior)
+        posterior = errors.posterior(best.model, best.grams, use)
+    weight = errors.weight(posterior)
+    known: dict[ModelKey, Array] = {}
+
+    def standard(c: Candidate) -> Array:
+        key = c.model.key
+        if key not in known:
+            known[key] = leave_out(c.model, errors, use, weight=weight).standard
+        return known[key]
+
+    return standard
 
 
 def passes(model: LinearModel) -> bool:
@@ -224,17 +239,16 @@ def find_misfit(
         if (has_forces and not misses) or _is_one_trial(search, most):
             return None
 
-    weight = trial_weights(search)
+    standard = standard_errors(search)
 
     def score(c: Candidate) -> Scored:
-        left = leave_out(c.model, search.errors, weight=weight)
-        return Scored(c.log_p, left.standard, passes(c.model))
+        return Scored(c.log_p, standard(c), passes(c.model))
 
     choice = settled(search, score, equivalent)
     log_p = [c.log_p for c in search.found.values()]
     sensor_alone = search.found[ModelKey()].posterior.log_sensor
     log_b = log_sum_exp(np.array(log_p)) - sensor_alone
-    return Misfit(search, rivals, equivalent, choice, float(log_b))
+    return Misfit(search, rivals, equivalent, choice, standard, float(log_b))
 
 
 def settled(

@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import entropy
 
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Criticism
@@ -25,7 +27,9 @@ def test_rivals_count_by_what_they_predict_and_not_by_evidence(missed):
     weights = tracing.misfit.weights
     assert chosen.separates == (*weights,)
     assert len(weights) > 2
-    # The evidence alone would leave one or two.
+    # The evidence alone would leave two or three.
+    number = [np.exp(entropy([*p.values()])) for p in (weights, tracing.probabilities)]
+    assert number[0] > 1.5 * number[1]
     assert max(weights.values()) < max(tracing.probabilities.values()) - 0.1
     assert {*weights} <= {*tracing.evidences}
     assert chosen.action is not None
