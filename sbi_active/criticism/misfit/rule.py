@@ -18,22 +18,25 @@ r"""What helps, and what is the cause, when every model is wrong.
    the top, the likeliest of them is tried as the top, and counts where it adds to what
    helps.
 3. The probability that it is the *cause* is its inclusion probability, with that of
-   what no action tells from it, times :math:`.85^k (1 - u)^{1.5}`, with u the share of
-   the excess error that remains,
+   what no action tells from it, times o / (1 + o) with the odds
 
 .. math::
-    u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
+    o = \min(n, 8) \; .6^{k - 1 + b} \; \frac{\Delta}{\Delta + 20}
+        \left(\frac{M'}{M}\right)^{.3}
+        \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-1.6}, \qquad
+    u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right).
 
-from mean squared errors M on left-out trials in sensor variances: of the model of k
-effects, of the model without the effect and of the bare one. It is the smaller u of two
-sets: of what helps, and of what is left of it where each must predict better with a
-probability of .9, since two that imitate each other both look dispensable. Several
-effects imitate more easily than one what nobody declared, and each beyond the first
-costs .85. Where the chi-square passes against the sensor nothing remains, and the
-factor is :math:`.85^{k - 1}`. Without a time axis it is
-:math:`.85 \cdot .75^{k - 1} / (1 + (u / .25)^2)` in either case. All of these numbers
-are empirical: evidence alone, or prediction alone, names a stand-in as surely as a
-cause.
+   Each of n declared effects is beforehand as likely as all that nobody declared; a
+   library of more than eight leaves out as little. Several effects, k, imitate more
+   easily than one, and so does one that drives b parameters of the simulator to their
+   bounds. :math:`\Delta` are the nats that the set gains by the effect, beside
+   something undeclared and with the prior. M are mean squared errors on left-out trials
+   in sensor variances: of the set, of the set without the effect, of the bare model,
+   and M' of the best model of at most k effects without it. U is the share of the
+   excess error that remains, the smaller one of two sets: of what helps, and of what is
+   left of it where each must predict better with a probability of .9, since two that
+   imitate each other both look dispensable. All of these numbers are empirical:
+   evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
 from __future__ import annotations
@@ -47,7 +50,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.under_misfit import CERTAIN
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -56,9 +58,11 @@ ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 ADMITTED_FEW = 1.2  # likewise, without a time axis
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-HALF = 0.25  # u that leaves half of P(cause) without a time axis
-FURTHER = 0.75  # what each further effect leaves of it there
-STEEP = 1.5  # power of what is removed, with one
+ENOUGH = 8  # effects in a library that leaves out as little as a larger one
+IMITATED = 0.6  # what is left of the odds by a further effect, or parameter at a bound
+WEAK = 20.0  # nats gained by an effect that leave half of the odds
+HALF, STEEP = 0.25, 1.6  # u from which what remains counts, and the power
+UNRIVALLED = 0.3  # power of the best error without an effect to that with it
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 DECISIVE = float(np.log(100.0))  # for each effect beyond the second, nats
@@ -73,12 +77,12 @@ class Scored:
         square: Mean squared error on each left-out part, in sensor variances and units
             of what is expected of it, (f,): trials to which a fit can but extrapolate
             tell little of a model.
-        passes: Whether its chi-square passes against the sensor.
+        at_bounds: Parameters of the simulator that are at a bound.
     """
 
     log_p: float
     square: Array
-    passes: bool
+    at_bounds: int = 0
 
     @property
     def error(self) -> float:
@@ -157,18 +161,11 @@ def choose(
     for n in key.effects:
         # Beside one that hardly helps an effect may be missed less than it is alone.
         sets = [k for k in (key, surer) if n in k.effects]
-        remains[n], num = min((_remains(models, k, n), len(k.effects)) for k in sets)
-        # Several imitate more easily than one what nobody declared, and few numbers a
-        # trial are fitted to the sensor's error by much that is wrong.
-        if not timed:
-            share = CERTAIN * FURTHER ** (num - 1) / (1 + (remains[n] / HALF) ** 2)
-        elif models[key].passes:
-            share = CERTAIN ** (num - 1)
-        else:
-            share = CERTAIN**num * (1 - remains[n]) ** STEEP
+        remains[n] = min(_remains(models, k, n) for k in sets)
+        odds = _odds(models, key, n, alike[n], remains[n]) * min(len(names), ENOUGH)
         # Which of several that no action separates it is nobody can tell.
         either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
-        cause[n] = either * share
+        cause[n] = either * odds / (1 + odds)
     instead = stand_ins(models, key, names)
     return Choice(key, probabilities, inclusion, cause, better, remains, instead)
 
@@ -271,6 +268,35 @@ def _pruned(
         if not failing:
             return key, better
         key = key.without(min(failing, key=without.__getitem__))
+
+
+def _odds(
+    models: Mapping[ModelKey, Scored],
+    key: ModelKey,
+    name: str,
+    alike: frozenset[str],
+    remains: float,
+) -> float:
+    """Return the odds of a cause against what nobody declared, if both were as likely.
+
+    Args:
+        models: Fitted ones.
+        key: The set.
+        name: Of one of its effects.
+        alike: Effects that nothing separates from it, itself among them.
+        remains: u.
+    """
+    own, size = models[key], len(key.effects)
+    gained = max(own.log_p - models[key.without(name)].log_p, 0.0)
+    rival = min(
+        model.error
+        for other, model in models.items()
+        if len(other.effects) <= size and not alike & {*other.effects}
+    )
+    ratio = max(rival, 1.0) / max(own.error, 1.0)
+    imitates = IMITATED ** (size - 1 + own.at_bounds)
+    left = (1 + (remains / HALF) ** 2) ** STEEP
+    return imitates * ratio**UNRIVALLED * gained / (gained + WEAK) / left
 
 
 def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:

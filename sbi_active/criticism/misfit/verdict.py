@@ -73,7 +73,7 @@ class Misfit:
 
     def passes(self, key: ModelKey) -> bool:
         """Return whether a model's chi-square passes against the sensor."""
-        return passes(self.model(key))
+        return self.model(key).chi_square[2] > PASSES
 
     def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
         """Return the posterior of a model by some parts of the trials."""
@@ -146,7 +146,7 @@ class Misfit:
         def score(c: Candidate) -> Scored:
             posterior = errors.posterior(c.model, c.grams, use)
             log_p = c.log_prior + posterior.log_process
-            return Scored(log_p, standard(c), passes(c.model))
+            return Scored(log_p, standard(c), at_bounds(self.search, c.model))
 
         return settled(self.search, score, self.equivalent).key
 
@@ -158,7 +158,8 @@ class Misfit:
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
                 log_p = c.log_prior + posterior.log_process
-                return Scored(log_p, self.standard(c), passes(c.model))
+                bounds = at_bounds(self.search, c.model)
+                return Scored(log_p, self.standard(c), bounds)
 
             if settled(self.search, score, self.equivalent).key != self.choice.key:
                 return False
@@ -193,9 +194,10 @@ def standard_errors(
     return standard
 
 
-def passes(model: LinearModel) -> bool:
-    """Return whether the chi-square of a linear model passes against the sensor."""
-    return model.chi_square[2] > PASSES
+def at_bounds(search: Search, model: LinearModel) -> int:
+    """Return how many parameters of the simulator a fit has driven to a bound."""
+    of_all = search.columns(model.key, ModelKey()) & (model.trial_of < 0)
+    return int(((model.u <= model.low) | (model.u >= model.high))[of_all].sum())
 
 
 def find_misfit(
@@ -242,7 +244,7 @@ def find_misfit(
     standard = standard_errors(search)
 
     def score(c: Candidate) -> Scored:
-        return Scored(c.log_p, standard(c), passes(c.model))
+        return Scored(c.log_p, standard(c), at_bounds(search, c.model))
 
     choice = settled(search, score, equivalent)
     log_p = [c.log_p for c in search.found.values()]
