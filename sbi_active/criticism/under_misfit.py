@@ -11,9 +11,6 @@ Array = NDArray[Any]
 
 #: Probability of being the cause from which an effect is named.
 NAMED = 0.5
-#: That an effect which leaves nothing is the cause, and no imitation of what nobody
-#: declared; empirical.
-CERTAIN = 0.85
 #: What is neither named nor declared.
 UNDECLARED = "something undeclared"
 

@@ -34,7 +34,6 @@ from sbi_active.criticism.steps.influence import (
     withdrawn,
 )
 from sbi_active.criticism.steps.near_aliases import near_aliases
-from sbi_active.criticism.under_misfit import CERTAIN
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -43,6 +42,9 @@ PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
 #: That what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
+#: That an effect beyond the first, beside which a set fits to the sensor's error, is
+#: real and imitates nothing; empirical.
+REAL = 0.85
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
 
@@ -172,7 +174,7 @@ def _beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     error more often than one: each beyond the first is real with a probability of .85
     (in six such worlds of ``benchmarks/misfit``, none of which judge, 7 of 15 were).
     """
-    kept = {k: v * CERTAIN ** max(len(k.effects) - 1, 0) for k, v in p.items()}
+    kept = {k: v * REAL ** max(len(k.effects) - 1, 0) for k, v in p.items()}
     process = ModelKey(error=UNEXPLAINED)
     kept[process] += 1.0 - sum(kept.values())
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
