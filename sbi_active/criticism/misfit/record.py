@@ -224,7 +224,7 @@ def _found(
         helps=choice.key.effects,
         cause=choice.cause,
         better=choice.better,
-        remains=choice.remains,
+        odds=choice.odds,
         sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
         passes=misfit.passes(choice.key),
         size=last.posterior.size,

@@ -18,25 +18,18 @@ r"""What helps, and what is the cause, when every model is wrong.
    the top, the likeliest of them is tried as the top, and counts where it adds to what
    helps.
 3. The probability that it is the *cause* is its inclusion probability, with that of
-   what no action tells from it, times o / (1 + o) with the odds
+   what no action tells from it, times that of its odds
+   (:class:`~sbi_active.criticism.under_misfit.Odds`). They take the share u of the
+   excess error that remains,
 
 .. math::
-    o = \min(n, 8) \; .6^{k - 1 + b} \; \frac{\Delta}{\Delta + 20}
-        \left(\frac{M'}{M}\right)^{.3}
-        \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-1.6}, \qquad
-    u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right).
+    u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
 
-   Each of n declared effects is beforehand as likely as all that nobody declared; a
-   library of more than eight leaves out as little. Several effects, k, imitate more
-   easily than one, and so does one that drives b parameters of the simulator to their
-   bounds. :math:`\Delta` are the nats that the set gains by the effect, beside
-   something undeclared and with the prior. M are mean squared errors on left-out trials
-   in sensor variances: of the set, of the set without the effect, of the bare model,
-   and M' of the best model of at most k effects without it. U is the share of the
-   excess error that remains, the smaller one of two sets: of what helps, and of what is
-   left of it where each must predict better with a probability of .9, since two that
-   imitate each other both look dispensable. All of these numbers are empirical:
-   evidence alone, or prediction alone, names a stand-in as surely as a cause.
+from mean squared errors M on left-out trials in sensor variances: of the set, of the
+set without the effect and of the bare model. It is the smaller u of two sets: of what
+helps, and of what is left of it where each must predict better with a probability of
+.9, since two that imitate each other both look dispensable. All of these numbers are
+empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
 from __future__ import annotations
@@ -50,6 +43,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.under_misfit import Odds
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -58,11 +52,6 @@ ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
 ADMITTED_FEW = 1.2  # likewise, without a time axis
 INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
-ENOUGH = 8  # effects in a library that leaves out as little as a larger one
-IMITATED = 0.6  # what is left of the odds by a further effect, or parameter at a bound
-WEAK = 20.0  # nats gained by an effect that leave half of the odds
-HALF, STEEP = 0.25, 1.6  # u from which what remains counts, and the power
-UNRIVALLED = 0.3  # power of the best error without an effect to that with it
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
 DECISIVE = float(np.log(100.0))  # for each effect beyond the second, nats
@@ -105,7 +94,7 @@ class Choice:
         inclusion: Probability of each effect among them.
         cause: Probability of each effect that helps of being the cause.
         better: Probability that a left-out trial is predicted better with it.
-        remains: u, by effect that helps.
+        odds: Of being a cause and no imitation, by effect that helps.
         instead: What may stand in the place of an effect that helps, where anything
             may (:func:`stand_ins`).
     """
@@ -115,7 +104,7 @@ class Choice:
     inclusion: dict[str, float]
     cause: dict[str, float]
     better: dict[str, float]
-    remains: dict[str, float]
+    odds: dict[str, Odds]
     instead: dict[str, tuple[str, ...]]
 
 
@@ -157,17 +146,23 @@ def choose(
         if {*again[0].effects} > {*key.effects}:
             key, better, pooled = again
     surer, _ = _pruned(models, key, pooled, SURE)
-    remains, cause = {}, {}
+    odds, cause = {}, {}
     for n in key.effects:
         # Beside one that hardly helps an effect may be missed less than it is alone.
         sets = [k for k in (key, surer) if n in k.effects]
-        remains[n] = min(_remains(models, k, n) for k in sets)
-        odds = _odds(models, key, n, alike[n], remains[n]) * min(len(names), ENOUGH)
+        odds[n] = Odds(
+            declared=len(names),
+            helping=len(key.effects),
+            at_bounds=models[key].at_bounds,
+            gained=max(models[key].log_p - models[key.without(n)].log_p, 0.0),
+            rival=_rival(models, key, alike[n]),
+            remains=min(_remains(models, k, n) for k in sets),
+        )
         # Which of several that no action separates it is nobody can tell.
         either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
-        cause[n] = either * odds / (1 + odds)
+        cause[n] = either * odds[n].probability
     instead = stand_ins(models, key, names)
-    return Choice(key, probabilities, inclusion, cause, better, remains, instead)
+    return Choice(key, probabilities, inclusion, cause, better, odds, instead)
 
 
 def starts(
@@ -270,33 +265,22 @@ def _pruned(
         key = key.without(min(failing, key=without.__getitem__))
 
 
-def _odds(
-    models: Mapping[ModelKey, Scored],
-    key: ModelKey,
-    name: str,
-    alike: frozenset[str],
-    remains: float,
+def _rival(
+    models: Mapping[ModelKey, Scored], key: ModelKey, alike: frozenset[str]
 ) -> float:
-    """Return the odds of a cause against what nobody declared, if both were as likely.
+    """Return the best error without an effect over that of a set with it.
 
     Args:
         models: Fitted ones.
-        key: The set.
-        name: Of one of its effects.
-        alike: Effects that nothing separates from it, itself among them.
-        remains: u.
+        key: The set; models of more effects do not count.
+        alike: The effect, and what nothing separates from it.
     """
-    own, size = models[key], len(key.effects)
-    gained = max(own.log_p - models[key.without(name)].log_p, 0.0)
-    rival = min(
+    rivals = [
         model.error
         for other, model in models.items()
-        if len(other.effects) <= size and not alike & {*other.effects}
-    )
-    ratio = max(rival, 1.0) / max(own.error, 1.0)
-    imitates = IMITATED ** (size - 1 + own.at_bounds)
-    left = (1 + (remains / HALF) ** 2) ** STEEP
-    return imitates * ratio**UNRIVALLED * gained / (gained + WEAK) / left
+        if len(other.effects) <= len(key.effects) and not alike & {*other.effects}
+    ]
+    return max(min(rivals), 1.0) / max(models[key].error, 1.0)
 
 
 def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:

@@ -35,8 +35,8 @@ def odds(cause):
 def test_the_odds_of_a_cause_are_the_product_that_the_equation_says():
     found = choose(models(none=(0.0, 101.0), a=(20.0, 11.0), b=(1.0, 90.0)), "ab")
     assert found.key == ModelKey(("a",))
-    assert found.remains["a"] == pytest.approx(0.1, abs=1e-2)
-    u = found.remains["a"]
+    assert found.odds["a"].remains == pytest.approx(0.1, abs=1e-2)
+    u = found.odds["a"].remains
     expected = 2 * 20 / 40 * (90 / 11) ** 0.3 * (1 + (u / 0.25) ** 2) ** -1.6
     assert odds(found.cause["a"]) == pytest.approx(expected, rel=1e-6)
     assert found.better["a"] > 0.99
@@ -265,5 +265,7 @@ def test_an_effect_that_hardly_helps_does_not_hide_the_cause_beside_it():
     assert 0.8 < found.better["b"] < 0.9
     assert found.key == ModelKey(("a", "b"))
     alone = choose(models(none=(0.0, 101.0), a=(20.0, 11.0)), "a")
-    assert found.remains["a"] == pytest.approx(alone.remains["a"])  # without b
+    assert found.odds["a"].remains == pytest.approx(
+        alone.odds["a"].remains
+    )  # without b
     assert found.cause["b"] < 0.1 < found.cause["a"]
