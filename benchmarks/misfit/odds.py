@@ -1,0 +1,182 @@
+"""What tells a cause from an effect that imitates what nobody declared.
+
+    python -m benchmarks.misfit.odds --group own --kind E --first 700 --cases 20
+    python -m benchmarks.misfit.odds --table
+
+Each effect that a verdict says helps is a claim, with the factors of its odds
+(:class:`sbi_active.criticism.under_misfit.Odds`) and whether it is there. The table
+fits logistic regressions to the claims of all machines but one, and says how well they
+do on that one: by each factor, without each, and by all; beside them the odds as they
+are. Cases from 1,000 on judge, and are refused.
+
+Resumable: a case that stands in ``results/odds.csv`` is not run again; cases in which
+nothing helps leave a row without an effect.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import brier_score_loss, roc_auc_score
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
+from benchmarks.misfit.machines import GROUPS
+from benchmarks.rows import append, read
+from sbi_active.criticism import close_loop
+from sbi_active.criticism.under_misfit import REMAINING, WEAK, Odds
+
+__all__ = ["COLUMNS", "claims", "main", "table"]
+
+RESULT = Path(__file__).parent / "results" / "odds.csv"
+COLUMNS = [
+    *["group", "machine", "kind", "case", "effect", "right", "cause"],
+    *["declared", "helping", "at_bounds", "gained", "rival", "remains"],
+]
+
+Row = Mapping[str, Any]
+
+
+def claims(group: str, kind: Kind, number: int) -> list[Row]:
+    """Return a row for each effect that helps, or one without any."""
+    case = draw_case(group, kind, number)
+    problem, truth = case.problem, case.truth
+    report = close_loop(
+        problem.model,
+        problem.prior,
+        problem.trials,
+        effects=problem.effects,
+        seed=number,
+        evaluate=False,
+        plan=False,
+    )
+    known = {
+        "group": group,
+        "machine": truth.machine.name,
+        "kind": kind,
+        "case": number,
+    }
+    misfit = report.tracing.misfit
+    if misfit is None or not misfit.helps:
+        return [known]
+    alike = [truth.machine.equivalent(name) for name in truth.names]
+    right = frozenset() if kind == "R" else frozenset().union(*alike)
+    return [
+        known
+        | {"effect": name, "right": int(name in right), "cause": misfit.cause[name]}
+        | vars(odds)
+        for name, odds in misfit.odds.items()
+    ]
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Return how well factors of the odds tell causes from imitations.
+
+    Args:
+        rows: Claims, as the CSV file has them.
+    """
+    rows = [row for row in rows if row["effect"]]
+    right = np.array([int(row["right"]) for row in rows])
+    machines = np.array([row["machine"] for row in rows])
+    odds = [_odds(row) for row in rows]
+    factors = {
+        "nats gained": [np.log(o.gained / (o.gained + WEAK) + 0.01) for o in odds],
+        "what remains": [np.log1p((o.remains / REMAINING) ** 2) for o in odds],
+        "rivals": [np.log(o.rival) for o in odds],
+        "effects that help": [o.helping for o in odds],
+        "parameters at bounds": [o.at_bounds for o in odds],
+    }
+
+    def line(title: str, names: Sequence[str]) -> str:
+        found = _predicted(np.array([factors[n] for n in names]).T, right, machines)
+        return f"| {title} | {_scores(right, found)} |"
+
+    as_they_are = np.array([o.probability for o in odds])
+    every = [*factors]
+    return [
+        f"{len(rows)} effects that help, {right.sum()} of them there, "
+        f"{len({*machines})} machines, each by the others",
+        "",
+        "| by | area under the curve | Brier score |",
+        "|---|---|---|",
+        *[line(name, [name]) for name in every],
+        *[line(f"all but {n}", [m for m in every if m != n]) for n in every],
+        line("all", every),
+        f"| the odds as they are | {_scores(right, as_they_are)} |",
+    ]
+
+
+def _odds(row: Row) -> Odds:
+    return Odds(
+        declared=int(row["declared"]),
+        helping=int(row["helping"]),
+        at_bounds=int(row["at_bounds"]),
+        gained=float(row["gained"]),
+        rival=float(row["rival"]),
+        remains=float(row["remains"]),
+    )
+
+
+def _predicted(
+    x: NDArray[np.float64], right: NDArray[np.int64], groups: NDArray[np.str_]
+) -> NDArray[np.float64]:
+    """Return the probabilities of a logistic regression on the other groups."""
+    model = make_pipeline(StandardScaler(), LogisticRegression())
+    found = cross_val_predict(
+        model, x, right, groups=groups, cv=LeaveOneGroupOut(), method="predict_proba"
+    )
+    return np.asarray(found)[:, 1]
+
+
+def _scores(right: NDArray[np.int64], p: NDArray[np.float64]) -> str:
+    return f"{roc_auc_score(right, p):.3f} | {brier_score_loss(right, p):.3f}"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the cases that are asked for and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--group", choices=[*GROUPS], default="own")
+    parser.add_argument("--kind", choices=KINDS, default="E")
+    parser.add_argument("--first", type=int, default=700)
+    parser.add_argument("--cases", type=int, default=20)
+    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    arguments = parser.parse_args(argv)
+    if not arguments.table:
+        _run(arguments)
+    print("\n".join(table(read(arguments.out))))
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    group, kind = arguments.group, arguments.kind
+    numbers = range(arguments.first, arguments.first + arguments.cases)
+    if numbers.stop > FIRST_JUDGED:
+        raise SystemExit(
+            f"expected cases below {FIRST_JUDGED}, since those from there on judge; "
+            f"got {numbers.start} to {numbers.stop - 1}; pass another --first"
+        )
+    done = {(r["group"], r["kind"], int(r["case"])) for r in read(arguments.out)}
+    for number in numbers:
+        if (group, kind, number) in done:
+            continue
+        rows = claims(group, kind, number)
+        append(arguments.out, COLUMNS, rows)
+        said = {
+            row["effect"]: round(row["cause"], 2) for row in rows if "effect" in row
+        }
+        print(f"{group} {kind} {number}: {json.dumps(said)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
