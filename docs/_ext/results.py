@@ -92,6 +92,7 @@ TABLES = {
     ),
     "Verdicts where every model is wrong": (
         "benchmarks.misfit.run --summary",
+        "benchmarks.misfit.odds --table",
         "benchmarks.misfit.start_states --summary",
     ),
     "Forces that nobody declared": ("benchmarks.forces.run --summary",),

@@ -14,10 +14,11 @@ NAMED = 0.5
 #: What is neither named nor declared.
 UNDECLARED = "something undeclared"
 
-#: Effects of a library that leaves out as little as a larger one.
-ENOUGH = 8
-#: What a further effect, or a parameter at its bound, leaves of the odds of a cause.
-IMITATED = 0.6
+#: How much likelier a declared effect is beforehand than all that nobody declared, and
+#: effects of a library that leaves out as little as a larger one.
+DECLARED, ENOUGH = 4 / 3, 9
+#: What each further effect, and each parameter at its bound, leaves of the odds.
+FURTHER, AT_BOUND = 0.4, 0.6
 #: Nats gained by an effect that leave half of them.
 WEAK = 20.0
 #: Share of the excess error from which what remains counts, and the power of it.
@@ -31,16 +32,17 @@ class Odds:
     r"""That an effect is a cause, and does not imitate what nobody declared.
 
     .. math::
-        o = \min(n, 8) \; .6^{k - 1 + b} \; \frac{\Delta}{\Delta + 20}
+        o = \frac{4}{3} \min(n, 9) \; .4^{k - 1} \; .6^b \; \frac{\Delta}{\Delta + 20}
             \left(\frac{M'}{M}\right)^{.3}
             \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-1.6}
 
-    Each of n declared effects is beforehand as likely as all that nobody declared; a
-    library of more than eight leaves out as little. What gains little, what leaves
-    much and what is rivaled may be an imitation; several effects imitate more easily
-    than one, and so does one that drives parameters of the simulator to their bounds.
-    All of these numbers are empirical: fitted to simulated worlds (below case 1,000 of
-    ``benchmarks/misfit``), whose causes and imitations no factor tells apart alone.
+    Each of n declared effects is beforehand a little likelier than all that nobody
+    declared; a library of more than nine leaves out as little. What gains little, what
+    leaves much and what is rivaled may be an imitation; several effects imitate more
+    easily than one, and so does one that drives parameters of the simulator to their
+    bounds. All of these numbers are empirical: tuned on simulated worlds
+    (``benchmarks/misfit``, where others judge them) and so that measured machines whose
+    cause was removed from the library are told right.
 
     Attributes:
         declared: n, the effects of the library.
@@ -65,12 +67,11 @@ class Odds:
     @property
     def value(self) -> float:
         """The product."""
-        imitated = IMITATED ** (self.helping - 1 + self.at_bounds)
+        likely = DECLARED * min(self.declared, ENOUGH)
+        imitated = FURTHER ** (self.helping - 1) * AT_BOUND**self.at_bounds
         gained = self.gained / (self.gained + WEAK)
         left = (1 + (self.remains / REMAINING) ** 2) ** STEEP
-        return (
-            min(self.declared, ENOUGH) * imitated * gained * self.rival**RIVALED / left
-        )
+        return likely * imitated * gained * self.rival**RIVALED / left
 
     @property
     def probability(self) -> float:
