@@ -75,16 +75,15 @@ def loop(*effects, x=None, smooth=True):
     return Criticism(model, PRIOR, trials, effects=effects, actions=ACTIONS)
 
 
+FLAT = [
+    effect(held, half(2 * STEP)),
+    effect(rounded, half(0.5)),
+    effect(dead, half(0.8), "action"),
+]
+
+
 @pytest.mark.parametrize("smooth", [True, False])
-@pytest.mark.parametrize(
-    "flat",
-    [
-        effect(held, half(2 * STEP)),
-        effect(rounded, half(0.5)),
-        effect(dead, half(0.8), "action"),
-    ],
-    ids=lambda flat: flat.name,
-)
+@pytest.mark.parametrize("flat", FLAT, ids=lambda flat: flat.name)
 def test_what_is_flat_at_its_null_is_not_none(flat, smooth):
     assert loop(flat, smooth=smooth).equivalent() == ()
 
@@ -101,7 +100,7 @@ def test_what_shows_nowhere_or_is_a_parameter_is_none(hidden):
 def test_a_lag_that_is_held_over_steps_raises_the_alarm_and_is_named():
     action = ACTIONS.values[[0, 2, 4, 1, 5, 3]]
     x = held(swing(TRUE, action), torch.full((6, 1), 3 * STEP), action, None)
-    criticism = loop(effect(held, half(2 * STEP)), x=x)
+    criticism = loop(*FLAT, x=x)
     assert criticism.detect().by_evidence
     report = criticism.report(evaluate=False)
     assert report.verdict == "held"
