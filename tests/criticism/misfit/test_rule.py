@@ -154,9 +154,13 @@ def test_effects_that_nothing_separates_share_their_mass():
     assert apart.inclusion["a"] == pytest.approx(0.5)
     together = choose(several, "ab", [frozenset("ab")])
     assert len(together.key.effects) == 1
-    assert together.cause["a"] > 1.9 * apart.cause["a"]
-    # Of what is no imitation half each; as likely as a is b, which predicts as well.
-    assert apart.cause["a"] < 0.5 < together.cause["a"]
+    (name,) = together.key.effects
+    sure = together.odds[name].probability
+    assert together.cause == pytest.approx({name: sure}, abs=1e-6)
+    assert apart.cause["a"] == pytest.approx(apart.odds["a"].probability / 2, abs=1e-6)
+    # What predicts as well is a rival where an action may tell it apart.
+    assert apart.odds["a"].rival == pytest.approx(1.0)
+    assert apart.cause["a"] < 0.5 < together.cause[name]
 
 
 def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
@@ -264,8 +268,6 @@ def test_an_effect_that_hardly_helps_does_not_hide_the_cause_beside_it():
     found = choose(several, "ab")
     assert 0.8 < found.better["b"] < 0.9
     assert found.key == ModelKey(("a", "b"))
-    alone = choose(models(none=(0.0, 101.0), a=(20.0, 11.0)), "a")
-    assert found.odds["a"].remains == pytest.approx(
-        alone.odds["a"].remains
-    )  # without b
+    alone = choose(models(none=(0.0, 101.0), a=(20.0, 11.0)), "a").odds["a"]
+    assert found.odds["a"].remains == pytest.approx(alone.remains)
     assert found.cause["b"] < 0.1 < found.cause["a"]
