@@ -33,14 +33,14 @@ from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
 from benchmarks.rows import append, read
 from sbi_active.criticism import close_loop
-from sbi_active.criticism.under_misfit import REMAINING, WEAK, Odds
+from sbi_active.criticism.under_misfit import FAR, REMAINING, Odds
 
 __all__ = ["COLUMNS", "claims", "main", "table"]
 
 RESULT = Path(__file__).parent / "results" / "odds.csv"
 COLUMNS = [
     *["group", "machine", "kind", "case", "effect", "right", "cause"],
-    *["declared", "helping", "at_bounds", "gained", "rival", "remains"],
+    *["declared", "helping", "at_bounds", "gained", "remains", "error", "timed"],
 ]
 
 Row = Mapping[str, Any]
@@ -89,9 +89,9 @@ def table(rows: Sequence[Row]) -> list[str]:
     machines = np.array([row["machine"] for row in rows])
     odds = [_odds(row) for row in rows]
     factors = {  # a hundredth keeps what gains nothing finite
-        "nats gained": [np.log(o.gained / (o.gained + WEAK) + 0.01) for o in odds],
+        "nats gained": [np.log(o.by_gain + 0.01) for o in odds],
         "what remains": [np.log1p((o.remains / REMAINING) ** 2) for o in odds],
-        "rivals": [np.log(o.rival) for o in odds],
+        "error": [np.log1p(o.error / FAR) for o in odds],
         "effects that help": [o.helping for o in odds],
         "parameters at bounds": [o.at_bounds for o in odds],
     }
@@ -121,8 +121,9 @@ def _odds(row: Row) -> Odds:
         helping=int(row["helping"]),
         at_bounds=int(row["at_bounds"]),
         gained=float(row["gained"]),
-        rival=float(row["rival"]),
         remains=float(row["remains"]),
+        error=float(row["error"]),
+        timed=row["timed"] == "True",
     )
 
 

@@ -14,17 +14,19 @@ NAMED = 0.5
 #: What is neither named nor declared.
 UNDECLARED = "something undeclared"
 
-#: How much likelier a declared effect is beforehand than all that nobody declared, and
-#: effects of a library that leaves out as little as a larger one.
-DECLARED, ENOUGH = 4 / 3, 9
+#: Odds of each of n effects beforehand, over the square of n, and effects of a library
+#: that leaves out as little as a larger one.
+DECLARED, ENOUGH = 6 / 5, 9
 #: What each further effect, and each parameter at its bound, leaves of the odds.
-FURTHER, AT_BOUND = 0.4, 0.6
-#: Nats gained by an effect that leave half of them.
-WEAK = 20.0
+FURTHER, AT_BOUND = 0.7, 0.6
+#: Nats gained by an effect that leave half of them; without a time axis a quarter.
+WEAK, WEAK_UNTIMED = 50.0, 20.0
 #: Share of the excess error from which what remains counts, and the power of it.
-REMAINING, STEEP = 0.25, 1.6
-#: Power of the error of what rivals an effect.
-RIVALED = 0.3
+REMAINING, STEEP = 0.25, 2.0
+#: Mean squared error on left-out trials that leaves half of them, sensor variances.
+FAR = 300.0
+#: Power of the product.
+TEMPERED = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,17 +34,21 @@ class Odds:
     r"""That an effect is a cause, and does not imitate what nobody declared.
 
     .. math::
-        o = \frac{4}{3} \min(n, 9) \; .4^{k - 1} \; .6^b \; \frac{\Delta}{\Delta + 20}
-            \left(\frac{M'}{M}\right)^{.3}
-            \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-1.6}
+        o = \left(\frac{6}{5} \min(n, 9)^2 \; .7^{k - 1} \; .6^b \; g
+            \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-2}
+            \left(1 + \frac{M}{300}\right)^{-1}\right)^{.6}, \quad
+        g = \frac{\Delta}{\Delta + 50}, \text{ or }
+            \left(\frac{\Delta}{\Delta + 20}\right)^2 \text{ without a time axis.}
 
-    Each of n declared effects is beforehand a little likelier than all that nobody
-    declared; a library of more than nine leaves out as little. What gains little, what
-    leaves much and what is rivaled may be an imitation; several effects imitate more
-    easily than one, and so does one that drives parameters of the simulator to their
-    bounds. All of these numbers are empirical: tuned on simulated worlds
+    The more effects are declared, the less is left out, up to nine of them. What gains
+    little and what leaves much may be an imitation, and little is a few nats more where
+    a trial is a few numbers without a time axis. Several effects imitate more easily
+    than one, and so does one that drives parameters of the simulator to their bounds;
+    and a simulator that still misses by tens of the sensor's deviations lacks something
+    large. These factors share what they know, so that their product is tempered. All
+    of these numbers are empirical: tuned on simulated worlds
     (``benchmarks/misfit``, where others judge them) and so that measured machines whose
-    cause was removed from the library are told right.
+    cause was removed from the library are told right; M decides on these alone.
 
     Attributes:
         declared: n, the effects of the library.
@@ -50,28 +56,37 @@ class Odds:
         at_bounds: b, parameters of the simulator at a bound beside them.
         gained: :math:`\Delta`, nats that the verdict gains by the effect, beside
             something undeclared and with its prior.
-        rival: :math:`M' / M`, mean squared errors on left-out trials of the best model
-            of no more effects without it, and of the verdict's.
-        remains: u, the share of the excess of such an error over the sensor's that the
-            effect leaves of the excess without it, or of the bare model's, whichever
-            is more.
+        remains: u, the share of the excess of the fit's mean squared residual over the
+            sensor's that the effect leaves of the excess without it, or of the bare
+            model's, whichever is more.
+        error: M, mean squared error of the verdict on left-out trials, in sensor
+            variances.
+        timed: Whether x has a time axis.
     """
 
     declared: int
     helping: int
     at_bounds: int
     gained: float
-    rival: float
     remains: float
+    error: float
+    timed: bool
 
     @property
     def value(self) -> float:
-        """The product."""
-        likely = DECLARED * min(self.declared, ENOUGH)
+        """The product, tempered."""
+        likely = DECLARED * min(self.declared, ENOUGH) ** 2
         imitated = FURTHER ** (self.helping - 1) * AT_BOUND**self.at_bounds
-        gained = self.gained / (self.gained + WEAK)
         left = (1 + (self.remains / REMAINING) ** 2) ** STEEP
-        return likely * imitated * gained * self.rival**RIVALED / left
+        far = 1 + self.error / FAR
+        return (likely * imitated * self.by_gain / left / far) ** TEMPERED
+
+    @property
+    def by_gain(self) -> float:
+        """Factor of the nats gained, g."""
+        if self.timed:
+            return self.gained / (self.gained + WEAK)
+        return (self.gained / (self.gained + WEAK_UNTIMED)) ** 2
 
     @property
     def probability(self) -> float:

@@ -10,7 +10,7 @@ from benchmarks.rows import append, read
 
 def rows_of(gained):
     """Two machines of twenty claims, of which every other one is of a cause."""
-    factors = {"declared": 8, "helping": 1, "at_bounds": 0, "rival": 2.0}
+    factors = {"declared": 8, "helping": 1, "at_bounds": 0, "error": 2.0, "timed": True}
     return [
         factors
         | {"group": "own", "machine": machine, "kind": "E", "case": i, "effect": "a"}
@@ -40,7 +40,7 @@ def test_claims_have_the_factors_of_their_odds():
         assert {*row} == {*COLUMNS}
         assert row["right"] in (0, 1)
         assert 0 <= row["cause"] < 1
-        assert np.isfinite([row["gained"], row["rival"], row["remains"]]).all()
+        assert np.isfinite([row["gained"], row["error"], row["remains"]]).all()
 
 
 def test_cases_that_judge_are_refused(tmp_path):

@@ -23,12 +23,11 @@ r"""What helps, and what is the cause, when every model is wrong.
    excess error that remains,
 
 .. math::
-    u = \max\left(\frac{M - 1}{M_{-e} - 1}, \frac{M - 1}{M_0 - 1}\right),
+    u = \max\left(\frac{r - 1}{r_{-e} - 1}, \frac{r - 1}{r_0 - 1}\right),
 
-from mean squared errors M on left-out trials in sensor variances: of the set, of the
-set without the effect and of the bare model. It is the smaller u of two sets: of what
-helps, and of what is left of it where each must predict better with a probability of
-.9, since two that imitate each other both look dispensable. All of these numbers are
+from mean squared residuals r of fits in sensor variances: of the set, of the set
+without the effect and of the bare model. What is left out tells less of it, since a few
+trials to which a fit extrapolates hold most of that error. All of these numbers are
 empirical: evidence alone, or prediction alone, names a stand-in as surely as a cause.
 """
 
@@ -66,11 +65,13 @@ class Scored:
         square: Mean squared error on each left-out part, in sensor variances and units
             of what is expected of it, (f,): trials to which a fit can but extrapolate
             tell little of a model.
+        fitted: Mean squared residual of the fit, in sensor variances.
         at_bounds: Parameters of the simulator that are at a bound.
     """
 
     log_p: float
     square: Array
+    fitted: float
     at_bounds: int = 0
 
     @property
@@ -80,8 +81,8 @@ class Scored:
 
     @property
     def excess(self) -> float:
-        """Beyond the sensor's."""
-        return max(self.error - 1, SMALLEST_EXCESS)
+        """Of the fit's residual, beyond the sensor's error."""
+        return max(self.fitted - 1, SMALLEST_EXCESS)
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def choose(
             n: sum(v for k, v in probabilities.items() if groups[n] & {*k.effects})
             for n in names
         }
-        return *_pruned(models, top, pooled, BETTER), pooled
+        return *_pruned(models, top, pooled), pooled
 
     top, *larger = starts(models, names, timed=timed)
     key, better, pooled = helping(top)
@@ -145,18 +146,16 @@ def choose(
         # What a further effect drives out was not there for it.
         if {*again[0].effects} > {*key.effects}:
             key, better, pooled = again
-    surer, _ = _pruned(models, key, pooled, SURE)
     odds, cause = {}, {}
     for n in key.effects:
-        # Beside one that hardly helps an effect may be missed less than it is alone.
-        sets = [k for k in (key, surer) if n in k.effects]
         odds[n] = Odds(
             declared=len(names),
             helping=len(key.effects),
             at_bounds=models[key].at_bounds,
             gained=max(models[key].log_p - models[key.without(n)].log_p, 0.0),
-            rival=_rival(models, key, alike[n]),
-            remains=min(_remains(models, k, n) for k in sets),
+            remains=_remains(models, key, n),
+            error=models[key].error,
+            timed=timed,
         )
         # Which of several that no action separates it is nobody can tell.
         either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
@@ -243,7 +242,6 @@ def _pruned(
     models: Mapping[ModelKey, Scored],
     key: ModelKey,
     pooled: Mapping[str, float],
-    sure: float,
 ) -> tuple[ModelKey, dict[str, float]]:
     """Return the part of a set whose effects all help, and how surely each does."""
     while True:
@@ -258,29 +256,11 @@ def _pruned(
         failing = [
             n
             for n in key.effects
-            if pooled[n] < INCLUDED or (better[n] < sure and without[n] < most)
+            if pooled[n] < INCLUDED or (better[n] < BETTER and without[n] < most)
         ]
         if not failing:
             return key, better
         key = key.without(min(failing, key=without.__getitem__))
-
-
-def _rival(
-    models: Mapping[ModelKey, Scored], key: ModelKey, alike: frozenset[str]
-) -> float:
-    """Return the best error without an effect over that of a set with it.
-
-    Args:
-        models: Fitted ones.
-        key: The set; models of more effects do not count.
-        alike: The effect, and what nothing separates from it.
-    """
-    rivals = [
-        model.error
-        for other, model in models.items()
-        if len(other.effects) <= len(key.effects) and not alike & {*other.effects}
-    ]
-    return max(min(rivals), 1.0) / max(models[key].error, 1.0)
 
 
 def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:

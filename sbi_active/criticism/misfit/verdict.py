@@ -146,7 +146,7 @@ class Misfit:
         def score(c: Candidate) -> Scored:
             posterior = errors.posterior(c.model, c.grams, use)
             log_p = c.log_prior + posterior.log_process
-            return Scored(log_p, standard(c), at_bounds(self.search, c.model))
+            return scored(self.search, c, log_p, standard(c))
 
         return settled(self.search, score, self.equivalent).key
 
@@ -158,8 +158,7 @@ class Misfit:
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
                 log_p = c.log_prior + posterior.log_process
-                bounds = at_bounds(self.search, c.model)
-                return Scored(log_p, self.standard(c), bounds)
+                return scored(self.search, c, log_p, self.standard(c))
 
             if settled(self.search, score, self.equivalent).key != self.choice.key:
                 return False
@@ -194,10 +193,19 @@ def standard_errors(
     return standard
 
 
-def at_bounds(search: Search, model: LinearModel) -> int:
-    """Return how many parameters of the simulator a fit has driven to a bound."""
+def scored(search: Search, c: Candidate, log_p: float, square: Array) -> Scored:
+    """Return what the rule is to know of a model.
+
+    Args:
+        search: Has fitted it.
+        c: The model.
+        log_p: Its unnormalized log posterior probability.
+        square: Its mean squared errors on left-out parts, (f,).
+    """
+    model = c.model
     of_all = search.columns(model.key, ModelKey()) & (model.trial_of < 0)
-    return int(((model.u <= model.low) | (model.u >= model.high))[of_all].sum())
+    at_bounds = (model.u <= model.low) | (model.u >= model.high)
+    return Scored(log_p, square, model.rms**2, int(at_bounds[of_all].sum()))
 
 
 def find_misfit(
@@ -244,7 +252,7 @@ def find_misfit(
     standard = standard_errors(search)
 
     def score(c: Candidate) -> Scored:
-        return Scored(c.log_p, standard(c), at_bounds(search, c.model))
+        return scored(search, c, c.log_p, standard(c))
 
     choice = settled(search, score, equivalent)
     log_p = [c.log_p for c in search.found.values()]

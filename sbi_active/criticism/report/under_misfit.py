@@ -142,7 +142,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         f"{n}: probability of the cause {_share(misfit, n)}, of a better prediction of "
         f"a new trial {probability(misfit.better[n])}; the verdict gains "
         f"{misfit.odds[n].gained:.0f} nats by it, and {100 * misfit.remains[n]:.0f} % "
-        "of the excess without it remains"
+        "of the excess of the fit without it remains"
         for n in misfit.helps
     ]
     return Section(
