@@ -166,10 +166,9 @@ def test_a_sensor_beside_an_error_of_unknown_size_is_told_the_same_way():
     )
     own = trials(lag=LAG, hidden=HIDDEN)
     found, known = loop(own, model=model).trace(), loop(own).trace()
-    likeliest = [max(t.misfit.cause, key=t.misfit.cause.get) for t in (found, known)]
-    assert likeliest == ["lag", "lag"]
+    assert found.misfit.named == known.misfit.named == ("lag",)
     assert found.misfit.cause["lag"] == pytest.approx(
-        known.misfit.cause["lag"], abs=0.2
+        known.misfit.cause["lag"], abs=0.15
     )
     assert loop(trials(), model=model).trace().verdict == "none"
 
