@@ -4,9 +4,10 @@ r"""What helps, and what is the cause, when every model is wrong.
    smallest, or is not larger on a new trial with a probability of .9: one trial far
    from the others may hold most of a mean square. Without a time axis, where a trial
    is too few numbers to be sure of anything, it has to be within a fifth. Errors below
-   the sensor's are no better than it. The most probable of them by the shared evidence
-   is the top, where each effect beyond the second has to gain a Bayes factor of 100:
-   several imitate one that is not there.
+   the sensor's are no better than it. What is more probable than all of these by ten
+   nats is admitted as well. The most probable of them by the shared evidence is the
+   top, where the second effect has to gain a Bayes factor of five, and each one beyond
+   it 100: several imitate one that is not there.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
@@ -53,7 +54,9 @@ INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
-DECISIVE = float(np.log(100.0))  # for each effect beyond the second, nats
+SECOND = float(np.log(5.0))  # for the second effect, nats
+DECISIVE = float(np.log(100.0))  # for each one beyond it
+AHEAD = 10.0  # nats from which a model is admitted whatever its error
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,8 @@ def _probabilities(
 
 def _cost(key: ModelKey) -> float:
     """Return what a set is to gain for being so large, nats."""
-    return DECISIVE * max(len(key.effects) - 2, 0)
+    num = len(key.effects)
+    return SECOND * (num >= 2) + DECISIVE * max(num - 2, 0)
 
 
 def stand_ins(
@@ -273,18 +277,23 @@ def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> flo
 def admitted(
     models: Mapping[ModelKey, Scored], *, timed: bool = True
 ) -> list[ModelKey]:
-    """Return the models that predict left-out trials about as well as the best."""
+    """Return the models that predict left-out trials about as well as the best.
+
+    And those that are far more probable than all of them.
+    """
     best = min(models.values(), key=lambda m: m.error)
     smallest = max(best.error, 1.0)  # below the sensor's, by chance
-    if not timed:
-        most = ADMITTED_FEW**2 * smallest
-        return [key for key, m in models.items() if m.error <= most]
-    return [
-        key
-        for key, m in models.items()
-        if m.error <= ADMITTED**2 * smallest
-        or predicts_better(best.square, m.square) < SURE
-    ]
+
+    def is_as_good(model: Scored) -> bool:
+        if not timed:
+            return model.error <= ADMITTED_FEW**2 * smallest
+        surely_worse = predicts_better(best.square, model.square) >= SURE
+        return model.error <= ADMITTED**2 * smallest or not surely_worse
+
+    as_good = {key for key, m in models.items() if is_as_good(m)}
+    net = {key: m.log_p - _cost(key) for key, m in models.items()}
+    enough = max(net[key] for key in as_good) + AHEAD
+    return [key for key in models if key in as_good or net[key] > enough]
 
 
 def predicts_better(one: Array, other: Array) -> float:

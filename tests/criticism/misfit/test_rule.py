@@ -42,7 +42,7 @@ def test_the_odds_of_a_cause_are_the_product_that_the_equation_says():
     own = found.odds["a"]
     assert own.remains == pytest.approx(0.1)  # of the fit, not of left-out trials
     assert own.error == pytest.approx(11.0, rel=1e-2)
-    known = 1.2 * 2**2 / (1 + (0.1 / 0.25) ** 2) ** 2 / (1 + own.error / 300)
+    known = 2**2 / (1 + (0.1 / 0.25) ** 2) ** 2 / (1 + own.error / 400)
     assert product(found.cause["a"]) == pytest.approx(known * 20 / 70)
     assert found.better["a"] > 0.99
     few = choose(several, "ab", timed=False)
@@ -74,7 +74,7 @@ def test_a_simulator_that_still_misses_by_far_makes_a_cause_less_sure():
         for e in (10.0, 1000.0)
     )
     mean = WIGGLE.mean()
-    expected = (1 + 1000 * mean / 300) / (1 + 10 * mean / 300)
+    expected = (1 + 1000 * mean / 400) / (1 + 10 * mean / 400)
     assert product(near) / product(far) == pytest.approx(expected)
 
 
@@ -104,12 +104,12 @@ def test_one_trial_far_from_the_others_does_not_rule_a_model_out():
     far[0] = 60.0
     several = models(none=(0.0, 101.0), b=(0.0, 4.0)) | {
         ModelKey(("b",)): scored(0.0, even),
-        ModelKey(("a",)): scored(30.0, far),
+        ModelKey(("a",)): scored(8.0, far),
     }
     assert far.mean() > 2 * even.mean()
     assert predicts_better(even, far) < 0.9
     assert choose(several, "ab").key == ModelKey(("a",))
-    worse = {**several, ModelKey(("a",)): scored(30.0, 2 * even)}
+    worse = {**several, ModelKey(("a",)): scored(8.0, 2 * even)}
     assert choose(worse, "ab").key == ModelKey(("b",))
 
 
@@ -118,10 +118,10 @@ def test_without_a_time_axis_a_model_within_a_fifth_is_compared_and_no_other():
     far[0] = 60.0
     several = models(none=(0.0, 101.0), b=(0.0, 4.0)) | {
         ModelKey(("b",)): scored(0.0, even),
-        ModelKey(("a",)): scored(30.0, far),
+        ModelKey(("a",)): scored(8.0, far),
     }
     assert choose(several, "ab", timed=False).key == ModelKey(("b",))
-    near = {**several, ModelKey(("a",)): scored(30.0, 1.18**2 * even)}
+    near = {**several, ModelKey(("a",)): scored(8.0, 1.18**2 * even)}
     assert choose(near, "ab", timed=False).key == ModelKey(("a",))
     assert choose(near, "ab").key == ModelKey(("b",))  # surely worse
 
@@ -131,14 +131,14 @@ def test_errors_below_the_sensor_s_are_all_alike(timed):
     """A stand-in happens to predict to half of the sensor's error, the cause to it."""
     several = models(none=(0.0, 101.0), a=(40.0, 0.99), b=(20.0, 0.25))
     assert choose(several, "ab", timed=timed).key == ModelKey(("a",))
-    above = models(none=(0.0, 101.0), a=(40.0, 9.9), b=(20.0, 2.5))
+    above = models(none=(0.0, 101.0), a=(28.0, 9.9), b=(20.0, 2.5))
     assert choose(above, "ab", timed=timed).key == ModelKey(("b",))
 
 
 def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
     """A fast effect has the evidence, a slow one beside it the prediction."""
     found = choose(
-        models(none=(0.0, 80.0), a=(60.0, 75.0), b=(2.0, 40.0), a_b=(50.0, 20.0)), "ab"
+        models(none=(0.0, 80.0), a=(60.0, 75.0), b=(2.0, 40.0), a_b=(61.0, 20.0)), "ab"
     )
     assert [*found.probabilities] == [ModelKey(("a", "b"))]
     assert found.key == ModelKey(("a", "b"))
@@ -193,7 +193,7 @@ def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
 def test_relatives_that_share_their_mass_help_together():
     """Neither of two is more likely there than not, and one of them surely is."""
     several = models(none=(0.0, 101.0), a=(0.0, 30.0), b=(0.0, 30.0), c=(19.5, 4.3))
-    several |= models(a_c=(20.0, 4.0), b_c=(20.1, 4.0))
+    several |= models(a_c=(21.6, 4.0), b_c=(21.7, 4.0))
     found = choose(several, "abc")
     assert {n: found.inclusion[n] < 0.5 for n in "ab"} == {"a": True, "b": True}
     assert found.key == ModelKey(("b", "c"))
@@ -203,24 +203,39 @@ def test_relatives_that_share_their_mass_help_together():
 def test_relatives_together_more_likely_than_the_set_without_are_in_the_top():
     """Each is less probable than c alone, one of both is more probable than it."""
     several = models(none=(0.0, 101.0), a=(0.0, 30.0), b=(0.0, 30.0), c=(20.2, 4.4))
-    several |= models(a_c=(19.9, 4.0), b_c=(20.0, 4.0))
+    several |= models(a_c=(21.5, 4.0), b_c=(21.6, 4.0))
     tops = [ModelKey(("c",)), ModelKey(("b", "c"))]
     assert starts(several, "abc") == tops
     assert choose(several, "abc").key == ModelKey(("b", "c"))
-    apart = {**several, ModelKey(("a", "c")): scored(19.9, 4.4)}  # no relative of b
+    apart = {**several, ModelKey(("a", "c")): scored(21.5, 4.4)}  # no relative of b
     assert choose(apart, "abc").key == ModelKey(("c",))
 
 
 def test_relatives_that_drive_out_what_helps_are_not_taken():
     """With b a left-out trial is predicted no worse without a, which helps alone."""
     several = models(none=(0.0, 101.0), a=(20.3, 11.0), c=(0.0, 60.0))
-    several |= models(a_b=(20.0, 10.0), a_c=(19.95, 10.0))
+    several |= models(a_b=(21.6, 10.0), a_c=(21.55, 10.0))
     share = np.array([1.04, 0.9] * 4)
     imitated = several[ModelKey(("a", "b"))].square * share
     several[ModelKey(("b",))] = scored(0.0, imitated)
     tops = [ModelKey(("a",)), ModelKey(("a", "b"))]
     assert starts(several, "abc") == tops
     assert choose(several, "abc").key == ModelKey(("a",))
+
+
+def test_a_model_that_is_far_more_probable_is_admitted_whatever_its_error():
+    """Two that imitate a cause predict a few left-out trials better."""
+    several = models(none=(0.0, 101.0), b=(0.0, 50.0), c=(0.0, 50.0), b_c=(20.0, 4.0))
+    near, far = (models(a=(20.0 + gain, 9.0)) for gain in (8.0, 9.0))
+    assert choose(several | near, "abc").key == ModelKey(("b", "c"))  # it costs ln 5
+    assert choose(several | far, "abc").key == ModelKey(("a",))
+
+
+def test_a_second_effect_needs_a_bayes_factor_of_five():
+    several = models(none=(0.0, 101.0), a=(20.0, 10.0), b=(5.0, 60.0))
+    few, many = (models(a_b=(20.0 + gain, 9.5)) for gain in (1.5, 1.7))
+    assert starts(several | few, "ab")[0] == ModelKey(("a",))
+    assert starts(several | many, "ab")[0] == ModelKey(("a", "b"))
 
 
 def test_a_third_effect_needs_decisive_evidence():
