@@ -14,8 +14,9 @@ NAMED = 0.5
 #: What is neither named nor declared.
 UNDECLARED = "something undeclared"
 
-#: Effects of a library that leaves out as little as a larger one.
-ENOUGH = 9
+#: Odds of each declared effect beforehand, over their number, and effects of a library
+#: that leaves out as little as a larger one.
+DECLARED, ENOUGH = 8, 9
 #: What each further effect, and each parameter at its bound, leaves of the odds.
 FURTHER, AT_BOUND = 0.7, 0.6
 #: Nats gained by an effect that leave half of them; without a time axis a quarter.
@@ -23,7 +24,7 @@ WEAK, WEAK_UNTIMED = 50.0, 20.0
 #: Share of the excess error from which what remains counts, and the power of it.
 REMAINING, STEEP = 0.25, 2.0
 #: Mean squared error on left-out trials that leaves half of them, sensor variances.
-FAR = 400.0
+FAR = 150.0
 #: Power of the product.
 TEMPERED = 0.6
 
@@ -33,9 +34,9 @@ class Odds:
     r"""That an effect is a cause, and does not imitate what nobody declared.
 
     .. math::
-        o = \left(\min(n, 9)^2 \; .7^{k - 1} \; .6^b \; g
+        o = \left(8 \min(n, 9) \; .7^{k - 1} \; .6^b \; g
             \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-2}
-            \left(1 + \frac{M}{400}\right)^{-1}\right)^{.6}, \quad
+            \left(1 + \frac{M}{150}\right)^{-1}\right)^{.6}, \quad
         g = \frac{\Delta}{\Delta + 50}, \text{ or }
             \left(\frac{\Delta}{\Delta + 20}\right)^2 \text{ without a time axis.}
 
@@ -74,7 +75,7 @@ class Odds:
     @property
     def value(self) -> float:
         """The product, tempered."""
-        likely = min(self.declared, ENOUGH) ** 2
+        likely = DECLARED * min(self.declared, ENOUGH)
         imitated = FURTHER ** (self.helping - 1) * AT_BOUND**self.at_bounds
         left = (1 + (self.remains / REMAINING) ** 2) ** STEEP
         far = 1 + self.error / FAR

@@ -131,7 +131,8 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         f"Every model carries {error}, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "
         f"error on left-out {misfit.left_out}, in units of what the others let expect, "
-        f"is within a {near} of the smallest; P is among them. Errors below are root "
+        f"is within a {near} of the smallest, and what is more probable than these by "
+        "ten nats; P is among them. Errors below are root "
         "mean squares of models fitted without what they predict. The "
         f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
         "beyond it, as a share of the bare model's.",
