@@ -69,6 +69,10 @@ def _measures(
 
     found = {
         "E, gain >= 50 %: right": (of("E large"), _has_all),
+        "E, gain >= 50 %: right, or in a stated place": (
+            of("E large"),
+            _has_all_places,
+        ),
         "E, gain 20 to 50 %: right": (of("E some"), _has_all),
         "E, gain < 20 %: right": (of("E little"), _has_all),
     }

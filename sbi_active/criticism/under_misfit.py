@@ -16,7 +16,7 @@ UNDECLARED = "something undeclared"
 
 #: Odds of each declared effect beforehand, over their number, and effects of a library
 #: that leaves out as little as a larger one.
-DECLARED, ENOUGH = 8, 9
+DECLARED, ENOUGH = 6, 9
 #: What each further effect, and each parameter at its bound, leaves of the odds.
 FURTHER, AT_BOUND = 0.7, 0.6
 #: Nats gained by an effect that leave half of them; without a time axis a quarter.
@@ -24,7 +24,7 @@ WEAK, WEAK_UNTIMED = 50.0, 20.0
 #: Share of the excess error from which what remains counts, and the power of it.
 REMAINING, STEEP = 0.25, 2.0
 #: Mean squared error on left-out trials that leaves half of them, sensor variances.
-FAR = 150.0
+FAR = 200.0
 #: Power of the product.
 TEMPERED = 0.6
 
@@ -34,9 +34,9 @@ class Odds:
     r"""That an effect is a cause, and does not imitate what nobody declared.
 
     .. math::
-        o = \left(8 \min(n, 9) \; .7^{k - 1} \; .6^b \; g
+        o = \left(6 \min(n, 9) \; .7^{k - 1} \; .6^b \; g
             \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-2}
-            \left(1 + \frac{M}{150}\right)^{-1}\right)^{.6}, \quad
+            \left(1 + \frac{M}{200}\right)^{-1}\right)^{.6}, \quad
         g = \frac{\Delta}{\Delta + 50}, \text{ or }
             \left(\frac{\Delta}{\Delta + 20}\right)^2 \text{ without a time axis.}
 

@@ -42,7 +42,7 @@ def test_the_odds_of_a_cause_are_the_product_that_the_equation_says():
     own = found.odds["a"]
     assert own.remains == pytest.approx(0.1)  # of the fit, not of left-out trials
     assert own.error == pytest.approx(11.0, rel=1e-2)
-    known = 8 * 2 / (1 + (0.1 / 0.25) ** 2) ** 2 / (1 + own.error / 150)
+    known = 6 * 2 / (1 + (0.1 / 0.25) ** 2) ** 2 / (1 + own.error / 200)
     assert product(found.cause["a"]) == pytest.approx(known * 20 / 70)
     assert found.better["a"] > 0.99
     few = choose(several, "ab", timed=False)
@@ -74,7 +74,7 @@ def test_a_simulator_that_still_misses_by_far_makes_a_cause_less_sure():
         for e in (10.0, 1000.0)
     )
     mean = WIGGLE.mean()
-    expected = (1 + 1000 * mean / 150) / (1 + 10 * mean / 150)
+    expected = (1 + 1000 * mean / 200) / (1 + 10 * mean / 200)
     assert product(near) / product(far) == pytest.approx(expected)
 
 
