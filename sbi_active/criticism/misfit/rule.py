@@ -6,8 +6,8 @@ r"""What helps, and what is the cause, when every model is wrong.
    is too few numbers to be sure of anything, it has to be within a fifth. Errors below
    the sensor's are no better than it. What is more probable than all of these by ten
    nats is admitted as well. The most probable of them by the shared evidence is the
-   top, where the second effect has to gain a Bayes factor of five, and each one beyond
-   it 100: several imitate one that is not there.
+   top, where each effect beyond the second has to gain a Bayes factor of 100, and
+   without a time axis the second one of five: several imitate one that is not there.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
@@ -54,8 +54,8 @@ INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
 NEEDED = 2.0  # times the error on left-out trials without an effect
 PASSES = 0.01  # tail probability of a chi-square against the sensor
 SMALLEST_EXCESS = 1e-2
-SECOND = float(np.log(5.0))  # for the second effect, nats
-DECISIVE = float(np.log(100.0))  # for each one beyond it
+DECISIVE = float(np.log(100.0))  # for each effect beyond the second, nats
+SECOND_FEW = float(np.log(5.0))  # for the second one, without a time axis
 AHEAD = 10.0  # nats from which a model is admitted whatever its error
 
 
@@ -199,15 +199,16 @@ def _probabilities(
 ) -> dict[ModelKey, float]:
     """Return the probabilities of the admitted models, most probable first."""
     keys = admitted(models, timed=timed)
-    log_p = np.array([models[key].log_p - _cost(key) for key in keys])
+    log_p = np.array([models[key].log_p - _cost(key, timed=timed) for key in keys])
     p = np.exp(log_p - log_sum_exp(log_p))
     return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
 
 
-def _cost(key: ModelKey) -> float:
+def _cost(key: ModelKey, *, timed: bool) -> float:
     """Return what a set is to gain for being so large, nats."""
     num = len(key.effects)
-    return SECOND * (num >= 2) + DECISIVE * max(num - 2, 0)
+    second = 0.0 if timed or num < 2 else SECOND_FEW
+    return second + DECISIVE * max(num - 2, 0)
 
 
 def stand_ins(
@@ -291,7 +292,7 @@ def admitted(
         return model.error <= ADMITTED**2 * smallest or not surely_worse
 
     as_good = {key for key, m in models.items() if is_as_good(m)}
-    net = {key: m.log_p - _cost(key) for key, m in models.items()}
+    net = {key: m.log_p - _cost(key, timed=timed) for key, m in models.items()}
     enough = max(net[key] for key in as_good) + AHEAD
     return [key for key in models if key in as_good or net[key] > enough]
 
