@@ -285,11 +285,12 @@ def admitted(
     best = min(models.values(), key=lambda m: m.error)
     smallest = max(best.error, 1.0)  # below the sensor's, by chance
 
+    most = (ADMITTED if timed else ADMITTED_FEW) ** 2 * smallest
+
     def is_as_good(model: Scored) -> bool:
-        if not timed:
-            return model.error <= ADMITTED_FEW**2 * smallest
-        surely_worse = predicts_better(best.square, model.square) >= SURE
-        return model.error <= ADMITTED**2 * smallest or not surely_worse
+        if model.error <= most:
+            return True
+        return timed and predicts_better(best.square, model.square) < SURE
 
     as_good = {key for key, m in models.items() if is_as_good(m)}
     net = {key: m.log_p - _cost(key, timed=timed) for key, m in models.items()}
