@@ -15,12 +15,14 @@ from benchmarks.criticism.cases import Case
 from benchmarks.criticism.oracle import oracle_rmse
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Report, close_loop
+from sbi_active.criticism.under_misfit import UNDECLARED
 
 __all__ = ["COLUMNS", "counted", "score_case"]
 
 COLUMNS = [
     *["case", "effects", "strengths", "theta", "correlation", "lambda", "support"],
     *["verdict", "probabilities", "credible_set", "equivalent", "formula"],
+    "undeclared",
     *["rmse_before", "rmse_after", "rmse_oracle", "coverage_before", "coverage_after"],
     *["engine", "warnings", "trial_simulations", "cpu_seconds", "failure"],
 ]
@@ -101,6 +103,7 @@ def read_report(report: Report) -> dict[str, object]:
         "credible_set": json.dumps([*report.credible_set]),
         "equivalent": json.dumps([sorted(group) for group in report.equivalent]),
         "formula": report.guess or "",
+        "undeclared": int(UNDECLARED in repr(report)),
         "warnings": len(report.warnings),
     }
     for metric, before, after, *_ in report.before_after.itertuples(index=False):

@@ -14,6 +14,7 @@ from benchmarks.criticism.curves import SCORES, Curves
 from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.intervals import brier_score, rate, reliability
 from benchmarks.criticism.worlds import World
+from sbi_active.criticism.under_misfit import UNDECLARED
 
 __all__ = ["summary"]
 
@@ -86,6 +87,8 @@ def _library(world: World, rows: Sequence[Row]) -> list[str]:
         + rate([r["verdict"] == "scatter" for r in scattered if _detected(r)])
         + f", detected {sum(map(_detected, scattered))}/{len(scattered)}",
     ]
+    if said := [r["undeclared"] == "1" for r in named if r["undeclared"]]:
+        lines.append(f'false "{UNDECLARED}" {rate(said)}')
     lines += [
         f"  case {r['case']} (lambda {float(r['lambda']):.0f}): {r['effects']} "
         f"{r['strengths']} called {r['verdict']}"
@@ -169,13 +172,19 @@ def _removed(world: World, rows: Sequence[Row]) -> list[str]:
 
 
 def _said_so(world: World, title: str, rows: Sequence[Row]) -> list[str]:
-    lines = [f"says so ({title}) {rate([*map(_unexplained, rows)])}"]
+    lines = [
+        f"says so ({title}) {rate([*map(_unexplained, rows)])}",
+        f'the same, or names an effect "beside {UNDECLARED}" ({title}) '
+        f"{rate([_unexplained(r) or r['undeclared'] == '1' for r in rows])}",
+    ]
     formulas = [r for r in rows if r["effects"] in world.formulas]
     hits = [r["formula"] in world.formulas[r["effects"]] for r in formulas]
     lines.append(f"names the formula ({title}) {rate(hits)}")
     lines += [
         f"  case {r['case']} (lambda {float(r['lambda']):.0f}): {r['effects']} called "
-        f"{r['verdict']}" + (f", guess {r['formula']}" if r["formula"] else "")
+        f"{r['verdict']}"
+        + (f", guess {r['formula']}" if r["formula"] else "")
+        + (f" beside {UNDECLARED}" if r["undeclared"] == "1" else "")
         for r in rows
         if title == "all" and (not _unexplained(r) or r["effects"] in world.formulas)
     ]

@@ -9,7 +9,7 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.numbers import number, probability, stated
 from sbi_active.criticism.report.section import Section, joined, named_entries
 from sbi_active.criticism.results import Array, ModelKey
-from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
 
 
 def misfit_line(report: Contents, misfit: Misfit) -> str:
@@ -28,6 +28,8 @@ def misfit_line(report: Contents, misfit: Misfit) -> str:
     causes = joined([f"{n} ({stated(misfit.cause[n])})" for n in named])
     line = f"Verdict: {report.verdict}, probably the cause"
     line += f" ({stated(misfit.cause[named[0]])})" if len(named) == 1 else f": {causes}"
+    # An effect that imitates one that nobody declared leaves something of it.
+    line += "" if misfit.passes else f", beside {UNDECLARED}"
     rest = [n for n in misfit.helps if n not in named]
     return line + (f"; {joined(rest)} helps to predict" if rest else "")
 
