@@ -322,7 +322,7 @@ class RivalSet:
         for few in (True, False) if self.nuisances or not self.is_smooth else (False,):
             other = self._temper(rival, seed, few=few)
             both = np.hypot(sample.standard_error, other.standard_error)
-            if sample.log_evidence > other.log_evidence + 2 * both:
+            if sample.log_evidence - 2 * both > other.log_evidence:
                 # Particles that lost a ridge do not find it again.
                 return sample, "least squares"
         return other, "tempering"
