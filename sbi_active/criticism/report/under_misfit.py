@@ -57,9 +57,10 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
         ]
     found += _described(report, misfit.helps)
     verb = "Adding" if not named else "With"
+    beside = f", of {UNDECLARED} that it may imitate" * (not misfit.passes)
     found.append(
         f"{verb} {ModelKey(misfit.helps)} the error on left-out {misfit.left_out} goes "
-        f"from {change}; {remains} over the sensor's remains."
+        f"from {change}; {remains} over the sensor's remains{beside}."
     )
     rest = [n for n in misfit.helps if n not in named]
     if rest:
