@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -36,19 +37,21 @@ class Odds:
     .. math::
         o = \left(6 \min(n, 9) \; .7^{k - 1} \; .6^b \; g
             \left(1 + \left(\frac{u}{.25}\right)^2\right)^{-2}
-            \left(1 + \frac{M}{200}\right)^{-1}\right)^{.6}, \quad
+            \left(1 + \frac{M}{200}\right)^{-1}
+            \left(1 + \frac{e^G}{6}\right)^{-1}\right)^{.6}, \quad
         g = \frac{\Delta}{\Delta + 50}, \text{ or }
             \left(\frac{\Delta}{\Delta + 20}\right)^2 \text{ without a time axis.}
 
     The more effects are declared, the less is left out, up to nine of them. What gains
     little and what leaves much may be an imitation, and little is a few nats more where
-    a trial is a few numbers without a time axis. Several effects imitate more easily
-    than one, and so does one that drives parameters of the simulator to their bounds;
-    and a simulator that still misses by tens of the sensor's deviations lacks something
-    large. These factors share what they know, so that their product is tempered. All
-    of these numbers are empirical: tuned on simulated worlds
-    (``benchmarks/misfit``, where others judge them) and so that measured machines whose
-    cause was removed from the library are told right; M decides on these alone.
+    a trial is a few numbers without a time axis; there elementary formulas, which stand
+    for what nobody declared, compete with it. Several effects imitate more easily than
+    one, and so does one that drives parameters of the simulator to their bounds; and a
+    simulator that still misses by tens of the sensor's deviations lacks something
+    large. These factors share what they know, so that their product is tempered. All of
+    these numbers are empirical: tuned on simulated worlds (``benchmarks/misfit``, where
+    others judge them) and so that measured machines whose cause was removed from the
+    library are told right; M decides on these alone.
 
     Attributes:
         declared: n, the effects of the library.
@@ -62,6 +65,8 @@ class Odds:
         error: M, mean squared error of the verdict on left-out trials, in sensor
             variances.
         timed: Whether x has a time axis.
+        guessed: G, nats that elementary formulas in the place of the effect gain over
+            it; with a time axis they are not asked.
     """
 
     declared: int
@@ -71,6 +76,7 @@ class Odds:
     remains: float
     error: float
     timed: bool
+    guessed: float = -np.inf
 
     @property
     def value(self) -> float:
@@ -79,7 +85,8 @@ class Odds:
         imitated = FURTHER ** (self.helping - 1) * AT_BOUND**self.at_bounds
         left = (1 + (self.remains / REMAINING) ** 2) ** STEEP
         far = 1 + self.error / FAR
-        return (likely * imitated * self.by_gain / left / far) ** TEMPERED
+        o = likely * imitated * self.by_gain / left / far
+        return float((o / (1 + np.exp(self.guessed) / DECLARED)) ** TEMPERED)
 
     @property
     def by_gain(self) -> float:

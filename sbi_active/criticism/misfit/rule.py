@@ -34,7 +34,7 @@ empirical: evidence alone, or prediction alone, names a stand-in as surely as a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +118,7 @@ def choose(
     equivalent: Sequence[frozenset[str]] = (),
     *,
     timed: bool = True,
+    guessed: Callable[[ModelKey, str], float] | None = None,
 ) -> Choice:
     """Return what helps, and the probability that it is the cause.
 
@@ -126,6 +127,8 @@ def choose(
         names: Of all effects.
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
+        guessed: Returns the nats that guesses in the place of an effect of a set gain
+            over it; None where none were made.
     """
     probabilities = _probabilities(models, timed=timed)
     inclusion = {
@@ -159,6 +162,7 @@ def choose(
             remains=_remains(models, key, n),
             error=models[key].error,
             timed=timed,
+            guessed=-np.inf if guessed is None else guessed(key, n),
         )
         # Which of several that no action separates it is nobody can tell.
         either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})

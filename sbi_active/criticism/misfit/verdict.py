@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.fit import FirstLook
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.left_out import leave_out
 from sbi_active.criticism.misfit.linear import LinearModel
@@ -254,7 +255,9 @@ def find_misfit(
     def score(c: Candidate) -> Scored:
         return scored(search, c, c.log_p, standard(c))
 
-    choice = settled(search, score, equivalent)
+    timed = rivals.measurements.is_sequence
+    guessed = None if timed else partial(gained_by_guesses, search)
+    choice = settled(search, score, equivalent, guessed)
     log_p = [c.log_p for c in search.found.values()]
     sensor_alone = search.found[ModelKey()].posterior.log_sensor
     log_b = log_sum_exp(np.array(log_p)) - sensor_alone
@@ -265,6 +268,7 @@ def settled(
     search: Search,
     score: Callable[[Candidate], Scored],
     equivalent: Sequence[frozenset[str]],
+    guessed: Callable[[ModelKey, str], float] | None = None,
 ) -> Choice:
     """Return what helps, once every part of the top model is fitted.
 
@@ -272,6 +276,8 @@ def settled(
         search: The models so far.
         score: What the rule is to know of one.
         equivalent: Groups of effects that nothing separates.
+        guessed: Returns what guesses in the place of an effect gain over it, nats; None
+            asks none.
     """
     scored: dict[ModelKey, Scored] = {}
     timed = search.rivals.measurements.is_sequence
@@ -282,7 +288,9 @@ def settled(
         tops = starts(scored, search.names, timed=timed)
         missing = [key for top in tops for key in _missing(search, top)]
         if not missing:
-            return choose(scored, search.names, equivalent, timed=timed)
+            return choose(
+                *(scored, search.names, equivalent), timed=timed, guessed=guessed
+            )
         for key in missing:
             search.fit_set(key)
 
