@@ -33,7 +33,7 @@ from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
 from benchmarks.rows import append, read
 from sbi_active.criticism import close_loop
-from sbi_active.criticism.under_misfit import FAR, REMAINING, Odds
+from sbi_active.criticism.under_misfit import DECLARED, FAR, REMAINING, Odds
 
 __all__ = ["COLUMNS", "claims", "main", "table"]
 
@@ -41,6 +41,7 @@ RESULT = Path(__file__).parent / "results" / "odds.csv"
 COLUMNS = [
     *["group", "machine", "kind", "case", "effect", "right", "cause"],
     *["declared", "helping", "at_bounds", "gained", "remains", "error", "timed"],
+    "guessed",
 ]
 
 Row = Mapping[str, Any]
@@ -92,6 +93,7 @@ def table(rows: Sequence[Row]) -> list[str]:
         "nats gained": [np.log(o.by_gain + 0.01) for o in odds],
         "what remains": [np.log1p((o.remains / REMAINING) ** 2) for o in odds],
         "error": [np.log1p(o.error / FAR) for o in odds],
+        "guesses": [np.logaddexp(0.0, o.guessed - np.log(DECLARED)) for o in odds],
         "effects that help": [o.helping for o in odds],
         "parameters at bounds": [o.at_bounds for o in odds],
     }
@@ -124,6 +126,7 @@ def _odds(row: Row) -> Odds:
         remains=float(row["remains"]),
         error=float(row["error"]),
         timed=row["timed"] == "True",
+        guessed=float(row["guessed"]),
     )
 
 

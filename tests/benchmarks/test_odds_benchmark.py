@@ -11,6 +11,7 @@ from benchmarks.rows import append, read
 def rows_of(gained):
     """Two machines of twenty claims, of which every other one is of a cause."""
     factors = {"declared": 8, "helping": 1, "at_bounds": 0, "error": 2.0, "timed": True}
+    factors["guessed"] = -np.inf
     return [
         factors
         | {"group": "own", "machine": machine, "kind": "E", "case": i, "effect": "a"}

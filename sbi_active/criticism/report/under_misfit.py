@@ -146,7 +146,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         f"{n}: probability of the cause {_share(misfit, n)}, of a better prediction of "
         f"a new trial {probability(misfit.better[n])}; the verdict gains "
         f"{misfit.odds[n].gained:.0f} nats by it, and {100 * misfit.remains[n]:.0f} % "
-        "of the excess of the fit without it remains"
+        "of the excess of the fit without it remains" + _outdone(misfit.odds[n].guessed)
         for n in misfit.helps
     ]
     return Section(
@@ -156,6 +156,11 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         header=tuple(header),
         rows=tuple(rows),
     )
+
+
+def _outdone(nats: float) -> str:
+    """Return what elementary formulas gain over an effect, where they do."""
+    return f"; guesses in its place gain {nats:.0f} nats over it" if nats > 1 else ""
 
 
 def _share(misfit: Misfit, name: str) -> str:

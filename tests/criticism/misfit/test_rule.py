@@ -78,6 +78,23 @@ def test_a_simulator_that_still_misses_by_far_makes_a_cause_less_sure():
     assert product(near) / product(far) == pytest.approx(expected)
 
 
+def test_formulas_in_the_place_of_an_effect_compete_with_it():
+    several = models(none=(0.0, 101.0), a=(20.0, 2.0), b=(19.0, 2.1), a_b=(39.0, 1.1))
+    asked = []
+
+    def guessed(key, name):
+        asked.append((key.effects, name))
+        return {"a": -np.inf, "b": 12.0}[name]
+
+    without = choose(several, "ab")
+    found = choose(several, "ab", guessed=guessed)
+    assert without.key == found.key == ModelKey(("a", "b"))
+    assert asked == [(("a", "b"), "a"), (("a", "b"), "b")]
+    assert found.cause["a"] == without.cause["a"]
+    less = product(without.cause["b"]) / product(found.cause["b"])
+    assert less == pytest.approx(1 + np.exp(12.0) / 6, rel=1e-6)
+
+
 def test_a_fit_that_drives_a_parameter_to_its_bound_is_less_surely_of_a_cause():
     inside = models(none=(0.0, 101.0), a=(20.0, 2.0))
     at_bound = replace(inside[ModelKey(("a",))], at_bounds=2)

@@ -90,6 +90,31 @@ def test_scatter_gives_way_to_effects_that_help_beside_it(beside):
     assert not replace(misfit, choice=nothing).replaces("scatter")
 
 
+def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
+    """A power of 1.5 is not declared; the quadratic takes up 99 % of its excess."""
+
+    def curved(theta: Tensor, action: Tensor) -> Tensor:
+        return line(theta, action) + 2 * action[:, :1].to(theta).abs() ** 1.5
+
+    own = trials()
+    x = own.x + curved(torch.zeros(NUM_TRIALS, 2), own.action)
+    found = loop(Trials(own.action, x))
+    report = found.report(evaluate=False, plan=False)
+    misfit = report.tracing.misfit
+    assert misfit.helps == ("quadratic",)
+    assert misfit.remains["quadratic"] < 0.02
+    assert misfit.odds["quadratic"].guessed > 10
+    assert misfit.cause["quadratic"] < 0.01
+    assert report.guess == "|xi|^1.5"
+    assert "guesses in its place gain" in " ".join(str(report).split())
+
+
+def test_a_cause_has_no_rival_among_formulas(beside):
+    guessed = beside.trace().misfit.odds["quadratic"].guessed
+    # One of them is the effect itself.
+    assert -4 < guessed < 0
+
+
 def test_a_model_that_fits_is_no_misfit():
     found = loop(trials(quadratic=QUADRATIC))
     assert found.trace().verdict == "quadratic"
