@@ -86,14 +86,14 @@ def judge(
         )
         tracing = loop.trace()
         adopted += [e for n in tracing.chosen for e in effects if e.name == n]
-        values = _mean(tracing, ModelKey(tracing.chosen))
+        values = _best(tracing, ModelKey(tracing.chosen))
         run = leg.free_run(parameters, adopted, values)[0]
         row = _row(tracing) | {
             "values": values[0].tolist(),
             "after": leg.errors(run),
         }
         if before is None:
-            bare = _mean(tracing, ModelKey())
+            bare = _best(tracing, ModelKey())
             before = leg.errors(leg.free_run(parameters, [], bare)[0])
             row |= {"before": before, "bare values": bare[0].tolist()}
         found.append(row)
@@ -110,10 +110,14 @@ def judge(
     }
 
 
-def _mean(tracing: Tracing, key: ModelKey) -> torch.Tensor:
-    """Return the posterior mean of a model's parameters and strengths, (1, d)."""
-    draws = tracing.evidences[str(key)].draws
-    return torch.from_numpy(draws.mean(0, keepdims=True))
+def _best(tracing: Tracing, key: ModelKey) -> torch.Tensor:
+    """Return a model's best parameters and strengths, (1, d), or their mean.
+
+    Draws as wide as misfit asks leave the valley that the best fit lies in.
+    """
+    own = tracing.evidences[str(key)]
+    best = own.draws.mean(0) if own.best is None else own.best
+    return torch.from_numpy(best[None])
 
 
 def _row(tracing: Tracing) -> dict[str, Any]:
