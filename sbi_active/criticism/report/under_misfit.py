@@ -31,7 +31,8 @@ def misfit_line(report: Contents, misfit: Misfit) -> str:
     # An effect that imitates one that nobody declared leaves something of it.
     line += "" if misfit.passes else f", beside {UNDECLARED}"
     rest = [n for n in misfit.helps if n not in named]
-    return line + (f"; {joined(rest)} helps to predict" if rest else "")
+    verb = "helps" if len(rest) == 1 else "help"
+    return line + (f"; {joined(rest)} {verb} to predict" if rest else "")
 
 
 def misfit_sentences(report: Contents, misfit: Misfit) -> str:
