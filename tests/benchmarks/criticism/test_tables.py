@@ -25,6 +25,7 @@ def row(case: int, effects: str, verdict: str, strength: float, **changes) -> di
         "credible_set": json.dumps([verdict]),
         "equivalent": "[]",
         "formula": "",
+        "undeclared": "0",
         "rmse_before": "2.0",
         "rmse_after": "1.0",
         "rmse_oracle": "0.8",
@@ -113,13 +114,26 @@ def test_calibration_needs_both_kinds():
     assert "calibration" not in table("loop", {"clean": clean})
 
 
+def test_what_is_wrongly_called_undeclared_is_counted_where_it_is_known():
+    rows = [row(i, "drift", "drift", 50.0, undeclared=str(i % 2)) for i in range(4)]
+    title = 'false "something undeclared"'
+    assert f"{title} 0.500 (2/4)" in table("loop", {"library": rows})
+    older = [each | {"undeclared": ""} for each in rows]
+    assert title not in table("loop", {"library": older})
+
+
 def test_the_right_formula_and_an_alias_are_told_apart():
     rows = [
         row(0, "quadratic", "unexplained", 90.0, formula="xi^2", support="80"),
         row(1, "quadratic", "unexplained", 90.0, formula="|xi|", support="80"),
-        row(2, "drift", "quadratic", 90.0, support="9"),
+        row(2, "drift", "quadratic", 90.0, support="9", undeclared="1"),
+        row(3, "drift", "quadratic", 20.0, support="9"),
     ]
     text = table("open", {"removed": rows})
+    beside = 'the same, or names an effect "beside something undeclared"'
+    assert f"{beside} (lambda > 25) 1.000 (3/3)" in text
+    assert f"{beside} (all) 0.750 (3/4)" in text
+    assert "called quadratic beside something undeclared" in text
     assert "says so (lambda > 25) 0.667 (2/3)" in text
     assert "of those declared leave lambda > 25 1.000 (2/2)" in text
     assert "names the formula (lambda > 25) 0.500 (1/2)" in text

@@ -238,7 +238,8 @@ def test_the_lock_goes_with_its_process(bank):
         time.sleep(60)
 
     with forked(hold) as is_running:
-        while not (bank.path / "writer.json").exists():
+        holder = bank.path / "writer.json"
+        while not holder.exists() or not holder.read_text().endswith("}"):
             assert is_running()
         other = Bank(bank.path, simulator=simulator)
         text = f"got process {is_running.pid} on"

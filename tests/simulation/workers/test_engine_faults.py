@@ -91,7 +91,8 @@ def check_faults(n, num_workers, time_limit, killer):
 
 
 def test_faults_cost_their_rows_alone():
-    check_faults(200, num_workers=2, time_limit=0.2, killer=40)
+    # A second, since other jobs may hold a worker up for tenths of one.
+    check_faults(200, num_workers=2, time_limit=1.0, killer=40)
 
 
 @pytest.mark.slow
