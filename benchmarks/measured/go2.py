@@ -29,13 +29,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from benchmarks.criticism.scores import counted
 from benchmarks.measured.go2_least_squares import fit_leg
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
 from benchmarks.measured.go2_tables import tables
+from benchmarks.measured.record_verdicts import center
 from sbi_active.criticism import Criticism, Effect
+from sbi_active.criticism.report.under_misfit import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
 from sbi_active.mujoco import Robot, force_effects, mjcf_effects
 
@@ -86,14 +86,14 @@ def judge(
         )
         tracing = loop.trace()
         adopted += [e for n in tracing.chosen for e in effects if e.name == n]
-        values = _best(tracing, ModelKey(tracing.chosen))
+        values = center(tracing.evidences[str(ModelKey(tracing.chosen))])
         run = leg.free_run(parameters, adopted, values)[0]
         row = _row(tracing) | {
             "values": values[0].tolist(),
             "after": leg.errors(run),
         }
         if before is None:
-            bare = _best(tracing, ModelKey())
+            bare = center(tracing.evidences[str(ModelKey())])
             before = leg.errors(leg.free_run(parameters, [], bare)[0])
             row |= {"before": before, "bare values": bare[0].tolist()}
         found.append(row)
@@ -110,16 +110,6 @@ def judge(
     }
 
 
-def _best(tracing: Tracing, key: ModelKey) -> torch.Tensor:
-    """Return a model's best parameters and strengths, (1, d), or their mean.
-
-    Draws as wide as misfit asks leave the valley that the best fit lies in.
-    """
-    own = tracing.evidences[str(key)]
-    best = own.draws.mean(0) if own.best is None else own.best
-    return torch.from_numpy(best[None])
-
-
 def _row(tracing: Tracing) -> dict[str, Any]:
     """Return a verdict as plain figures."""
     misfit, helps = tracing.misfit, tracing.chosen
@@ -128,7 +118,9 @@ def _row(tracing: Tracing) -> dict[str, Any]:
     describe = {e.name: e.describe for e in tracing.estimates}
     return {
         "verdict": tracing.verdict,
-        "line": f"Verdict: {tracing.verdict}",
+        "line": f"Verdict: {tracing.verdict}"
+        if misfit is None
+        else misfit_line(tracing.verdict, misfit),
         "named": [*(helps if misfit is None else misfit.named)],
         "helps": [*helps],
         "describe": [describe[name] for name in helps],

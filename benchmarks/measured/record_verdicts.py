@@ -13,7 +13,7 @@ from sbi_active.criticism import Report
 from sbi_active.criticism.results import NONE, Evidence
 from sbi_active.criticism.under_misfit import ModelError
 
-__all__ = ["Found", "read_report"]
+__all__ = ["Found", "center", "read_report"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +69,8 @@ def read_report(report: Report, theta_dim: int) -> Found:
     return Found(
         row=row,
         helps=helps,
-        before=_center(tracing.evidences[NONE], theta_dim),
-        after=_center(after, num),
+        before=center(tracing.evidences[NONE], theta_dim),
+        after=center(after, num),
         text=str(report).split("\n\n")[0],
     )
 
@@ -84,7 +84,14 @@ def _model(model: ModelError) -> dict[str, Any]:
     }
 
 
-def _center(evidence: Evidence, columns: int) -> Tensor:
-    """Return the best fit where every model misses, as the library predicts by it."""
+def center(evidence: Evidence, columns: int | None = None) -> Tensor:
+    """Return the best fit where every model misses, as the library predicts by it.
+
+    Draws as wide as misfit asks leave the valley that the best fit lies in.
+
+    Args:
+        evidence: Of the model.
+        columns: How many of its parameters and strengths; None for all, (1, columns).
+    """
     best = evidence.draws.mean(0) if evidence.best is None else evidence.best
     return torch.from_numpy(best[None, :columns]).double()

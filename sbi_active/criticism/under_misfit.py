@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 Array = NDArray[Any]
 
@@ -85,8 +86,9 @@ class Odds:
         imitated = FURTHER ** (self.helping - 1) * AT_BOUND**self.at_bounds
         left = (1 + (self.remains / REMAINING) ** 2) ** STEEP
         far = 1 + self.error / FAR
-        o = likely * imitated * self.by_gain / left / far
-        return float((o / (1 + np.exp(self.guessed) / DECLARED)) ** TEMPERED)
+        unguessed = expit(np.log(DECLARED) - self.guessed)
+        o = likely * imitated * self.by_gain / left / far * unguessed
+        return float(o**TEMPERED)
 
     @property
     def by_gain(self) -> float:

@@ -20,7 +20,7 @@ def verdict_line(report: Contents) -> str:
     p = tracing.probabilities.get(verdict)
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
     if tracing.misfit is not None and not tracing.instead_of:
-        line = misfit_line(report, tracing.misfit)
+        line = misfit_line(verdict, tracing.misfit)
     elif (family := open_form(report)) is not None:
         line = f"Verdict: {family}"
     line += verdict_clause(tracing)

@@ -12,7 +12,7 @@ from sbi_active.criticism.results import Array, ModelKey
 from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
 
 
-def misfit_line(report: Contents, misfit: Misfit) -> str:
+def misfit_line(verdict: str, misfit: Misfit) -> str:
     """Return the verdict in one line: what is named, what helps, or nothing."""
     named = misfit.named
     if not misfit.helps:
@@ -26,7 +26,7 @@ def misfit_line(report: Contents, misfit: Misfit) -> str:
             "not named as the cause"
         )
     causes = joined([f"{n} ({stated(misfit.cause[n])})" for n in named])
-    line = f"Verdict: {report.verdict}, probably the cause"
+    line = f"Verdict: {verdict}, probably the cause"
     line += f" ({stated(misfit.cause[named[0]])})" if len(named) == 1 else f": {causes}"
     # An effect that imitates one that nobody declared leaves something of it.
     line += "" if misfit.passes else f", beside {UNDECLARED}"

@@ -57,10 +57,10 @@ def test_the_report_says_what_remains(named):
     report = named.report()
     text = " ".join(str(report).split())
     assert text.startswith("Verdict: lag, probably the cause (P = 0.")
-    line = misfit_line(report, report.tracing.misfit)
+    line = misfit_line(report.verdict, report.tracing.misfit)
     assert "), beside something undeclared; cubic helps" in line
     passing = replace(report.tracing.misfit, passes=True)
-    assert "); cubic helps" in misfit_line(report, passing)
+    assert "); cubic helps" in misfit_line(report.verdict, passing)
     assert "Lag: probably the cause (0." in text
     assert "% of the excess over the sensor's remains" in text
     assert "Models that predict" in text

@@ -93,6 +93,9 @@ def test_formulas_in_the_place_of_an_effect_compete_with_it():
     assert found.cause["a"] == without.cause["a"]
     less = product(without.cause["b"]) / product(found.cause["b"])
     assert less == pytest.approx(1 + np.exp(12.0) / 6, rel=1e-6)
+    with np.errstate(over="raise"):
+        far = replace(found.odds["b"], guessed=1e4)
+        assert far.probability == 0
 
 
 def test_a_fit_that_drives_a_parameter_to_its_bound_is_less_surely_of_a_cause():
