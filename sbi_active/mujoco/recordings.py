@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.mujoco.models.names import names_of, start_places
+from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
 
 __all__ = ["require_in_range", "trials_of"]
@@ -36,7 +36,8 @@ def trials_of(
 
     Each has a column "time", s from the start of the trial, one of each input and one
     of each sensor, and may have "start hinge" or "start hinge velocity", of which the
-    first row counts. A sensor may have NaN where it was not read; an input is held.
+    first row counts. Where a sensor is called as an input, the input's column is
+    "hinge control". A sensor may have NaN where it was not read; an input is held.
 
     Args:
         model: Compiled.
@@ -67,7 +68,10 @@ def trials_of(
         None,
         x,
         sample_times=times[0] if same else times,
-        inputs={name: [f[name].to_numpy(float) for f in frames] for name in inputs}
+        inputs={
+            name: [f[_column(name, f, names)].to_numpy(float) for f in frames]
+            for name in inputs
+        }
         or None,
         input_times=times if inputs else None,
         start={
@@ -113,8 +117,9 @@ def _frame(
         given = pd.read_csv(given, comment="#")
     frame = pd.DataFrame(given)
     frame.columns = [str(c).strip() for c in frame.columns]
-    starts = [START + name for name in start_places(model)]
-    wanted = [TIME, *inputs, *names]
+    starts = [START + name for name in (*start_places(model), *held_places(model))]
+    controls = [_column(name, frame, names) for name in inputs]
+    wanted = [TIME, *controls, *names]
     spare = [c for c in frame.columns if c not in {*wanted, *starts}]
     for name in wanted:
         if name not in frame.columns:
@@ -131,7 +136,7 @@ def _frame(
                 f"expected start states of joints in {what}; got {name!r}; did you "
                 f"mean {near[0]!r}?"
             )
-    for name in [TIME, *inputs]:
+    for name in [TIME, *controls]:
         lost = np.flatnonzero(~np.isfinite(frame[name].to_numpy(float)))
         if len(lost):
             raise ValueError(
@@ -144,6 +149,12 @@ def _frame(
             f"expected a time that increases in {what}; got {frame[TIME][row]:g} in "
             f"row {row}; sort the log, and split it where it starts again"
         )
-    for name in inputs:
-        require_in_range(model, name, frame[name].to_numpy(float), what)
+    for name, column in zip(inputs, controls, strict=True):
+        require_in_range(model, name, frame[column].to_numpy(float), what)
     return frame
+
+
+def _column(name: str, frame: pd.DataFrame, sensors: Sequence[str]) -> str:
+    """Return the column of an input; one that a sensor shares is the sensor's."""
+    own = f"{name} control"
+    return own if name in sensors or own in frame.columns else name
