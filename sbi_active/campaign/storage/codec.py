@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.messages import Explained
 
 #: Packages whose classes are stored by their attributes.
@@ -169,6 +170,8 @@ class _Writer:
                 return {TAG: "known", "path": self._places[id(value)]}
             raise NotStorableError(f"{kind.__module__}.{kind.__qualname__}")
         state = {**getattr(value, "__dict__", {})}
+        if isinstance(value, RowCache):  # what it lacks is simulated again
+            state = vars(RowCache(value.most))
         for base in kind.__mro__:
             for slot in _slots(base):
                 if hasattr(value, slot):

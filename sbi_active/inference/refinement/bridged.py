@@ -12,11 +12,17 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.diagnostics import Assumption
+from sbi_active.inference.refinement.contradiction import (
+    MAX_INFLATIONS,
+    find_contradiction,
+)
 from sbi_active.inference.refinement.gauss_newton import (
+    STEP,
     WIDER,
     Laplace,
     WhitenedTrials,
     find_laplace,
+    unchanged,
 )
 from sbi_active.inference.refinement.importance import WeightedPool
 from sbi_active.inference.refinement.settings import RefinementOptions
@@ -50,6 +56,8 @@ REMEMBERED = 0.3  # correlation of particles with where they began that is too m
 NUM_INTEGRAL = 4_000  # draws, which cost no simulation
 UNCHANGED = 2e-3  # deviations of the noise, which single precision may change
 NUM_PROBES = 16  # draws at which uninformed parameters are changed
+NUM_AROUND = 64  # parameters among which heavy tails have their best fit
+STABLE = 1.1  # growth of the inflation below which it is settled
 MOVING = 0.02  # share of moves accepted, below which particles are stuck
 
 
@@ -156,10 +164,34 @@ def refine_many(
         z = base.to_z(torch.cat(near))
         inside = base.inside(z)
         points = coordinates.from_z(z[inside]) if inside.any() else None
+    declared = likelihood
     trials = WhitenedTrials(likelihood, coordinates)
     laplace = find_laplace(trials, rng, points)
     if laplace is None:
         return None
+    contradiction = None
+    for _ in range(MAX_INFLATIONS):
+        best = laplace.modes[:1]
+        residual, jacobian = trials.jacobian(best, unchanged, STEP)
+        around = laplace.modes[0] + WIDTHS[-1][0] * (
+            laplace.guess.sample(NUM_AROUND, rng) - laplace.modes[0]
+        )
+        found = find_contradiction(
+            declared,
+            coordinates.to_theta(np.concatenate([best, around])),
+            residual[0] * likelihood.inflation,
+            jacobian[0] * likelihood.inflation,
+            level=settings.contradiction_level,
+            rng=rng,
+        )
+        if found is None or found.inflation < STABLE * likelihood.inflation:
+            break
+        contradiction = found
+        likelihood = SimulatedLikelihood(
+            table, action, x, inflation=contradiction.inflation
+        )
+        trials = WhitenedTrials(likelihood, coordinates)
+        laplace = find_laplace(trials, rng, laplace.modes) or laplace
     free = _free(laplace, trials, rng)
     found = _bridged(laplace, likelihood, coordinates, free, settings, rng)
     if found is None:
@@ -171,8 +203,10 @@ def refine_many(
     belief = BridgedBelief(
         prior, coordinates, likelihood, pool, free, defensive=settings.defensive
     )
-    known = diagnose_exactly(likelihood, base, pool, seed)
+    known = diagnose_exactly(declared, base, pool, seed)
     doubts = []
+    if contradiction is not None:
+        known = contradiction.noted(known)
     moves = found.acceptance >= MOVING and found.memory <= REMEMBERED
     if not moves:
         doubts.append(

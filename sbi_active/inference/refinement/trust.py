@@ -11,7 +11,6 @@ from scipy.stats import kurtosis
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.regression_error import (
-    LARGE,
     SMALL,
     expected_error,
 )
@@ -31,6 +30,7 @@ SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 UNSETTLED = 0.1  # nats a dimension
 CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
 EDGE = 0.5  # mass within 1 % of the edge of one parameter that calls for a warning
+UNTRUSTED = 0.1  # nats off, by the number of simulations, that call for a warning
 RARE = 1e-3  # tail probability of the observation that calls for a warning
 
 
@@ -200,7 +200,7 @@ def diagnose(
             "its noise",
         ),
         "small_error": (
-            last.error <= LARGE,
+            last.error <= UNTRUSTED,
             last.error,
             "the belief is off by about {:.2g} nats, since its regressions rest on few "
             "simulations for so many parameters and numbers; raise num_histories",

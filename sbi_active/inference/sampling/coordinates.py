@@ -71,6 +71,8 @@ class PriorCoordinates:
     def inside(self, z: Array) -> NDArray[np.bool_]:
         """Return whether the parameters lie in the prior's support, shape (n,)."""
         theta = self.to_theta(z)
+        if not len(theta):  # which constraints of a mixed prior cannot reshape
+            return np.zeros(0, dtype=bool)
         finite = theta.isfinite().all(-1)
         inside = within_support(self.prior, torch.nan_to_num(theta))
         return (finite & inside).numpy()

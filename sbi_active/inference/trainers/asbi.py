@@ -32,7 +32,7 @@ from sbi_active.inference.networks.training import (
     train_mixture_density,
 )
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.stages import refine
+from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
