@@ -38,6 +38,7 @@ FLOORS = (
     "inference.beliefs",
     "inference.rounds",
     "inference.regression",
+    "inference.declared",
     "inference.refinement",
     "inference.emulation",
     "inference.products",

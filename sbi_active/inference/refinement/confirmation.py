@@ -26,8 +26,8 @@ import torch
 from numpy.typing import NDArray
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
+from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.seeding import forked_generators
 

@@ -11,23 +11,24 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import parameter_dim, require_support
+from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.beliefs.comparison import compare_orders
+from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.declared.contradiction import (
+    MAX_INFLATIONS,
+    Contradiction,
+    contradiction_at,
+)
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.simulated import ExactRecord, refine_exactly
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.refinement.confirmation import (
     Confirmation,
     by_likelihoods,
     by_replicates,
 )
-from sbi_active.inference.refinement.contradiction import (
-    MAX_INFLATIONS,
-    Contradiction,
-    contradiction_at,
-)
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.simulated import ExactRecord, refine_exactly
-from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
-from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.refinement.stages import MANY, Stages, Task
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
@@ -130,12 +131,13 @@ def _few(
     belief = stages.run()
     contradiction = stages.contradiction()
     if contradiction is not None or not _is_consistent(task, belief, seed):
-        return task.many(None, seed) or _inflated(stages, belief, contradiction, seed)
+        wider = task.many(None, seed, weighted=True)
+        return wider or _inflated(stages, belief, contradiction, seed)
     if isinstance(belief, SimulatedBelief):
         return belief
     belief.diagnostics = _confirmed(stages, belief, seed).noted(belief.diagnostics)
     if not belief.diagnostics.trustworthy:
-        other = task.many(None, seed)
+        other = task.many(None, seed, weighted=True)
         if other is not None and other.diagnostics.trustworthy:
             return other
     return belief

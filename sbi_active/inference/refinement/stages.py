@@ -12,22 +12,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.refinement.bridged import BridgedBelief, refine_many
-from sbi_active.inference.refinement.contradiction import (
+from sbi_active.inference.declared.bridged import BridgedBelief, refine_many
+from sbi_active.inference.declared.contradiction import (
     Contradiction,
     compared,
 )
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.outcome_checks import check_outcomes
-from sbi_active.inference.refinement.regression_error import SMALL, widened
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.simulated import refine_exactly
-from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
-from sbi_active.inference.refinement.simulated_likelihood import (
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.simulated import refine_exactly
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
 )
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.outcome_checks import check_outcomes
+from sbi_active.inference.refinement.regression_error import SMALL, widened
 from sbi_active.inference.refinement.trust import (
     SERIOUS_MISFIT,
     Course,
@@ -87,12 +87,15 @@ class Task:
             return None
         return MeanTable(self.simulator, self.settings.workers)
 
-    def many(self, past: HistoryRecord | None, seed: int) -> BridgedBelief | None:
+    def many(
+        self, past: HistoryRecord | None, seed: int, *, weighted: bool = False
+    ) -> BridgedBelief | None:
         """Return the belief by Gauss-Newton steps and sequential Monte Carlo.
 
         Args:
             past: Of an earlier call, as in :func:`.refine`.
             seed: Seed of everything random.
+            weighted: Whether to end with an importance sample.
         """
         return refine_many(
             self.simulator,
@@ -103,6 +106,7 @@ class Task:
             past=past,
             settings=self.settings,
             seed=seed,
+            weighted=weighted,
         )
 
     def jumps(self, stage: Stage) -> bool:

@@ -107,7 +107,9 @@ class PriorCoordinates:
     def sample_prior(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return coordinates of draws from the prior, shape (n, d)."""
         with forked_generators(int(rng.integers(2**31))):
-            return self.to_z(self.prior.sample(torch.Size([num_samples])))
+            # Some priors cannot draw nothing.
+            theta = self.prior.sample(torch.Size([max(num_samples, 1)]))
+        return self.to_z(theta[:num_samples])
 
     def _forward(self, theta: Array) -> Array:
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.bridge import NormalMixture
 from sbi_active.inference.sampling.least_squares import Whitener, descend
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
