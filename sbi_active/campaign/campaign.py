@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +16,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.campaign.display.progress import StageWatch, rounds
-from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
@@ -141,6 +142,7 @@ class Campaign(CampaignTrials):
     def _begin(
         self, state: CampaignState, actions: ActionSpace, learner: Any, planner: Planner
     ) -> None:
+        self._guard = threading.RLock()  # one thread at a time changes the history
         self.state, self.actions = state, actions
         self._learner, self._planner = learner, planner
 
@@ -217,6 +219,7 @@ class Campaign(CampaignTrials):
         self._storage = Storage(found.disk, found.state.options.bank, found.prior)
         return self
 
+    @guarded
     def close(self) -> None:
         """Let other processes write to the directory; the next call takes it again."""
         self._storage.close()
@@ -229,7 +232,12 @@ class Campaign(CampaignTrials):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy is in memory alone: a directory belongs to one campaign.
-        return {**vars(self), "_storage": Storage(prior=self.first_prior)}
+        own = {**vars(self), "_storage": Storage(prior=self.first_prior)}
+        del own["_guard"]
+        return own
+
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        vars(self).update(own, _guard=threading.RLock())
 
     @property
     @stored

@@ -35,6 +35,8 @@ TRUSTED = (
 )
 #: Levels of attributes below what is given again in which to look for references.
 DEPTH = 5
+#: Bytes that any file may hold, and times its size that it may hold beyond.
+LEAST_LIMIT, MOST_SHRUNK = 16 * 2**20, 100
 TAG = "!"  # of whatever JSON does not hold by itself
 
 _SEQUENCES: dict[str, Callable[[list[Any]], Any]] = {
@@ -91,7 +93,13 @@ def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
         ValueError: If the content is nothing that :func:`encode` writes.
     """
     try:
-        stored = torch.load(io.BytesIO(zlib.decompress(content)), weights_only=True)
+        # What was written shrinks less: a small file that fills memory was crafted.
+        limit = LEAST_LIMIT + MOST_SHRUNK * len(content)
+        reader = zlib.decompressobj()
+        plain = reader.decompress(content, limit)
+        if not reader.eof:
+            raise ValueError(f"more than {limit} bytes, or an end that is missing")
+        stored = torch.load(io.BytesIO(plain), weights_only=True)
         return _Reader(known, stored["arrays"]).value(json.loads(stored["structure"]))
     except Exception as error:  # each library has its own
         raise ValueError(

@@ -19,13 +19,14 @@ from sbi_active.campaign.learning.revision import rebuilt
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent
+from sbi_active.campaign.storage.damage import reading
 from sbi_active.campaign.storage.described import (
     actions_from,
     options_from,
     prior_from,
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
-from sbi_active.campaign.storage.manifest import require_same_simulator
+from sbi_active.campaign.storage.manifest import MANIFEST, require_same_simulator
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
@@ -125,17 +126,18 @@ def load(
     """Return the parts of a campaign, see :meth:`.Campaign.load`."""
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest = disk.manifest
-    settings: CampaignOptions = _given("options", options, manifest, options_from)
-    space: ActionSpace = _given("actions", actions, manifest, actions_from)
-    first_prior: Distribution = _given("prior", prior, manifest, prior_from)
-    state = CampaignState(
-        manifest["method"],
-        manifest["seed"],
-        settings,
-        num_earlier=manifest["num_earlier"],
-    )
+    settings: CampaignOptions = _given("options", options, disk, options_from)
+    space: ActionSpace = _given("actions", actions, disk, actions_from)
+    first_prior: Distribution = _given("prior", prior, disk, prior_from)
+    with reading(disk.path / MANIFEST):
+        state = CampaignState(
+            manifest["method"],
+            manifest["seed"],
+            settings,
+            num_earlier=manifest["num_earlier"],
+        )
+        shape = torch.Size(manifest["x_shape"])
     name = disk.restore(state)
-    shape = torch.Size(manifest["x_shape"])
     for note in disk.notes:
         warn(note, stacklevel=3)
     if simulator is None:
@@ -183,14 +185,17 @@ def _belief(
 
 
 def _given(
-    what: str, given: Any, manifest: dict[str, Any], made: Callable[[Any], Any]
+    what: str, given: Any, disk: CampaignDirectory, made: Callable[[Any], Any]
 ) -> Any:
     """Return what was passed, or else what the manifest describes."""
     if given is not None:
         return given
-    if manifest[what] is None:
+    with reading(disk.path / MANIFEST):
+        described, text = disk.manifest[what], disk.manifest[f"{what}_text"]
+    if described is None:
         raise ValueError(
             f"expected {what}=, which only its author can make again; got None; pass "
-            f"what the campaign was made with: {manifest[f'{what}_text']:.200}"
+            f"what the campaign was made with: {text:.200}"
         )
-    return made(manifest[what])
+    with reading(disk.path / MANIFEST):
+        return made(described)

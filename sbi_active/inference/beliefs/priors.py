@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from sbi.utils.sbiutils import within_support
+from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from sbi_active.seeding import forked_generators
@@ -106,20 +107,12 @@ def require_width(
             f"expected a prior with draws in its support; got {draws[0].tolist()} "
             "outside; pass finite bounds, the lower one below the upper one"
         )
-    few = [len(column.unique()) < 128 for column in draws.T]
-    if any(few):
-        name = (
-            f"parameter {few.index(True)}" if names is None else names[few.index(True)]
-        )
-        raise ValueError(
-            f"expected a prior of continuous parameters; got {name}, of which draws "
-            "repeat; fix it in the simulator, or declare a choice as an Effect"
-        )
     draws = draws.double()
     size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
     steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
     narrow = (steps < FEWEST_STEPS).nonzero()[:, 0].tolist()
     if not narrow:
+        _require_no_atoms(draws, names)
         return
     k = narrow[0]
     name = f"parameter {k}" if names is None else names[k]
@@ -129,3 +122,15 @@ def require_width(
         f"{FEWEST_STEPS} steps of float32 wide; fix the parameter in the simulator, or "
         "shift it to deviations from its value"
     )
+
+
+def _require_no_atoms(draws: Tensor, names: Sequence[str] | None) -> None:
+    """Raise where half of the draws of a parameter, shape (n, d), repeat others."""
+    few = [len(column.unique()) < len(draws) / 2 for column in draws.T]
+    if any(few):
+        k = few.index(True)
+        name = f"parameter {k}" if names is None else names[k]
+        raise ValueError(
+            f"expected a prior of continuous parameters; got {name}, of which draws "
+            "repeat; fix it in the simulator, or declare a choice as an Effect"
+        )

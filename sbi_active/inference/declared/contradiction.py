@@ -166,7 +166,9 @@ def compared(
         level: Tail probability below which trials contradict.
     """
     count = x.isfinite().flatten(1).sum(1).numpy()
-    freedom = max(int(count.sum()) - num_fitted, 1)
+    freedom = int(count.sum()) - num_fitted
+    if freedom < 1:  # as few numbers as parameters meet at the edge of a prior alone
+        return None
     probability = float(chi2.sf(squares.sum(), freedom))
     if probability >= level:
         return None
