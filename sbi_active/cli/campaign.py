@@ -21,11 +21,21 @@ from sbi_active.cli.folder import (
     declared_by,
     effects_of,
     library_of,
+    named_effects,
     open_campaign,
     read_config,
     simulator_of,
 )
 from sbi_active.cli.trials import asked, confirm, places, print_status, written
+from sbi_active.cli.words import answer
+from sbi_active.simulation.bank.segments import write_file
+
+#: Options of ``criticize`` that say of a table what a campaign knows.
+OF_TABLES = (
+    *("config", "columns", "units", "inputs", "task", "prior", "theta_low"),
+    *("theta_high", "noise", "actions"),
+)
+LARGEST = 3.4028234e38  # that single precision holds
 
 
 def init(arguments: argparse.Namespace) -> int:
@@ -49,7 +59,7 @@ def init(arguments: argparse.Namespace) -> int:
         directory=arguments.folder,
     ) as campaign:
         folder = Path(arguments.folder)
-        (folder / DECLARED).write_text(json.dumps(declared, indent=2) + "\n")
+        write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
         print(f"{folder}: a campaign of {campaign.actions}")
     print(f"next: sbi-active ask {arguments.folder}")
     return 0
@@ -59,12 +69,12 @@ def ask(arguments: argparse.Namespace) -> int:
     """Print the action of the next trial."""
     with open_campaign(arguments, simulates=True) as campaign:
         trial = campaign.ask(target=arguments.target)
-        answer = asked(campaign, trial)
+        known = asked(campaign, trial)
     if arguments.json:
-        print(json.dumps(answer))
+        answer(known)
         return 0
     print(f"trial {trial.index}: {written(campaign, trial)}")
-    gain = answer["expected_information_gain"]
+    gain = known["expected_information_gain"]
     if gain is not None:
         print(f"it is expected to tell {gain:.2f} nats about {trial.target}")
     print(f"then: sbi-active tell {arguments.folder} {places(campaign)}")
@@ -130,8 +140,16 @@ def status(arguments: argparse.Namespace) -> int:
 
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare the campaign's simulator with its trials, and print the report."""
+    given = [n for n in OF_TABLES if getattr(arguments, n, None) is not None]
+    if given:
+        raise ValueError(
+            f"expected no --{given[0].replace('_', '-')} with a campaign's folder, "
+            f"which knows its own; got {getattr(arguments, given[0])}; leave it out"
+        )
+    own = named_effects(arguments)
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign))
+        usual, taken = library_of(campaign), {effect.name for effect in own}
+        report = campaign.criticize([*own, *(e for e in usual if e.name not in taken)])
     print(report)
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
@@ -215,18 +233,16 @@ def _status(arguments: argparse.Namespace) -> Any:
 def _outcome(arguments: argparse.Namespace, campaign: Campaign) -> Any:
     """Return what was measured, in the shape of the simulator's x."""
     if arguments.file is not None:
-        with open(arguments.file, newline="") as file:
-            cells = [cell.strip() for row in csv.reader(file) for cell in row]
-        try:
-            _numbers(cells[:1])
-        except ValueError:  # a header
-            with open(arguments.file, newline="") as file:
-                cells = [c.strip() for row in [*csv.reader(file)][1:] for c in row]
-        numbers = _numbers(cells)
+        numbers = _read_numbers(arguments.file)
     else:
+        if any(not cell.strip() for cell in arguments.x):
+            raise ValueError(
+                "expected numbers; got an empty one; write what was measured, nan for "
+                "one of several that was not, or --invalid"
+            )
         numbers = _numbers(arguments.x)
     shape = campaign.x_shape
-    if not numbers and getattr(arguments, "reason", None) is not None:
+    if not numbers and arguments.action is not None and "reason" in arguments:
         return None  # a correction of the action alone
     if len(numbers) != shape.numel():
         raise ValueError(
@@ -234,14 +250,54 @@ def _outcome(arguments: argparse.Namespace, campaign: Campaign) -> Any:
             f"{len(numbers)}; write nan for one that was not measured, --invalid where "
             "the trial gave none, or --missing where it failed"
         )
+    if all(math.isnan(number) for number in numbers):
+        raise ValueError(
+            "expected a number that was measured; got none; write --invalid where the "
+            "trial ran and gave none, or --missing where a fault hit it"
+        )
+    large = [n for n in numbers if abs(n) > LARGEST]
+    if large:
+        raise ValueError(
+            f"expected finite numbers that single precision holds; got {large[0]:g}; "
+            "correct it, or write nan where the sensor gave none"
+        )
     import torch
 
     return torch.tensor(numbers).reshape(shape)
 
 
+def _read_numbers(path: Path) -> list[float]:
+    """Return the numbers of a file, whose first row may be a header."""
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+    if len(rows) > 1 and not _are_numbers(rows[0]):
+        rows = rows[1:]
+    cells = [cell for row in rows for cell in row]
+    if not any(cells):
+        raise ValueError(
+            f"expected numbers in {path}; got none; write one a line, or separate them "
+            "by commas"
+        )
+    wrong = [cell for cell in cells if not _are_numbers([cell])]
+    if wrong:
+        raise ValueError(
+            f"expected numbers in {path}; got {wrong[0]!r:.80}; separate them by "
+            "commas, and leave out units"
+        )
+    return _numbers(cells)
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    try:
+        _numbers(cells)
+    except ValueError:
+        return False
+    return True
+
+
 def _numbers(cells: list[str]) -> list[float]:
     try:
-        return [float(cell) if cell else math.nan for cell in cells]
+        return [float(cell) if cell.strip() else math.nan for cell in cells]
     except ValueError:
         raise ValueError(
             f"expected numbers; got {' '.join(cells)!r:.80}; write them with a point, "

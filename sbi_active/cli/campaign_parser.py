@@ -59,6 +59,11 @@ def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     command.set_defaults(command=("campaign", name))
     command.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
     command.add_argument("--json", action="store_true", help="for programs")
+    command.add_argument(
+        "--trust",
+        action="store_true",
+        help="run Python code that lies in the folder, or that the folder names",
+    )
     return command
 
 
@@ -68,8 +73,7 @@ def _add_init(commands: Any, methods: Sequence[str]) -> None:
         help="make a campaign in a new folder",
         description=(
             "Make a campaign in a new folder. The options may stand in a TOML file, by "
-            "their names without the dashes in front. Write negative numbers as in "
-            "--theta-low=-5,-5."
+            "their names without the dashes in front."
         ),
     )
     init.set_defaults(command=("campaign", "init"))

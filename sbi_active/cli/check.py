@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import copy
 import itertools
+import math
 import sys
 import time
 import warnings
@@ -30,6 +31,9 @@ from sbi_active.tasks import get_task  # pyright: ignore
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
 LONG = 20.0  # seconds of simulation a round, beside which learning counts little
+
+
+MOST_VALUES = 100_000  # listed actions: a design looks at each
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -155,6 +159,11 @@ def actions_of(arguments: argparse.Namespace) -> ActionSpace:
         low, high = zip(*[limits for limits in ranges if limits], strict=True)
         return BoxActions([*low], [*high])
     axes = [_axis(spec) for spec in specs]
+    if math.prod(map(len, axes)) > MOST_VALUES:
+        raise ValueError(
+            f"expected at most {MOST_VALUES} actions; got "
+            f"{math.prod(map(len, axes))}; write LOW:HIGH for any number between"
+        )
     return DiscreteActions(torch.tensor([*itertools.product(*axes)]))
 
 
@@ -174,6 +183,11 @@ def _axis(spec: str) -> list[float]:
     if len(parts) != 3 or not parts[2].isdigit() or int(parts[2]) < 1:
         raise ValueError(
             f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; write, say, 0:5:11"
+        )
+    if int(parts[2]) > MOST_VALUES:
+        raise ValueError(
+            f"expected at most {MOST_VALUES} values of an action; got {parts[2]} in "
+            f"{spec!r}; write LOW:HIGH for any number between"
         )
     low, high = (_numbers(part)[0] for part in parts[:2])
     return torch.linspace(low, high, int(parts[2])).tolist()

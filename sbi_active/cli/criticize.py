@@ -17,7 +17,7 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.campaign.storage.manifest import MANIFEST, has_manifest
 from sbi_active.cli import campaign
 from sbi_active.cli.check import actions_of, prior_of, with_noise
-from sbi_active.cli.folder import read_config
+from sbi_active.cli.folder import named_effects, read_config
 from sbi_active.cli.loading import load_object
 from sbi_active.cli.problem import read_problem
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
@@ -32,7 +32,7 @@ def criticize(arguments: argparse.Namespace) -> int:
     """Compare a simulator with measured trials, and print the report."""
     if arguments.trials.is_dir():
         if has_manifest(arguments.trials):
-            arguments.folder = arguments.trials
+            arguments.folder, arguments.trust = arguments.trials, False
             return campaign.criticize(arguments)
         if not [*arguments.trials.glob("*.csv")]:
             raise ValueError(
@@ -54,7 +54,7 @@ def criticize(arguments: argparse.Namespace) -> int:
     # Only scales are taken from these where the permitted actions are unknown.
     space = actions or DiscreteActions(trials.action.unique(dim=0).float())
     over_time = trials.inputs is not None
-    own = [*effects, *_declared(arguments)]
+    own = [*effects, *named_effects(arguments)]
     taken = {effect.name for effect in own}
     generic = generic_effects(simulator, trials if over_time else space, prior=prior)
     report = close_loop(
@@ -204,19 +204,3 @@ def _require_units(
                 f"expected actions in {unit}; got {label} in {arguments.trials}; "
                 "convert the column, and state the unit in brackets"
             )
-
-
-def _declared(arguments: argparse.Namespace) -> list[Effect]:
-    if arguments.effects is None:
-        return []
-    named: Any = load_object(arguments.effects)
-    if callable(named):
-        named = named()
-    found = [*named]
-    wrong = [e for e in found if not isinstance(e, Effect)]
-    if wrong:
-        raise ValueError(
-            f"expected a list of Effect under {arguments.effects}; got "
-            f"{type(wrong[0]).__name__} in it; declare sbi_active.criticism.Effect"
-        )
-    return found

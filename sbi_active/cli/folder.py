@@ -163,12 +163,12 @@ def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign
     Raises:
         ValueError: If there is no campaign, or nobody knows where its simulator is.
     """
-    folder, declared = Path(arguments.folder), {}
-    if (folder / DECLARED).exists():
-        declared = json.loads((folder / DECLARED).read_text())
+    folder, declared = Path(arguments.folder), _read_declared(Path(arguments.folder))
     if getattr(arguments, "simulator", None) is not None:
         declared |= {"simulator": arguments.simulator, "folder": os.getcwd()}
         declared.pop("task", None)
+    if not arguments.trust:
+        _require_outside(folder, declared, arguments, simulates=simulates)
     given = _not_described(declared, folder)
     reader = Campaign.load(folder, **given)
     if not simulates:
@@ -182,6 +182,66 @@ def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign
     if reader.state.version.effects:
         effects = _with_usual(effects, simulator, reader)
     return Campaign.load(folder, simulator=simulator, effects=effects, **given)
+
+
+def _read_declared(folder: Path) -> dict[str, Any]:
+    """Return how the command line made a campaign; nothing where it did not."""
+    path = folder / DECLARED
+    if not path.exists():
+        return {}
+    try:
+        declared = json.loads(path.read_bytes())
+        texts = (declared.get(n) for n in ("simulator", "prior", "actions", "effects"))
+        is_whole = all(text is None or isinstance(text, str) for text in texts)
+        is_whole &= isinstance(declared.get("folder", ""), str)
+    except (ValueError, AttributeError, RecursionError):
+        is_whole = False
+    if not is_whole:
+        raise ValueError(
+            f"expected {path} as sbi-active init wrote it; got something else; restore "
+            "it from a copy, or name the simulator by --simulator"
+        )
+    return declared
+
+
+def _require_outside(
+    folder: Path,
+    declared: Mapping[str, Any],
+    arguments: argparse.Namespace,
+    *,
+    simulates: bool,
+) -> None:
+    """Raise where code would run that came with the folder.
+
+    What reads runs no code that the command line does not name. What simulates runs the
+    simulator that the folder names, unless that lies in the folder.
+    """
+    lacking = [w for w in ("prior", "actions") if read_manifest(folder)[w] is None]
+    named = [declared[what] for what in lacking if declared.get(what)]
+    if not simulates:
+        if "task" not in declared and named:
+            raise ValueError(
+                f"expected --trust, since the campaign's {lacking[0]} is Python code, "
+                f"{named[0]}; got none; look at it, and add --trust to run it"
+            )
+        return
+    if "task" in declared:
+        return
+    named += [declared[what] for what in ("simulator", "effects") if declared.get(what)]
+    inside = folder.resolve()
+    places = [Path.cwd(), Path(declared.get("folder", "."))]
+    for name in named:
+        module = name.partition(":")[0]
+        if module.endswith(".py"):
+            places.append(Path(declared.get("folder", "."), module))
+    for place in places:
+        place = place.resolve()
+        if place == inside or inside in place.parents:
+            raise ValueError(
+                f"expected --trust, since {', '.join(named)} would be imported from "
+                f"the campaign's own folder, {inside}; got none; look at the code "
+                "there, and add --trust to run it"
+            )
 
 
 def library_of(campaign: Campaign) -> list[Effect]:
@@ -204,3 +264,20 @@ def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Eff
     taken = {effect.name for effect in own}
     generic = generic_effects(simulator, reader.actions, prior=reader.first_prior)
     return [*own, *(effect for effect in generic if effect.name not in taken)]
+
+
+def named_effects(arguments: argparse.Namespace) -> list[Effect]:
+    """Return the effects that --effects names."""
+    if arguments.effects is None:
+        return []
+    named: Any = load_object(arguments.effects)
+    if callable(named):
+        named = named()
+    found = [*named]
+    wrong = [e for e in found if not isinstance(e, Effect)]
+    if wrong:
+        raise ValueError(
+            f"expected a list of Effect under {arguments.effects}; got "
+            f"{type(wrong[0]).__name__} in it; declare sbi_active.criticism.Effect"
+        )
+    return found

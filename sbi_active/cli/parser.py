@@ -7,11 +7,15 @@ at once. A command's module is imported when the command is called.
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any
 
 from sbi_active.cli.campaign_parser import add_campaign_commands
 
+_NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+#: Numbers that begin with a minus, separated by commas or colons.
+NEGATIVE = re.compile(rf"^-{_NUMBER}([,:][-+]?{_NUMBER})*$")
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
     "numerical",
@@ -36,7 +40,7 @@ def make_parser() -> argparse.ArgumentParser:
     Parsed arguments have a ``command``: the module of :mod:`sbi_active.cli` and the
     function in it that takes them.
     """
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="sbi-active",
         description="Tune a black-box simulator from a handful of real trials.",
     )
@@ -48,6 +52,14 @@ def make_parser() -> argparse.ArgumentParser:
     _add_criticize(commands)
     add_campaign_commands(commands, METHODS)
     return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser to which -1e-3 and -.5e2,1 are numbers, and no options."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._negative_number_matcher = NEGATIVE
 
 
 class _ShowVersion(argparse.Action):
@@ -127,7 +139,7 @@ def _add_check(commands: Any) -> None:
         description=(
             "Shapes, seeds, noise, lost rows, parameters that change nothing, and the "
             "cost of a campaign. Exit status 1 where something keeps a campaign from "
-            "working. Write negative numbers as in --theta-low=-5,-5."
+            "working."
         ),
     )
     check.set_defaults(command=("check", "check"))
@@ -172,8 +184,7 @@ def _add_criticize(commands: Any) -> None:
             "a sample, with columns trial and time besides, and with input_* in place "
             "of actions that vary in time. start_* is a measured start state. Units "
             "stand in brackets, as in x_height[m], and are those of the simulator. An "
-            "empty cell is what was not measured. Write negative numbers as in "
-            "--theta-low=-5,-5."
+            "empty cell is what was not measured. "
         ),
     )
     criticize.set_defaults(command=("criticize", "criticize"))

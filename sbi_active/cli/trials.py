@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from typing import Any
 
 from torch import Tensor
 
 from sbi_active.campaign import Campaign, Trial
-from sbi_active.cli.words import spoken
+from sbi_active.cli.words import answer, spoken
 
 MANY = 5  # numbers, more than somebody types
 
@@ -18,7 +17,7 @@ MANY = 5  # numbers, more than somebody types
 def confirm(arguments: argparse.Namespace, campaign: Campaign, trial: Trial) -> int:
     """Print what was recorded, and what comes next."""
     if arguments.json:
-        print(json.dumps(_described(campaign, trial)))
+        answer(_described(campaign, trial))
         return 0
     x = "" if trial.x is None else f", x = {_short(trial.x)}"
     print(f"trial {trial.index}: {trial.status} at {written(campaign, trial)}{x}")
@@ -32,8 +31,8 @@ def print_status(arguments: argparse.Namespace, campaign: Campaign) -> int:
     waiting = [t.index for t in campaign.history if not campaign.contains(t)]
     belief = _believed(campaign)
     if arguments.json:
-        answer = {"trials": told, "belief": belief, "health": campaign.health}
-        print(json.dumps({**answer, "not_in_belief": waiting}))
+        known = {"trials": told, "belief": belief, "health": campaign.health}
+        answer({**known, "not_in_belief": waiting})
         return 0
     print(f"{campaign!r}, health {campaign.health}")
     for trial in campaign.state.trials:
