@@ -142,7 +142,7 @@ class Campaign(CampaignTrials):
     def _begin(
         self, state: CampaignState, actions: ActionSpace, learner: Any, planner: Planner
     ) -> None:
-        self._guard = threading.RLock()  # one thread at a time changes the history
+        self._guard = threading.RLock()
         self.state, self.actions = state, actions
         self._learner, self._planner = learner, planner
 
@@ -233,8 +233,7 @@ class Campaign(CampaignTrials):
     def __getstate__(self) -> dict[str, Any]:
         # A copy is in memory alone: a directory belongs to one campaign.
         own = {**vars(self), "_storage": Storage(prior=self.first_prior)}
-        del own["_guard"]
-        return own
+        return {name: part for name, part in own.items() if name != "_guard"}
 
     def __setstate__(self, own: dict[str, Any]) -> None:
         vars(self).update(own, _guard=threading.RLock())
@@ -325,8 +324,7 @@ class Campaign(CampaignTrials):
         It ends early where :attr:`stop_reason` gives one; a trial that was designed by
         then stays pending.
 
-        An exception of the real system passes through; the trial stays pending, and
-        the next ``run`` goes on with it.
+        An exception of the real system passes through; the trial stays pending.
 
         Args:
             real_system: Takes an action, shape (action_dim,), and gives x.
@@ -375,9 +373,8 @@ class Campaign(CampaignTrials):
             evaluate=evaluate,
             designed=find_method(self.state.method).designs,
         )
-        chosen = [*report.tracing.chosen]
-        found = {"digest": report.digest, "verdict": report.verdict, "chosen": chosen}
-        self._storage.write("examined", **found)
+        found = {"digest": report.digest, "verdict": report.verdict}
+        self._storage.write("examined", **found, chosen=[*report.tracing.chosen])
         return report
 
     @stored
@@ -394,8 +391,7 @@ class Campaign(CampaignTrials):
             The belief over (theta, phi).
 
         Raises:
-            ValueError: If the verdict names none, or the report belongs to another
-                model than the current one.
+            ValueError: If the verdict names none, or is of another model.
         """
         self.update()
         self._learner = revise(self.state, self.actions, report)

@@ -98,7 +98,7 @@ def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
         reader = zlib.decompressobj()
         plain = reader.decompress(content, limit)
         if not reader.eof:
-            raise ValueError(f"more than {limit} bytes, or an end that is missing")
+            raise ValueError(f"expected a whole file of {limit} bytes at most")
         stored = torch.load(io.BytesIO(plain), weights_only=True)
         return _Reader(known, stored["arrays"]).value(json.loads(stored["structure"]))
     except Exception as error:  # each library has its own
