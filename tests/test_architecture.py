@@ -52,6 +52,7 @@ FLOORS = (
     "search",
     "design",
     "diagnostics",
+    "criticism.contradictions",
     "criticism.under_misfit",
     "criticism.results",
     "criticism.data",

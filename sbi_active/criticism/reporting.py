@@ -76,7 +76,8 @@ def report_of(
         exploratory: The same.
     """
     tracing = loop.judged(evaluation)
-    if tracing.refuted and held_out is not None:
+    is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
+    if is_withdrawn and evaluation is not None and held_out is not None:
         evaluation = evaluate_held_out(loop.rivals, tracing, held_out)
     simulator, prior = loop.add(tracing.chosen)
     space = loop.actions if plan else None
