@@ -446,3 +446,70 @@ def test_a_center_of_mass_moves_where_the_model_has_room_for_it():
     sliding = ball.replace('axis="0 1 0" pos="0 0 .3"', 'type="slide" axis="1 0 0"')
     with pytest.raises(ValueError, match="compiles as simple"):
         from_mjcf(sliding, {"ball.com_x": (-0.1, 0.1)}, noise=0.01, **given)
+
+
+def encoder_log(**changes):
+    time = np.arange(0.0, 1.0, 0.02)
+    log = {"time": time, "angle": 0.3 * np.sin(3 * time), "servo": 0 * time}
+    return {**log, **changes}
+
+
+def read_logs(*logs, xml=HELD):
+    return from_mjcf(
+        xml.format(name="servo"),
+        {"hinge.damping": (0.0, 1.0)},
+        noise=0.01,
+        recordings=[*logs],
+    ).trials
+
+
+def test_dates_are_seconds_since_the_first():
+    for unit in ("ms", "us", "ns"):
+        stamps = np.datetime64("2026-01-01") + (20 * np.arange(50)).astype(
+            "timedelta64[ms]"
+        ).astype(f"timedelta64[{unit}]")
+        dates = pd.Series(stamps).dt.tz_localize("UTC")
+        for time in (stamps, dates):
+            trials = read_logs(encoder_log(time=time))
+            assert trials.sample_times.tolist() == pytest.approx(
+                (0.02 * np.arange(50)).tolist()
+            )
+
+
+def test_a_log_of_milliseconds_is_said_before_anything_runs():
+    with pytest.warns(UserWarning, match="10,000 time steps of 0.002 s.*in ms"):
+        read_logs(encoder_log(time=1_000 * encoder_log()["time"]))
+
+
+def test_angles_that_wrap_or_are_degrees_are_said():
+    turning = np.linspace(0, 15, 50)
+    with pytest.warns(UserWarning, match=r"jumps by about 2 pi in 2 places"):
+        read_logs(encoder_log(angle=np.remainder(turning, 2 * np.pi)))
+    limited = HELD.replace('axis="0 1 0"', 'axis="0 1 0" limited="true" range="-90 90"')
+    limited = limited.replace('name="angle"', 'name="hinge"')
+    log = encoder_log(hinge=np.linspace(0, 60, 50))
+    del log["angle"]
+    with pytest.warns(UserWarning, match="range ends at 1.57.* rad: are these degrees"):
+        read_logs(log, xml=limited)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"time": encoder_log()["time"] + 1.7e9}, "subtract the time at which"),
+        ({"time": encoder_log()["time"] - 1}, "subtract the time at which"),
+        ({"angle": encoder_log()["angle"] + 1j}, "real numbers in column angle"),
+        ({"angle": ["0.1 rad"] * 50}, "numbers in column 'angle'.*'0.1 rad' in row 0"),
+    ],
+)
+def test_a_log_that_is_no_log_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_logs(encoder_log(**changes))
+
+
+def test_a_file_of_a_log_keeps_its_cells(tmp_path):
+    frame = pd.DataFrame(encoder_log())
+    path = tmp_path / "log.csv"
+    path.write_text("# a comment\n" + frame.to_csv(index=False), encoding="utf-8-sig")
+    trials = read_logs(path)
+    assert trials.x[0].tolist() == pytest.approx(frame["angle"].tolist())
