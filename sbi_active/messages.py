@@ -97,6 +97,7 @@ ANCHORS = {
     "drift aliased with the order of actions": "drift-aliased",
     "actions chosen for information and not for": "chosen-actions",
     "is far outside what the verdict's model": "held-out-missed",
+    "is far outside what the other trials show": "trial-outlying",
     "outcomes that disagree": "outcomes-disagree",
     "the simulator jumps": "jumps",
     "independent errors forced on a trajectory": "correlated-errors",

@@ -43,6 +43,8 @@ Array = NDArray[Any]
 #: as that of the chi-squares that refute. What is in another unit, or of another
 #: machine, is so far outside that half or twice the level calls the same trials.
 LEVEL = 0.01
+#: Trials below which their errors do not show how errors differ.
+FEWEST_TRIALS = 5
 
 
 def missed_trials(
@@ -105,6 +107,31 @@ def missed_trials(
         )
         found.append(missed)
     return (*sorted(found, key=lambda trial: -trial.size),)
+
+
+def outlying_trials(
+    squares: Sequence[float], *, level: float = LEVEL
+) -> list[tuple[int, float]]:
+    """Return fitted trials whose error is far beyond what all others show.
+
+    By Student's t of the logarithms, each trial against the others.
+
+    Args:
+        squares: Mean squared error of each trial on the fit to the others, shape (t,).
+        level: Probability that any of ordinary trials is called so (Bonferroni).
+
+    Returns:
+        Positions and how many times the median of the others the error is, largest
+        first.
+    """
+    logs, found = np.log(np.maximum(squares, 1e-300)), []
+    for k in range(len(logs) if len(logs) >= FEWEST_TRIALS else 0):
+        others = np.delete(logs, k)
+        n = len(others)
+        spread = others.std(ddof=1) * np.sqrt(1 + 1 / n)
+        if student.sf((logs[k] - others.mean()) / spread, n - 1) < level / len(logs):
+            found.append((k, float(np.exp(0.5 * (logs[k] - np.median(others))))))
+    return sorted(found, key=lambda each: -each[1])
 
 
 def _tails(prediction: Prediction, errors: Array, x: Array) -> Array:
