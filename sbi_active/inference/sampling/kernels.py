@@ -24,6 +24,9 @@ NUM_KERNELS = 120  # a choice: the density of a draw costs one term each
 NEIGHBORS = 0.1  # share of the draws that shape one kernel
 WIDTH = 1.2  # of a kernel, in deviations of its neighbors
 SHARE_OF_BASE = 0.05  # a choice: weights are then below 20 times target over base
+#: Of each variance: a ten-thousandth of a deviation, far above what rounding leaves.
+RIDGE = 1e-8
+RESOLUTION = 1e-7  # of float32 parameters, in the prior's units
 BLOCK = 2_000  # draws at once, which bounds the memory
 
 
@@ -66,11 +69,13 @@ class KernelProposal(Defended):
         z: Array, weight: Array, base: Proposal, rng: np.random.Generator
     ) -> KernelProposal:
         """Return kernels at draws (n, d) chosen by their normalized weights (n,)."""
-        d = z.shape[1]
         size = 6 * NUM_KERNELS
         cloud = z[rng.choice(len(z), size=size, p=weight)]
         location = cloud[:NUM_KERNELS]
-        overall = np.atleast_2d(np.cov(cloud.T)) + 1e-14 * np.eye(d)
+        overall = np.atleast_2d(np.cov(cloud.T))
+        # Fewer draws than parameters leave directions without a width.
+        least = RIDGE * overall.diagonal() + RESOLUTION**2
+        overall = overall + np.diag(least)
         whiten = np.linalg.inv(np.linalg.cholesky(overall))
         gap = (location @ whiten.T)[:, None] - cloud @ whiten.T
         nearest = np.argpartition((gap**2).sum(-1), int(NEIGHBORS * size), 1)
