@@ -150,7 +150,9 @@ class Diagnostics:
         return _restored, (parts | {name: dict(parts[name]) for name in plain},)
 
     def __getitem__(self, name: str) -> Any:
-        return self._as_dict(f"[{name!r}]")[name]
+        known = self._as_dict(f"[{name!r}]")
+        # A list without entries is left out of a dict, and is no unknown name.
+        return [] if getattr(self, name, None) == () else known[name]
 
     def __contains__(self, name: object) -> bool:
         return name in self._as_dict(f".__contains__({name!r})")

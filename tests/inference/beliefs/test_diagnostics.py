@@ -76,3 +76,10 @@ def test_entries_by_name_go_in_the_next_version():
         assert KNOWN.get("bandwidth") == 0.1
     with pytest.warns(DeprecationWarning, match="deprecated"):
         assert "width" not in KNOWN
+
+
+def test_an_empty_list_is_no_unknown_name():
+    with pytest.warns(DeprecationWarning):
+        assert Diagnostics()["warnings"] == []
+    with pytest.warns(DeprecationWarning), pytest.raises(KeyError):
+        Diagnostics()["warning"]
