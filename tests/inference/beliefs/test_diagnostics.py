@@ -79,7 +79,7 @@ def test_entries_by_name_go_in_the_next_version():
 
 
 def test_an_empty_list_is_no_unknown_name():
-    with pytest.warns(DeprecationWarning):
+    with pytest.warns(DeprecationWarning, match="deprecated"):
         assert Diagnostics()["warnings"] == []
-    with pytest.warns(DeprecationWarning), pytest.raises(KeyError):
+    with pytest.warns(DeprecationWarning, match="deprecated"), pytest.raises(KeyError):
         Diagnostics()["warning"]

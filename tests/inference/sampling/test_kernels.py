@@ -16,4 +16,5 @@ def test_fewer_draws_than_parameters_have_kernels(dim, num, size):
     z = size * rng.standard_normal((num, dim))
     proposal = KernelProposal.around(z, np.full(num, 1 / num), base, rng)
     drawn = proposal.sample(200, rng)
-    assert np.isfinite(drawn).all() and np.isfinite(proposal.log_prob(drawn)).all()
+    assert np.isfinite(drawn).all()
+    assert np.isfinite(proposal.log_prob(drawn)).all()
