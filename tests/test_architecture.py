@@ -21,6 +21,7 @@ FLOORS = (
     "messages",
     "renamed",
     "seeding",
+    "support",
     "threads",
     "notebook",
     "page",

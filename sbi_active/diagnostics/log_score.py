@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from sbi.utils.sbiutils import within_support
 from sklearn.ensemble import HistGradientBoostingClassifier
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate
+from sbi_active.support import within_support
 
 LARGEST = 6.0  # of a classifier's log ratio: what thousands of rows can tell
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 from sbi.inference.posteriors.direct_posterior import DirectPosterior
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 
 from sbi_active.inference.models.posterior import at_conditions
+from sbi_active.support import within_support
 
 TRIES = (1, 8, 40)  # times as many draws as are needed, for the rows that still lack
 

@@ -7,7 +7,6 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -20,6 +19,7 @@ from sbi_active.pyro.denoising import Denoised, denoise
 from sbi_active.pyro.error_models import SpikeAndSlab
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
+from sbi_active.support import within_support
 
 NUM_PREDICTIVE = 1_000  # simulations under the belief before the trial
 NUM_AVERAGED = 100  # denoised outcomes

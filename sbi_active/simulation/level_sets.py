@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 
 from sbi_active.combinations.formula import Combination
 from sbi_active.simulation.sensitivities import Sensitivities
+from sbi_active.support import within_support
 
 __all__ = ["moved_along"]
 

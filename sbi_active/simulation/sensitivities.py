@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
+from sbi_active.support import within_support
 
 __all__ = ["EQUAL", "SAME", "STEP", "Sensitivities", "Simulate"]
 

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.priors import is_discrete, parts_of
 from sbi_active.seeding import forked_generators
+from sbi_active.support import support_of
 
 Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
 
@@ -178,7 +179,7 @@ class Effect:
         """Return the log prior density, shape (n,), float64; -inf outside."""
         shape = self.prior.batch_shape + self.prior.event_shape
         value = phi.reshape(len(phi), *shape)
-        inside = self.prior.support.check(value)[:, None].flatten(1).all(-1)  # type: ignore[union-attr]
+        inside = support_of(self.prior).check(value)[:, None].flatten(1).all(-1)
         # Outside of its support a distribution raises or gives what it likes.
         with forked_generators(0, "inside"):
             some = self.prior.sample()

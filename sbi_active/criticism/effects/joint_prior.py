@@ -13,6 +13,7 @@ from typing_extensions import override
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.seeding import kept_generators
+from sbi_active.support import support_of
 
 
 class JointPrior(Distribution):
@@ -40,7 +41,7 @@ class JointPrior(Distribution):
     @property
     @override
     def support(self) -> constraints.Constraint:  # type: ignore[override]
-        parts = [_elementwise(d.support) for d in self._parts()]
+        parts = [_elementwise(support_of(d)) for d in self._parts()]
         return constraints.independent(
             constraints.cat(parts, dim=-1, lengths=self.sizes), 1
         )
@@ -67,7 +68,7 @@ class JointPrior(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         rows = value.reshape(-1, sum(self.sizes))
         theta, *phi = rows.split(self.sizes, -1)
-        inside = _rows(self.prior.support.check(theta))  # type: ignore[union-attr]
+        inside = _rows(support_of(self.prior).check(theta))
         with kept_generators():  # any place in the support will do
             place = self.prior.sample(torch.Size([1]))
         safe = torch.where(inside[:, None], theta, place)

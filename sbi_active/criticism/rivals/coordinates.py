@@ -14,8 +14,8 @@ from torch.distributions import Distribution
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import JointPrior
 from sbi_active.criticism.rivals.energy import dissipative_bounds
-from sbi_active.inference.sampling.coordinates import support_bounds
 from sbi_active.seeding import forked_generators
+from sbi_active.support import support_bounds, support_of
 
 Array = NDArray[Any]
 
@@ -204,11 +204,11 @@ class SearchCoordinates:
 
     def _bounds(self) -> tuple[Array, Array]:
         pairs = [
-            support_bounds(part.support, size)
+            support_bounds(support_of(part), size)
             for part, size in zip(self.joint._parts(), self.joint.sizes, strict=True)
         ]
         for e in self.nuisances:
-            low, high = support_bounds(e.prior.support, e.phi_dim)
+            low, high = support_bounds(support_of(e.prior), e.phi_dim)
             pairs.append(
                 (np.tile(low, self.num_trials), np.tile(high, self.num_trials))
             )

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
@@ -18,6 +17,7 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.messages import warn
 from sbi_active.notebook import card, parameters
 from sbi_active.seeding import forked_generators
+from sbi_active.support import support_of, within_support
 
 #: Draws behind moments and a chained belief's normalizer: a hundredth of a deviation.
 NUM_DRAWS = 20_000
@@ -65,13 +65,14 @@ class Belief(Distribution, ABC):
     @property
     @override
     def support(self) -> Any:
-        return self.prior.support
+        return support_of(self.prior)
 
     def sample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
         """Return draws, shape (*sample_shape, theta_dim), float32."""
         shape = torch.Size(sample_shape)
         with torch.no_grad():
-            return self._sample(shape.numel()).float().reshape(*shape, -1)
+            draws = self._sample(shape.numel()).float()
+            return draws.reshape(*shape, *self.event_shape)
 
     def quick_sample(self, num_samples: int, *, seed: int) -> Tensor:
         """Return draws for a picture, at no cost worth a word.

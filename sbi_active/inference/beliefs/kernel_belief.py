@@ -6,7 +6,6 @@ import math
 from typing import Literal
 
 import torch
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -14,6 +13,7 @@ from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.sampling.bandwidth import scott, silverman
 from sbi_active.seeding import forked_generators
+from sbi_active.support import within_support
 
 Bandwidth = float | Literal["scott", "silverman"]
 

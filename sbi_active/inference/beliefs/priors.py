@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from sbi_active.seeding import forked_generators
+from sbi_active.support import within_support
 
 #: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
 FEWEST_STEPS = 64
@@ -49,6 +49,12 @@ def require_support(prior: Distribution | None) -> Distribution:
             "expected a prior whose parameters may vary one by one; got "
             f"{_shown_prior(prior)}, which ties them to one another; use parameters "
             "that are free, such as the logarithms of ratios"
+        )
+    if len(prior.event_shape) != 1 and not prior.batch_shape:
+        raise ValueError(
+            "expected a prior over parameter sets, event shape (theta_dim,); got "
+            f"{_shown_prior(prior)} of event shape {tuple(prior.event_shape)}; pass "
+            "torch.distributions.Independent(distribution of shape (theta_dim,), 1)"
         )
     if prior.batch_shape:
         with forked_generators(0):

@@ -7,13 +7,13 @@ from typing import Any
 
 import torch
 from sbi.utils import RestrictedPrior
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import Explained, warn
+from sbi_active.support import within_support
 
 
 class UnexplainedOutcomeError(Explained, ValueError):

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
+from sbi_active.support import support_bounds, support_of, within_support
 
 Array = NDArray[Any]
 
@@ -44,7 +44,7 @@ class PriorCoordinates:
         with forked_generators(int(rng.integers(2**31))):
             theta = prior.sample(torch.Size([2_000])).double().numpy()
         self.dim = theta.shape[1]
-        self.low, self.high = support_bounds(prior.support, self.dim)
+        self.low, self.high = support_bounds(support_of(prior), self.dim)
         self.bounded = np.isfinite(self.low) & np.isfinite(self.high)
         # +1 for theta > low, -1 for theta < high, 0 for no logarithm.
         self._side = np.isfinite(self.low).astype(int) - np.isfinite(self.high)
@@ -116,21 +116,3 @@ class PriorCoordinates:
             above, below = np.log(theta - self.low), np.log(self.high - theta)
         logarithm = np.where(self._side > 0, above, below)
         return np.where(self._side == 0, theta, logarithm)
-
-
-def support_bounds(support: Any, dim: int) -> tuple[Array, Array]:
-    """Return the bounds of each number of a torch constraint, shapes (dim,)."""
-    if hasattr(support, "base_constraint"):
-        return support_bounds(support.base_constraint, dim)
-    if hasattr(support, "cseq"):  # constraints.cat
-        parts = [
-            support_bounds(part, int(length))
-            for part, length in zip(support.cseq, support.lengths, strict=True)
-        ]
-        low, high = zip(*parts, strict=True)
-        return np.concatenate(low), np.concatenate(high)
-    bounds = []
-    for name, missing in (("lower_bound", -np.inf), ("upper_bound", np.inf)):
-        bound = torch.as_tensor(getattr(support, name, missing)).double().numpy()
-        bounds.append(np.array(np.broadcast_to(bound.reshape(-1), (dim,))))
-    return bounds[0], bounds[1]

@@ -13,6 +13,7 @@ from sbi_active.information_gain.fits.completeness import Completeness
 from sbi_active.information_gain.fits.emulator import MeanEmulator
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
+from sbi_active.support import support_of
 
 DEGREES = 6  # of freedom of the Student-t proposals; even
 WIDER = 1.2  # than the linearized posterior
@@ -164,7 +165,7 @@ def log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tenso
 def log_density(belief: Distribution, theta: Tensor) -> Tensor:
     """Log density of the belief, -inf outside its support, shape (n,), float64."""
     try:
-        inside = belief.support.check(theta)  # type: ignore[union-attr]
+        inside = support_of(belief).check(theta)
     except NotImplementedError:
         inside = torch.ones(len(theta)).bool()
     log_b = torch.full((len(theta),), -torch.inf).double()

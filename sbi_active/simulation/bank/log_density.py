@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sbi_active.support import support_of
+
 
 def log_density(distribution: Any, theta: Tensor) -> Tensor:
     """Return the log density of rows, -inf outside the support.
@@ -22,7 +24,7 @@ def log_density(distribution: Any, theta: Tensor) -> Tensor:
     """
     result = torch.full((len(theta),), -torch.inf, dtype=torch.float64)
     try:
-        inside = distribution.support.check(theta)
+        inside = support_of(distribution).check(theta)
     except (AttributeError, NotImplementedError):
         inside = torch.ones(len(theta), dtype=torch.bool)
     inside = inside.reshape(len(theta), -1).all(-1)

@@ -17,7 +17,11 @@ from torch.distributions import (
     OneHotCategorical,
     Poisson,
     StudentT,
+    TransformedDistribution,
+    Uniform,
+    VonMises,
 )
+from torch.distributions.transforms import AffineTransform, ExpTransform
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
@@ -43,6 +47,7 @@ def independent(prior: Distribution) -> Independent:
         (PAYLOAD, "got a discrete one, BoxUniform, Bernoulli"),
         (OneHotCategorical(TWO), "got a discrete one, OneHotCategorical"),
         (Dirichlet(TWO), "may vary one by one; got Dirichlet"),
+        (Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
         (LKJCholesky(2, 1.0), "may vary one by one; got LKJCholesky"),
     ],
 )
@@ -115,8 +120,25 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
         independent(StudentT(1.0, 0 * TWO, TWO)),
         independent(HalfCauchy(TWO)),
         independent(MixtureSameFamily(Categorical(torch.ones(2, 2)), MODES)),
+        TransformedDistribution(
+            independent(Normal(0 * TWO, TWO)),
+            [ExpTransform(), AffineTransform(0.2, 1.0)],
+        ),
+        MixtureSameFamily(
+            Categorical(TWO),
+            independent(Uniform(torch.tensor([[0.0], [0.2]]).expand(2, 2), 1.0)),
+        ),
+        independent(VonMises(0 * TWO, TWO)),
     ],
-    ids=["Cauchy", "StudentT", "HalfCauchy", "mixture"],
+    ids=[
+        "Cauchy",
+        "StudentT",
+        "HalfCauchy",
+        "mixture",
+        "shifted log-normal",
+        "mixture of bounds",
+        "angle",
+    ],
 )
 def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
     c, x = campaign(prior), torch.tensor([0.6, 0.5])

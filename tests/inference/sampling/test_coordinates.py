@@ -18,7 +18,8 @@ from torch.distributions import (
     constraints,
 )
 
-from sbi_active.inference.sampling.coordinates import PriorCoordinates, support_bounds
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.support import support_bounds
 
 ONES = torch.ones(2)
 PRIORS: dict[str, Distribution] = {
