@@ -93,7 +93,8 @@ class _Student:
     """A mixture of Student t distributions, fitted to draws."""
 
     def __init__(self, y: Array, num_components: int, wider: float) -> None:
-        fit = GaussianMixture(num_components, reg_covar=1e-6, random_state=0).fit(y)
+        fit: Any = GaussianMixture(num_components, reg_covar=1e-6, random_state=0)
+        fit.fit(y)
         self.weight, self.mean = fit.weights_, fit.means_
         self.factor = np.linalg.cholesky(wider * fit.covariances_)
 

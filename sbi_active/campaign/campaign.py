@@ -221,7 +221,7 @@ class Campaign(CampaignTrials):
 
     @guarded
     def close(self) -> None:
-        """Let other processes write to the directory; the next call takes it again."""
+        """Let other processes write to the directory until the next call."""
         self._storage.close()
 
     def __enter__(self) -> Campaign:
@@ -373,7 +373,7 @@ class Campaign(CampaignTrials):
             evaluate=evaluate,
             designed=find_method(self.state.method).designs,
         )
-        found = {"digest": report.digest, "verdict": report.verdict}
+        found: Any = {"digest": report.digest, "verdict": report.verdict}
         self._storage.write("examined", **found, chosen=[*report.tracing.chosen])
         return report
 

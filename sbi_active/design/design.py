@@ -145,7 +145,8 @@ class Design:
             ``child_axes`` they are.
         """
         drawn = draw(self, ax)
-        legible(drawn.get_figure(root=True))
+        figure: Any = drawn.get_figure(root=True)
+        legible(figure)
         return drawn
 
 

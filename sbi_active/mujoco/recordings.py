@@ -178,13 +178,13 @@ def _as_numbers(frame: pd.DataFrame, names: Sequence[str], what: str) -> pd.Data
     """Return a log whose columns are numbers, dates as seconds since the first."""
     frame = frame.copy()
     for name in names:
-        cells = frame[name]
+        cells: Any = frame[name]
         if name == TIME and is_stamp(cells):
             frame[name] = seconds(cells, what)
             continue
         require_real(cells, name, what)
         blank = cells.map(lambda cell: str(cell).strip() == "")
-        numbers = pd.to_numeric(cells.where(~blank), errors="coerce")
+        numbers: Any = pd.to_numeric(cells.where(~blank), errors="coerce")
         wrong = np.flatnonzero(numbers.isna() & cells.notna() & ~blank)
         if len(wrong) and str(cells.iloc[wrong[0]]).strip().lower() != "nan":
             raise ValueError(

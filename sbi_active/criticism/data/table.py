@@ -251,7 +251,7 @@ class _TrialRows(Rows):
     def _note_empty(self, x: Array, rows: Array) -> None:
         """Warn of what counts as not measured."""
         # Sensors that are read at times of their own leave each other's cells empty.
-        others = np.isfinite(x).any(1) & (self.columns.time is not None)
+        others: Any = np.isfinite(x).any(1) & (self.columns.time is not None)
         for column, values in zip(self.columns.x, x.T, strict=True):
             at = np.sort(rows[np.isnan(values[rows]) & ~others[rows]])
             if len(at):

@@ -65,7 +65,7 @@ class Rows:
         """Return the time of each row in s, in order within a trial; 0 without one."""
         if self.columns.time is None:
             return np.zeros(len(self.frame))
-        cells = self.frame[self.columns.time]
+        cells: Any = self.frame[self.columns.time]
         if is_stamp(cells):  # from the start of each trial
             time = np.empty(len(cells))
             for at in self.members:
@@ -109,7 +109,7 @@ class Rows:
 
     def numbers(self, column: str, *, empty: bool = False) -> Array:
         """Return a column as numbers, shape (n,), NaN where cells may be empty."""
-        cells = self.frame[column]
+        cells: Any = self.frame[column]
         require_real(cells, column, self.source)
         text = cells.map(lambda cell: str(cell).strip())
         blank = text.str.lower().isin(EMPTY).to_numpy()

@@ -97,8 +97,9 @@ def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
     # An effect that vanishes at a bound is a weak one, and no prior is too narrow.
     nulls = [e.null_phi(1).double().numpy()[0] for e in fit.rival.effects]
     z = c.to_z(c.center[None])[0]
-    first = c.joint.sizes[0]
-    z[first:own] = np.concatenate([z[:0], *nulls])
+    declared = np.concatenate([z[:0], *nulls])
+    first = own - len(declared)  # of a simulator that was extended there are more
+    z[first:own] = declared
     ends = np.where(side < 0, c.low[:own], c.high[:own])
     vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < NEAR
     side[first:][vanishes[first:]] = 0

@@ -114,7 +114,8 @@ def find_contradiction(
     d = jacobian.shape[1]
     precision = jacobian.T @ jacobian + np.eye(d)
     parts = residual.reshape(t, -1), jacobian.reshape(t, -1, d)
-    gradient = np.einsum("kn,knd->kd", *parts) * seen.any(1)[:, None]
+    measured: Any = seen.any(1)
+    gradient = np.einsum("kn,knd->kd", *parts) * measured[:, None]
     spread = np.linalg.eigvals(np.linalg.solve(precision, gradient.T @ gradient))
     by_trial = t / (t - 1) * float(spread.real.max())
     return replace(found, inflation=max(found.inflation, by_trial**0.5))

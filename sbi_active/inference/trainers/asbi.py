@@ -200,15 +200,16 @@ class ASBI(MixtureRounds, NPE_C):
             return super()._resolve_prior(prior, sample_with)
 
     def _model(self, estimator: Any, *arguments: Any) -> ActionPosterior:
+        create: Any = NPE_C._create_posterior
         with kept_generators():
             try:
-                packed = NPE_C._create_posterior(self, estimator, *arguments)
+                packed = create(self, estimator, *arguments)
             except (AssertionError, NotImplementedError):
                 # sbi has no transform of a mixture, nor of a prior without moments. It
                 # serves the search of ``map`` alone.
                 *others, parameters = arguments
                 plain = replace(parameters, enable_transform=False)
-                packed = NPE_C._create_posterior(self, estimator, *others, plain)
+                packed = create(self, estimator, *others, plain)
         assert self._action_dim is not None
         assert self._outcome_shape is not None
         return ActionPosterior(packed, self._outcome_shape, self._action_dim)
