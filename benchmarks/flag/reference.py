@@ -115,4 +115,4 @@ class _Student:
             size = gammaln((DF + d) / 2) - gammaln(DF / 2) - d / 2 * np.log(DF * np.pi)
             size = size - np.log(np.diag(factor)).sum() + np.log(weight)
             parts.append(size - (DF + d) / 2 * np.log1p(square / DF))
-        return logsumexp(parts, axis=0)
+        return np.asarray(logsumexp(parts, axis=0))
