@@ -28,6 +28,8 @@ Array = NDArray[Any]
 
 #: Shares of the variance that are white, of errors of unknown size.
 SHARES = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
+#: Smallest share of a declared white error: below it sums of squares lose their digits.
+LEAST = 1e-12
 #: Time scales from this number of samples to this share of a trial, and their number.
 SAMPLES, TRIAL, NUM_TIMES = 0.7, 0.8, 9
 #: Numbers that are whitened before they are summed up.
@@ -53,16 +55,24 @@ class Hypotheses:
     log_prior: Array
 
     @classmethod
-    def of(cls, measurements: Measurements) -> Hypotheses:
-        """Return those that some measurements can tell."""
+    def of(cls, measurements: Measurements, share: float = 1.0) -> Hypotheses:
+        """Return those that some measurements can tell.
+
+        Args:
+            measurements: Which say what time scales can be told.
+            share: Smallest one that the declared white error of a channel has of the
+                variance of its residuals; shares go on by tens until a tenth of it.
+        """
         m = measurements
+        tens = np.log10(SHARES[0] / max(share / 10, LEAST))
+        below = SHARES[0] * 10.0 ** -np.arange(max(np.ceil(tens), 0), 0, -1)
         starts = np.flatnonzero(~np.isfinite(m.gap))
         ends = np.append(starts[1:], len(m))
         spans = m.time[ends - 1] - m.time[starts]
         span = max(float(np.median(spans)), 2 * m.step)
         low = SAMPLES * m.step
         times = np.geomspace(low, max(TRIAL * span, 2 * low), NUM_TIMES)
-        parts = np.meshgrid(SHARES, times, [False, True], indexing="ij")
+        parts = np.meshgrid([*below, *SHARES], times, [False, True], indexing="ij")
         share, time, smooth = (part.ravel() for part in parts)
         num = len(share)
         return cls(

@@ -160,13 +160,16 @@ def fitted(
         doubtful = [e for e in doubtful if e.name not in aliases]
         whole = rival(doubtful)
         lift = _Lift.of(bare, whole)
+    share = 1.0
+    if known_sd is not None:
+        share = float(((known_sd[channel] / unit) ** 2).min())
     found = Fitted(
         whole,
         lift(u),
         np.empty((0, 0)),
         unit,
         _unknowns(whole, lift(u)),
-        Hypotheses.of(simulator.measurements),
+        Hypotheses.of(simulator.measurements, share),
         Draws.none(whole.dim),
         tuple(aliases),
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import norm, rankdata
 from torch.distributions import Distribution
 
 from sbi_active.criticism.checks import require_fitting
@@ -37,6 +38,9 @@ FEWEST, FEWEST_KEPT = 50, 100
 INSIDE = 1e-6
 #: Multiple of the declared deviation from which errors are no longer the sensor's.
 BEYOND = 3.0
+#: Deviation of half a Gaussian: beside a bound draws that are narrower say that trials
+#: ask for what is beyond it, and not how well they tell the parameter.
+HALF = 0.6
 
 
 class IdentifiedBelief(KernelBelief):
@@ -44,6 +48,8 @@ class IdentifiedBelief(KernelBelief):
 
     Attributes:
         draws: Of theta, shape (n, theta_dim).
+        sides: Bound of the prior at which each parameter lies, -1 for the lower one, 1
+            for the upper one, 0 for none, shape (theta_dim,).
     """
 
     label = "identified"
@@ -54,9 +60,12 @@ class IdentifiedBelief(KernelBelief):
         # Kernels widen what they stand on: draws move in by as much.
         super().__init__(prior, mean + (1 - width**2) ** 0.5 * (draws - mean))
         self.draws = draws
+        self.sides = np.zeros(draws.shape[1], dtype=np.int64)
 
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return the central interval of each parameter by its name.
+
+        That of a parameter at a bound of its prior is one-sided, from the bound on.
 
         Args:
             level: Its probability.
@@ -65,11 +74,14 @@ class IdentifiedBelief(KernelBelief):
             raise ValueError(
                 f"expected a level between 0 and 1; got {level}; pass a probability"
             )
-        tails = torch.tensor([0.5 - level / 2, 0.5 + level / 2], dtype=torch.float64)
-        ends = torch.quantile(self.draws.double(), tails, dim=0).T.tolist()
         assert self.parameter_names is not None
-        each = zip(self.parameter_names, ends, strict=True)
-        return {name: (low, high) for name, (low, high) in each}
+        draws, found = self.draws.double().numpy(), {}
+        each = zip(self.parameter_names, self.sides.tolist(), draws.T, strict=True)
+        for name, side, own in each:
+            below = (1 - level) * (1 + side) / 2
+            low, high = np.quantile(own, [below, below + level]).tolist()
+            found[name] = low, high
+        return found
 
 
 def identify(
@@ -141,9 +153,14 @@ def identify(
         theta = parts.widen(found.u[:own] + u[:, :own], rng)
         u[:, :own] = _reflected(theta, c.low[:own], c.high[:own]) - found.u[:own]
     names = model.parameter_names or [f"theta_{k + 1}" for k in range(own)]
+    sides = c.sides((found.u + u)[:, :own])
+    for k in np.flatnonzero(sides):
+        bound = (c.low if sides[k] < 0 else c.high)[k] - found.u[k]
+        u[:, k] = bound - sides[k] * _opened(sides[k] * (bound - u[:, k]), parts.sd[k])
     theta = c.to_z(np.clip(found.u + u, c.low, c.high))[:, :own]
     belief = IdentifiedBelief(prior, torch.from_numpy(theta))
     belief.parameter_names = (*names,)
+    belief.sides = sides
     if parts.disagree:
         worst = names[int(np.argmin(parts.p_value))]
         notes.append(
@@ -156,10 +173,10 @@ def identify(
             f"{effective:.0f} effective draws: the posterior is not that of a nearly "
             "linear model; use Campaign, or a narrower prior"
         )
-    notes += _at_bounds(found, u, names)
+    notes += _at_bounds(belief)
     errors = _errors(found, model)
     if known_sd is not None:
-        notes += _beyond(errors, known_sd)
+        notes += _beyond(found, errors, known_sd)
     belief.diagnostics = (
         Diagnostics(trustworthy=True)
         .warned(*notes)
@@ -274,26 +291,50 @@ def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]
     return said
 
 
-def _beyond(errors: dict[str, dict[str, float]], declared: Array) -> list[str]:
+def _beyond(
+    found: Fitted, errors: dict[str, dict[str, float]], declared: Array
+) -> list[str]:
     """Return in which channels residuals are far larger than the declared error."""
-    ratios = {
-        name: own["sd"] / sd
-        for (name, own), sd in zip(errors.items(), declared.tolist(), strict=True)
-    }
-    return [
-        f"residuals of {name} are {ratio:.0f} times the declared error: the model "
-        "lacks something, or the error is declared too small; ask close_loop what it "
-        "lacks"
-        for name, ratio in ratios.items()
-        if ratio > BEYOND
-    ]
+    channel, notes = found.rival.simulator.measurements.channel, []
+    for c, (name, own) in enumerate(errors.items()):
+        if own["sd"] <= BEYOND * declared[c]:
+            continue
+        # What is left, since shapes of the error only have sizes some steps apart.
+        ratio = float(found.unit[channel == c][0]) / declared[c]
+        notes.append(
+            f"residuals of {name} are {ratio:.2g} times the declared error: the model "
+            "lacks something, or the error is declared too small; ask close_loop what "
+            "it lacks"
+        )
+    return notes
 
 
-def _at_bounds(found: Fitted, u: Array, names: Sequence[str]) -> list[str]:
+def _opened(inside: Array, sd: float) -> Array:
+    """Return how far draws are inside a bound, as half a Gaussian at least, (n,).
+
+    Where trials ask for what is far beyond it, the posterior within has no width, which
+    says nothing of the parameter.
+
+    Args:
+        inside: How far they are, shape (n,).
+        sd: Deviation that the parameter has without bounds.
+    """
+    if inside.std() >= HALF * sd:
+        return inside
+    probability = (rankdata(inside, "ordinal") - 0.5) / len(inside)
+    return np.maximum(inside, sd * norm.ppf(0.5 + probability / 2))
+
+
+def _at_bounds(belief: IdentifiedBelief) -> list[str]:
     """Return which parameters may be beyond a bound of the prior."""
-    sides = found.rival.coordinates.sides((found.u + u)[:, : len(names)])
-    return [
-        f"{name} is at a bound of its prior; move the bound, or say why"
-        for name, side in zip(names, sides, strict=True)
-        if side
-    ]
+    notes, found = [], belief.interval()
+    for (name, (low, high)), side in zip(found.items(), belief.sides, strict=True):
+        if side:
+            limit = f"upper one: at least {low:.3g}"
+            if side < 0:
+                limit = f"lower one: at most {high:.3g}"
+            notes.append(
+                f"{name} is at a bound of its prior, the {limit}, and nothing says how "
+                "far beyond; move the bound, or say why"
+            )
+    return notes

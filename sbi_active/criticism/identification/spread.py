@@ -40,10 +40,12 @@ class Spread:
         p_value: Of each parameter being the same in all parts, shape (d,).
         deviation: Of the parts from their mean, as far as it is none of their errors,
             shape (f, d), such that normal multiples of them add up to the spread.
+        sd: Of each parameter by all trials if it had no bounds, shape (d,).
     """
 
     p_value: Array
     deviation: Array
+    sd: Array
 
     @property
     def disagree(self) -> bool:
@@ -90,7 +92,9 @@ def spread(found: Fitted) -> Spread:
     # Of their own deviations, those that are far off by their errors count less.
     off = np.sqrt(weight) * (each - mean)
     off = off / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
-    return Spread(chi2.sf(square, max(freedom, 1)), off * np.sqrt(variance))
+    p_value = chi2.sf(square, max(freedom, 1))
+    whole = np.sqrt(np.diag(np.linalg.inv(total + ridge)))[:own]
+    return Spread(p_value, off * np.sqrt(variance), whole)
 
 
 def _parts(m: Measurements) -> NDArray[np.int64]:

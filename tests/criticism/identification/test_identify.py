@@ -122,6 +122,46 @@ def test_a_bound_is_kept_and_told():
     assert any("decay is at a bound" in w for w in belief.diagnostics.warnings)
 
 
+@pytest.mark.parametrize(("low", "high", "side"), [(0.6, 1.0, -1), (0.0, 0.05, 1)])
+def test_an_interval_at_a_bound_is_one_sided_and_has_a_width(low, high, side):
+    """Logs that ask for what is far beyond a bound say nothing of what is within.
+
+    White errors of a hundredth of what is missed leave no width to draws within; of a
+    parameter without bounds they leave that of errors as large as the residuals.
+    """
+    prior = BoxUniform(torch.tensor([1.0, low, 0.5]), torch.tensor([6.0, high, 2.0]))
+    belief = identify(model(), prior, Trials(ACTION, recorded()))
+    one, two = belief.interval()["decay"]
+    bound, limit = (low, f"at most {two:.3g}")
+    if side > 0:
+        bound, limit = (high, f"at least {one:.3g}")
+    (said,) = (w for w in belief.diagnostics.warnings if "decay is at a bound" in w)
+    assert limit in said
+    assert (one if side < 0 else two) == pytest.approx(bound, abs=1e-3)
+    assert two - one > 0.01
+    # One-sided: a twentieth of the draws are farther inside.
+    inside = (belief.draws[:, 1] - bound).abs().double().numpy()
+    assert two - one == pytest.approx(np.quantile(inside, 0.95), abs=1e-3)
+
+
+@pytest.mark.parametrize("times", [30.0, 300.0, 1e4])
+def test_errors_far_beyond_the_declared_one_have_their_size(times):
+    """Of any size: not as many times as some largest shape of the error allows."""
+    bend = 0.3 * torch.stack([torch.sin(3 * TIMES), 50 * torch.cos(TIMES)], -1)
+    x = recorded(extra=bend)
+    sd = torch.tensor([0.3, 15.0]) / 2**0.5 / times
+    belief = identify(model(GaussianNoise(sd)), PRIOR, Trials(ACTION, x))
+    sizes = [e["sd"] for e in belief.diagnostics.errors.values()]
+    assert np.log10(np.divide(sizes, times * sd)) == pytest.approx([0, 0], abs=0.6)
+    said = [w for w in belief.diagnostics.warnings if "declared error" in w]
+    told = [float(w.split(" are ")[1].split(" times")[0]) for w in said]
+    assert len(told) == 2
+    assert np.log10(np.divide(told, times)) == pytest.approx([0, 0], abs=0.4)
+    free = identify(model(), PRIOR, Trials(ACTION, x)).interval()
+    for name, (low, high) in belief.interval().items():
+        assert high - low > 0.3 * (free[name][1] - free[name][0])
+
+
 def test_what_may_be_there_is_found_or_not():
     """A shift of the position beside it: found, and theta as narrow as before."""
 
