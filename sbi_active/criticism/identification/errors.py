@@ -55,16 +55,16 @@ class Hypotheses:
     log_prior: Array
 
     @classmethod
-    def of(cls, measurements: Measurements, share: float = 1.0) -> Hypotheses:
+    def of(cls, measurements: Measurements, declared: float = 1.0) -> Hypotheses:
         """Return those that some measurements can tell.
 
         Args:
             measurements: Which say what time scales can be told.
-            share: Smallest one that the declared white error of a channel has of the
-                variance of its residuals; shares go on by tens until a tenth of it.
+            declared: Share of the variance of residuals that a declared white error
+                has at least in all channels; shares go on by tens to a tenth of it.
         """
         m = measurements
-        tens = np.log10(SHARES[0] / max(share / 10, LEAST))
+        tens = np.log10(SHARES[0] / max(declared / 10, LEAST))
         below = SHARES[0] * 10.0 ** -np.arange(max(np.ceil(tens), 0), 0, -1)
         starts = np.flatnonzero(~np.isfinite(m.gap))
         ends = np.append(starts[1:], len(m))
