@@ -25,6 +25,7 @@ FURTHER = {
     "actions": {"sbi_active.actions.waveforms": ()},
     "criticism": {
         "sbi_active.criticism.results": (),
+        "sbi_active.criticism.contradictions": ("SevereTest",),
         "sbi_active.criticism.effects.first_samples": ("zero_from_first_samples",),
     },
     "design": {"sbi_active.export": ("to_inference_data",)},
