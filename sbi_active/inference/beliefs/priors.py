@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
+from sbi.utils.torchutils import set_validate_args
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution, MixtureSameFamily, constraints
 
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
@@ -56,6 +57,10 @@ def require_support(prior: Distribution | None) -> Distribution:
             f"{_shown_prior(prior)} of event shape {tuple(prior.event_shape)}; pass "
             "torch.distributions.Independent(distribution of shape (theta_dim,), 1)"
         )
+    if any(isinstance(part, MixtureSameFamily) for part in _nested(prior)):
+        # torch asks that a value lies within the bounds of every component, and raises
+        # for draws of its own; whether it does so at all depends on what was imported.
+        set_validate_args(prior, False)
     if prior.batch_shape:
         with forked_generators(0):
             draws = prior.sample(torch.Size([2]))
@@ -88,6 +93,15 @@ def _is_constrained(support: Any) -> bool:
     """Return whether some part of a support has less dimensions than numbers."""
     tied = (constraints.simplex, constraints.corr_cholesky)
     return any(isinstance(part, tuple(map(type, tied))) for part in parts_of(support))
+
+
+def _nested(prior: Any) -> Iterator[Any]:
+    """Yield a distribution and those that it is made of."""
+    yield prior
+    for value in vars(prior).values():
+        for part in value if isinstance(value, (list, tuple)) else [value]:
+            if isinstance(part, Distribution):
+                yield from _nested(part)
 
 
 def _shown_prior(prior: Distribution) -> str:

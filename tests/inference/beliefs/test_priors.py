@@ -3,6 +3,7 @@
 import pytest
 import torch
 from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils.torchutils import set_validate_args
 from torch.distributions import (
     Bernoulli,
     Categorical,
@@ -141,6 +142,7 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
     ],
 )
 def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
+    set_validate_args(prior, True)  # as after an import of pyro, which says so for all
     c, x = campaign(prior), torch.tensor([0.6, 0.5])
     c.ask()  # the network is trained and asked as well
     c.tell(x, action=[1.0])
