@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import inspect
 import sys
+import textwrap
 import types
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -20,13 +22,25 @@ SMALL = 16
 #: Deeper settings are not looked at.
 DEPTH = 6
 
+#: Methods that change a container or an array; torch's end in an underscore.
+CHANGING = {
+    *("add", "append", "appendleft", "clear", "discard", "extend", "fill", "insert"),
+    *("pop", "popitem", "popleft", "put", "remove", "resize", "reverse", "setdefault"),
+    *("sort", "update"),
+}
+
 
 def fingerprint(simulator: Callable[..., Any], *, version: str = "") -> dict[str, Any]:
     """Return a description of a simulator that can be stored and compared.
 
     It holds qualified names, source code (as a hash), and settings: public attributes,
-    default arguments and captured variables. It does not see the files, modules and
-    global variables that the simulator uses; those are up to ``version``.
+    default arguments, captured variables, and the global variables that the simulator's
+    functions name, in their own module or imported by ``from ... import``: numbers,
+    texts, arrays, containers of these, and functions of the same module, with those
+    that they name. It does not see files, what is read as an attribute of a module
+    (``settings.g``), functions and classes of other modules, objects of a user's
+    classes, and what a function itself changes, such as counters and caches; those
+    are up to ``version``.
 
     Args:
         simulator: Any callable.
@@ -99,11 +113,18 @@ def _describe(value: Any, depth: int) -> Any:
             "source": _source(value),
             "captured": below(_captured(value)),
             "defaults": below([*(value.__defaults__ or ())]),
+            "globals": _globals([value]),
         }
     if isinstance(value, torch.nn.Module):
         return {"name": _name(type(value)), "state": below(dict(value.state_dict()))}
     settings = {k: v for k, v in _attributes(value).items() if not k.startswith("_")}
     own = {"name": _name(type(value)), "source": _source(type(value))}
+    if callable(value):
+        kinds = [
+            k for k in type(value).__mro__ if k.__module__ == type(value).__module__
+        ]
+        methods = [m for k in kinds for m in vars(k).values() if inspect.isfunction(m)]
+        own["globals"] = _globals(methods)
     return {**{key: below(item) for key, item in settings.items()}, **own}
 
 
@@ -117,6 +138,92 @@ def _array(array: np.ndarray) -> Any:
         return _describe(array.tolist(), DEPTH)
     content = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
     return {"shape": [*array.shape], "dtype": str(array.dtype), "sha256": content}
+
+
+def _globals(functions: list[types.FunctionType]) -> dict[str, Any]:
+    """Return the global variables that functions use, from function to function.
+
+    Args:
+        functions: Where to begin.
+    """
+    found: dict[str, Any] = {}
+    waiting, seen = [f for f in functions if not _is_library(f)], {*functions}
+    while waiting:
+        function = waiting.pop()
+        changed = _changed_by(function)
+        for name in _names_in(function.__code__) & function.__globals__.keys():
+            value = function.__globals__[name]
+            value = getattr(value, "__wrapped__", value)  # of a cache
+            if isinstance(value, types.FunctionType):
+                if value.__module__ == function.__module__ and value not in seen:
+                    seen.add(value)
+                    waiting.append(value)
+                    defaults = _describe([*(value.__defaults__ or ())], DEPTH)
+                    found[name] = {"source": _source(value), "defaults": defaults}
+            elif name not in changed and not name.startswith("__") and _is_plain(value):
+                found[name] = _describe(_unboxed(value), DEPTH)
+    return found
+
+
+def _names_in(code: types.CodeType) -> set[str]:
+    """Return the names that code uses, that of inner functions too."""
+    inner = (c for c in code.co_consts if isinstance(c, types.CodeType))
+    return {*code.co_names}.union(*map(_names_in, inner))
+
+
+def _changed_by(function: types.FunctionType) -> set[str]:
+    """Return names of what a function changes: counters, caches, buffers."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, SyntaxError):  # typed at a prompt, or a part of a line
+        return set()
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        place: Any = None
+        if isinstance(node, ast.Global):
+            names |= {*node.names}
+        elif isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
+            place = node.value
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            method = node.func.attr
+            is_change = method in CHANGING or method.endswith("_")
+            place = node.func.value if is_change else None
+        while isinstance(place, ast.Subscript):  # as in CACHE["a"].append
+            place = place.value
+        if isinstance(place, ast.Name):
+            names.add(place.id)
+    return names
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a global variable is a setting: numbers and texts, or many."""
+    if isinstance(value, dict):
+        return all(map(_is_plain, (*value.keys(), *value.values())))
+    if isinstance(value, list | tuple | set | frozenset):
+        return all(map(_is_plain, value))
+    if isinstance(value, torch.Tensor):
+        return value.layout == torch.strided and value.device.type != "meta"
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biufcSU"
+    return value is None or isinstance(
+        value, bool | int | float | complex | str | bytes | np.generic
+    )
+
+
+def _unboxed(value: Any) -> Any:
+    """Return a plain value in the types of JSON, and arrays."""
+    if isinstance(value, dict):
+        return {repr(key): _unboxed(item) for key, item in value.items()}
+    if isinstance(value, set | frozenset):
+        return sorted(map(repr, value))
+    if isinstance(value, list | tuple):
+        return [_unboxed(item) for item in value]
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu().double() if value.is_floating_point() else value
+    if isinstance(value, np.generic):
+        value = value.item()
+    is_text = isinstance(value, complex | bytes)
+    return repr(value) if is_text else value
 
 
 def _captured(function: types.FunctionType) -> dict[str, Any]:
@@ -148,3 +255,9 @@ def _source(thing: Any) -> str | None:
         return hashlib.sha256(inspect.getsource(thing).encode()).hexdigest()[:16]
     except (OSError, TypeError):  # built in, or typed at a prompt
         return None
+
+
+def _is_library(thing: Any) -> bool:
+    """Return whether this library's releases say what it is, and no user."""
+    module = thing.__module__ or ""
+    return module.startswith("sbi_active.") and "tasks" not in module
