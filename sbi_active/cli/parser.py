@@ -7,10 +7,11 @@ at once. A command's module is imported when the command is called.
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any
 
-from sbi_active.cli.campaign_parser import add_campaign_commands
+from sbi_active.cli.campaign_parser import add_campaign_commands, add_trust
 
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
@@ -36,7 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     Parsed arguments have a ``command``: the module of :mod:`sbi_active.cli` and the
     function in it that takes them.
     """
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="sbi-active",
         description="Tune a black-box simulator from a handful of real trials.",
     )
@@ -48,6 +49,15 @@ def make_parser() -> argparse.ArgumentParser:
     _add_criticize(commands)
     add_campaign_commands(commands, METHODS)
     return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Takes for a value what begins like a negative number, as Python 3.14 does."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # Before, -1e-3, -.5e2 and -5,-5 were options that nobody knows.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
 
 class _ShowVersion(argparse.Action):
@@ -85,9 +95,9 @@ def _add_run(commands: Any) -> None:
         default="default",
         help="faithful: the paper's network and chained beliefs",
     )
-    run.add_argument("--simulations", type=int, help="to train on, a round")
-    run.add_argument("--samples", type=int, help="for the gain, a candidate action")
-    run.add_argument("--iterations", type=int, help="training steps a round")
+    run.add_argument("--simulations", type=_count, help="to train on, a round")
+    run.add_argument("--samples", type=_count, help="for the gain, a candidate action")
+    run.add_argument("--iterations", type=_count, help="training steps a round")
 
 
 def _add_bank(commands: Any) -> None:
@@ -112,7 +122,7 @@ def _add_bank(commands: Any) -> None:
     )
     build.add_argument("--rows", type=_count, required=True, help="in the bank, in all")
     build.add_argument("--seed", type=int, default=0)
-    build.add_argument("--workers", type=int, default=1, help="processes (1)")
+    build.add_argument("--workers", type=_count, default=1, help="processes (1)")
     inspect = actions.add_parser(
         "inspect", help="show rows and outcomes, and compare checksums"
     )
@@ -127,7 +137,7 @@ def _add_check(commands: Any) -> None:
         description=(
             "Shapes, seeds, noise, lost rows, parameters that change nothing, and the "
             "cost of a campaign. Exit status 1 where something keeps a campaign from "
-            "working. Write negative numbers as in --theta-low=-5,-5."
+            "working."
         ),
     )
     check.set_defaults(command=("check", "check"))
@@ -172,11 +182,11 @@ def _add_criticize(commands: Any) -> None:
             "a sample, with columns trial and time besides, and with input_* in place "
             "of actions that vary in time. start_* is a measured start state. Units "
             "stand in brackets, as in x_height[m], and are those of the simulator. An "
-            "empty cell is what was not measured. Write negative numbers as in "
-            "--theta-low=-5,-5."
+            "empty cell is what was not measured."
         ),
     )
-    criticize.set_defaults(command=("criticize", "criticize"))
+    criticize.set_defaults(command=("criticize", "criticize"), parser=criticize)
+    add_trust(criticize)
     criticize.add_argument(
         "trials",
         metavar="TRIALS.csv",

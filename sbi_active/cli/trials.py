@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
 from typing import Any
 
 from torch import Tensor
@@ -18,7 +16,7 @@ MANY = 5  # numbers, more than somebody types
 def confirm(arguments: argparse.Namespace, campaign: Campaign, trial: Trial) -> int:
     """Print what was recorded, and what comes next."""
     if arguments.json:
-        print(json.dumps(_described(campaign, trial)))
+        arguments.answer = _described(campaign, trial)
         return 0
     x = "" if trial.x is None else f", x = {_short(trial.x)}"
     print(f"trial {trial.index}: {trial.status} at {written(campaign, trial)}{x}")
@@ -33,7 +31,7 @@ def print_status(arguments: argparse.Namespace, campaign: Campaign) -> int:
     belief = _believed(campaign)
     if arguments.json:
         answer = {"trials": told, "belief": belief, "health": campaign.health}
-        print(json.dumps({**answer, "not_in_belief": waiting}))
+        arguments.answer = {**answer, "not_in_belief": waiting}
         return 0
     print(f"{campaign!r}, health {campaign.health}")
     for trial in campaign.state.trials:
@@ -73,7 +71,7 @@ def asked(campaign: Campaign, trial: Trial) -> dict[str, Any]:
     if trial.design is not None:
         gains = trial.design.expected_information_gain[trial.design.index]
         errors = trial.design.standard_error[trial.design.index]
-        gain, error = _finite(gains), _finite(errors)
+        gain, error = float(gains), float(errors)
     return {
         **_described(campaign, trial),
         "target": trial.target,
@@ -83,8 +81,8 @@ def asked(campaign: Campaign, trial: Trial) -> dict[str, Any]:
 
 
 def _described(campaign: Campaign, trial: Trial) -> dict[str, Any]:
-    """Return a trial as JSON: NaN is null."""
-    x = None if trial.x is None else [_finite(v) for v in trial.x.flatten()]
+    """Return a trial as JSON, but for NaN."""
+    x = None if trial.x is None else trial.x.flatten().tolist()
     return {
         "trial": trial.index,
         "status": trial.status,
@@ -96,11 +94,6 @@ def _described(campaign: Campaign, trial: Trial) -> dict[str, Any]:
         "surprise": trial.surprise,
         "reason": trial.reason,
     }
-
-
-def _finite(value: Tensor) -> float | None:
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def written(campaign: Campaign, trial: Trial) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
+import traceback
+from typing import Any
 
 #: What the library says to users of Python, and what that is on the command line.
 WORDS = (
@@ -15,6 +18,8 @@ WORDS = (
     (r"Campaign\.load\(directory, simulator=\.\.\.\)", "sbi-active ask DIR"),
     (r"ask\(\)", "sbi-active ask DIR"),
     (r"load the campaign with repair=True", "run sbi-active repair DIR"),
+    (r"load the campaign with prior=", "add --trust"),
+    (r"simulator_changed=True", "sbi-active update DIR --simulator-changed"),
 )
 
 
@@ -25,12 +30,31 @@ def spoken(text: str, folder: object) -> str:
         text: It names methods of Python.
         folder: Of the campaign.
     """
+    place = str(folder).replace("\\", r"\\")
     for of_python, of_command_line in WORDS:
-        command = of_command_line.replace("DIR", str(folder))
-        text = re.sub(of_python, command, text)
+        text = re.sub(of_python, of_command_line.replace("DIR", place), text)
     return text
 
 
 def say(text: str, folder: object) -> None:
     """Print a text of the library to standard error."""
-    print(f"sbi-active: {spoken(text, folder)}", file=sys.stderr)
+    if sys.stderr is not None:
+        print(f"sbi-active: {spoken(text, folder)}", file=sys.stderr)
+
+
+def place_of(error: BaseException) -> str:
+    """Return where an error was raised, to be added to its text."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, SyntaxError) or not frames:  # whose text has it
+        return ""
+    return f" ({frames[-1].filename}, line {frames[-1].lineno})"
+
+
+def as_json(value: Any) -> Any:
+    """Return an answer as JSON has it: null for a number that is not finite."""
+    if isinstance(value, dict):
+        return {key: as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in value]
+    is_number = not isinstance(value, float) or math.isfinite(value)
+    return value if is_number else None

@@ -30,6 +30,7 @@ from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.signatures import keywords_of, parameters_of, takes_rng
 from sbi_active.simulation.simulator import (
+    PAIRED,
     outcome_array,
     outcome_tensor,
     require_rows,
@@ -142,6 +143,7 @@ class SimulatorModel:
             )
         self._token = uuid.uuid4().hex
         self._is_deterministic: bool | None = None
+        self._square: int | None = None  # rows of an x that is as wide as it is long
 
     def __call__(
         self,
@@ -299,6 +301,7 @@ class SimulatorModel:
                 keywords["seeds"] = _copied(seeds)
             x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
+        self._require_own_rows(x)
         names = self.channel_names
         # A trajectory of one channel has no axis of its own for it.
         sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
@@ -308,6 +311,15 @@ class SimulatorModel:
                 f"{tuple(x.shape)}; name the entries of its last axis"
             )
         return x
+
+    def _require_own_rows(self, x: Tensor) -> None:
+        """Raise where x has a number for each pair of rows, at two numbers of rows."""
+        num_rows = len(x)
+        if num_rows == 1 or x.shape != (num_rows, num_rows):
+            return
+        if self._square not in (None, num_rows):
+            raise ValueError(PAIRED.format(n=num_rows, other=self._square))
+        self._square = num_rows
 
     def _own_conditions(
         self, theta: Tensor, action: Tensor, given: Mapping[str, Any]

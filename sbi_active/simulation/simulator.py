@@ -12,6 +12,13 @@ from sbi_active.arrays import all_finite, measured, own_tensor
 
 FEW_VALUES = 4  # outcomes for each whole number among them, at least: they are counts
 
+#: Of an x with a number for each pair of rows, as where (n,) meets (n, 1).
+PAIRED = (
+    "expected x of one shape a row; got ({n}, {n}), and ({other}, {other}) of {other} "
+    "rows, as where theta[:, 0] of shape (n,) meets action of shape (n, 1); index both "
+    "alike, as in theta[:, :1]"
+)
+
 
 class Simulator(Protocol):
     """What users bring: a draw from p(x | theta, action), one row a parameter set.

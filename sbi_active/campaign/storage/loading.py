@@ -21,10 +21,12 @@ from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent
 from sbi_active.campaign.storage.described import (
     actions_from,
+    describe_options,
     options_from,
     prior_from,
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
+from sbi_active.campaign.storage.drawn import drawn_from, stood_for
 from sbi_active.campaign.storage.manifest import require_same_simulator
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
@@ -84,7 +86,7 @@ class StoredLearner:
         saved, self._saved = self._saved, None
         if saved is not None:
             try:
-                self._belief = saved()
+                self._belief = stood_for(saved(), self.first_prior, self._state)
             except ValueError as error:
                 warn(f"the belief has to be computed again: {error}", stacklevel=3)
                 self._state.is_stale = True
@@ -126,8 +128,17 @@ def load(
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest = disk.manifest
     settings: CampaignOptions = _given("options", options, manifest, options_from)
-    space: ActionSpace = _given("actions", actions, manifest, actions_from)
-    first_prior: Distribution = _given("prior", prior, manifest, prior_from)
+    if options is not None and describe_options(options) != manifest["options"]:
+        warn(
+            f"options= hold for this process: the campaign in {directory} keeps "
+            f"{manifest['options_text']}; pass them at each load",
+            stacklevel=4,
+        )
+    reads = simulator is None
+    space: ActionSpace = _given("actions", actions, manifest, actions_from, reads=reads)
+    first_prior: Distribution = _given(
+        "prior", prior, manifest, prior_from, reads=reads
+    )
     state = CampaignState(
         manifest["method"],
         manifest["seed"],
@@ -183,11 +194,22 @@ def _belief(
 
 
 def _given(
-    what: str, given: Any, manifest: dict[str, Any], made: Callable[[Any], Any]
+    what: str,
+    given: Any,
+    manifest: dict[str, Any],
+    made: Callable[[Any], Any],
+    *,
+    reads: bool = False,
 ) -> Any:
-    """Return what was passed, or else what the manifest describes."""
+    """Return what was passed, or else what the manifest describes.
+
+    Readers get what stands for it where it is a class of its author's own.
+    """
     if given is not None:
         return given
+    drawn = manifest.get("drawn", {}).get(what)  # earlier files have none
+    if reads and drawn is not None:
+        return drawn_from(drawn)
     if manifest[what] is None:
         raise ValueError(
             f"expected {what}=, which only its author can make again; got None; pass "

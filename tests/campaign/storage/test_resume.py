@@ -261,7 +261,14 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     )
     go_on(campaign, 1).close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
-        Campaign.load(tmp_path / "c")
+        Campaign.load(tmp_path / "c", simulator=drawn, cost=price)
+    reader = Campaign.load(tmp_path / "c")  # by the draws that are kept
+    scale = campaign.belief.variance.sqrt()
+    assert ((reader.belief.mean - campaign.belief.mean).abs() < 0.2 * scale).all()
+    assert reader.belief.diagnostics == campaign.belief.diagnostics
+    assert torch.equal(reader.prior.mean, prior.mean)
+    with pytest.raises(ValueError, match="load the campaign with prior="):
+        reader.belief.log_prob(torch.zeros(2))
     with pytest.raises(ValueError, match="expected cost= as declared; got none"):
         Campaign.load(tmp_path / "c", simulator=drawn, prior=prior)
     again = Campaign.load(tmp_path / "c", simulator=drawn, prior=prior, cost=price)
