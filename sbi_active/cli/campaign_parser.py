@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -84,7 +83,7 @@ def add_trust(command: argparse.ArgumentParser) -> None:
 def utf8(given: str) -> str:
     """Return a word of the command line as text, in UTF-8 whatever the locale."""
     try:
-        return os.fsencode(given).decode()
+        return given.encode(errors="surrogateescape").decode()
     except UnicodeError:
         raise argparse.ArgumentTypeError(
             f"expected text in UTF-8; got {given!a}"

@@ -39,7 +39,17 @@ def spoken(text: str, folder: object) -> str:
 def say(text: str, folder: object) -> None:
     """Print a text of the library to standard error."""
     if sys.stderr is not None:
-        print(f"sbi-active: {spoken(text, folder)}", file=sys.stderr)
+        print(f"sbi-active: {spoken(_briefly(text), folder)}", file=sys.stderr)
+
+
+def _briefly(text: str) -> str:
+    """Return a text with the last line of each traceback in it, and its place."""
+
+    def last(found: re.Match[str]) -> str:
+        frames = re.findall(r'File "(.*)", line (\d+)', found[0])
+        return found[1] + (f" ({', line '.join(frames[-1])})" if frames else "")
+
+    return re.sub(r"Traceback \(most recent call last\):\n(?: .*\n)*(.*)", last, text)
 
 
 def place_of(error: BaseException) -> str:

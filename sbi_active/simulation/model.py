@@ -30,10 +30,10 @@ from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 from sbi_active.simulation.signatures import keywords_of, parameters_of, takes_rng
 from sbi_active.simulation.simulator import (
-    PAIRED,
     outcome_array,
     outcome_tensor,
     require_rows,
+    square_of,
 )
 
 FEW = 8  # rows that show whether fn is random
@@ -143,7 +143,7 @@ class SimulatorModel:
             )
         self._token = uuid.uuid4().hex
         self._is_deterministic: bool | None = None
-        self._square: int | None = None  # rows of an x that is as wide as it is long
+        self._square: int | None = None
 
     def __call__(
         self,
@@ -301,7 +301,7 @@ class SimulatorModel:
                 keywords["seeds"] = _copied(seeds)
             x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
-        self._require_own_rows(x)
+        self._square = square_of(x, self._square)
         names = self.channel_names
         # A trajectory of one channel has no axis of its own for it.
         sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
@@ -311,15 +311,6 @@ class SimulatorModel:
                 f"{tuple(x.shape)}; name the entries of its last axis"
             )
         return x
-
-    def _require_own_rows(self, x: Tensor) -> None:
-        """Raise where x has a number for each pair of rows, at two numbers of rows."""
-        num_rows = len(x)
-        if num_rows == 1 or x.shape != (num_rows, num_rows):
-            return
-        if self._square not in (None, num_rows):
-            raise ValueError(PAIRED.format(n=num_rows, other=self._square))
-        self._square = num_rows
 
     def _own_conditions(
         self, theta: Tensor, action: Tensor, given: Mapping[str, Any]

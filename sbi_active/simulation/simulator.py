@@ -12,13 +12,6 @@ from sbi_active.arrays import all_finite, measured, own_tensor
 
 FEW_VALUES = 4  # outcomes for each whole number among them, at least: they are counts
 
-#: Of an x with a number for each pair of rows, as where (n,) meets (n, 1).
-PAIRED = (
-    "expected x of one shape a row; got ({n}, {n}), and ({other}, {other}) of {other} "
-    "rows, as where theta[:, 0] of shape (n,) meets action of shape (n, 1); index both "
-    "alike, as in theta[:, :1]"
-)
-
 
 class Simulator(Protocol):
     """What users bring: a draw from p(x | theta, action), one row a parameter set.
@@ -112,6 +105,29 @@ def require_rows(theta: Tensor, action: Tensor) -> None:
                 f"expected finite {name}; got {rows[first].tolist()} in row {first}; "
                 "remove NaN and inf"
             )
+
+
+def square_of(x: Tensor, before: int | None) -> int | None:
+    """Return the rows of the last x that was as wide as it was long.
+
+    Args:
+        x: Outcomes, shape (n, *x_shape).
+        before: What this returned for earlier ones; None for none.
+
+    Raises:
+        ValueError: If that was so for two numbers of rows: each outcome has a number
+            for each row.
+    """
+    num_rows = len(x)
+    if num_rows == 1 or x.shape != (num_rows, num_rows) or before == num_rows:
+        return before
+    if before is None:
+        return num_rows
+    raise ValueError(
+        f"expected x of one shape a row; got {tuple(x.shape)}, and {(before, before)} "
+        f"of {before} rows, as where theta[:, 0] of shape (n,) meets action of shape "
+        "(n, 1); index both alike, as in theta[:, :1]"
+    )
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:
