@@ -11,7 +11,11 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sbi_active.cli.campaign_parser import add_campaign_commands, add_trust
+from sbi_active.cli.campaign_parser import (
+    add_campaign_commands,
+    add_trust,
+    utf8,
+)
 
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
@@ -204,6 +208,7 @@ def _add_criticize(commands: Any) -> None:
     )
     criticize.add_argument(
         "--columns",
+        type=utf8,
         nargs="+",
         metavar="KEY=NAME[,NAME...]",
         help="columns that are trial, time, action, x, input, start, role, index or "
@@ -212,6 +217,7 @@ def _add_criticize(commands: Any) -> None:
     )
     criticize.add_argument(
         "--units",
+        type=utf8,
         nargs="+",
         metavar="NAME=UNIT",
         help="of columns without a unit in the header",

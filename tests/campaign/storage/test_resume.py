@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pickle
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -240,6 +241,18 @@ def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
         Campaign.load(tmp_path / "c", simulator=drawn, options={"rows": 3})
     with pytest.raises(TypeError, match="expected an action space or a list"):
         Campaign.load(tmp_path / "c", simulator=drawn, actions="fast")
+
+
+def test_options_of_a_load_are_said_to_hold_for_one_process(tmp_path):
+    new(tmp_path / "c").close()
+    own = Campaign.load(tmp_path / "c").state.options
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Campaign.load(tmp_path / "c", simulator=drawn, options=own)
+    other = replace(own, num_samples=own.num_samples + 1)
+    with pytest.warns(UserWarning, match="hold for this process"):
+        Campaign.load(tmp_path / "c", simulator=drawn, options=other)
+    assert Campaign.load(tmp_path / "c").state.options == own
 
 
 def price(action):
