@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.designer import Design
+from sbi_active.page.page import legible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -134,7 +135,7 @@ def save(figure: Figure, path: str) -> None:
     """Write a figure and free it."""
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, dpi=110)
+    legible(figure).savefig(path, dpi=110)
     plt.close(figure)
 
 

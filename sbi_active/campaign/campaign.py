@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +16,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.campaign.display.progress import StageWatch, rounds
-from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
@@ -141,6 +142,7 @@ class Campaign(CampaignTrials):
     def _begin(
         self, state: CampaignState, actions: ActionSpace, learner: Any, planner: Planner
     ) -> None:
+        self._guard = threading.RLock()
         self.state, self.actions = state, actions
         self._learner, self._planner = learner, planner
 
@@ -218,6 +220,7 @@ class Campaign(CampaignTrials):
         self._storage = Storage(found.disk, found.state.options.bank, found.prior)
         return self
 
+    @guarded
     def close(self) -> None:
         """Let other processes write to the directory; the next call takes it again."""
         self._storage.close()
@@ -230,7 +233,11 @@ class Campaign(CampaignTrials):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy is in memory alone: a directory belongs to one campaign.
-        return {**vars(self), "_storage": Storage(prior=self.first_prior)}
+        own = {**vars(self), "_storage": Storage(prior=self.first_prior)}
+        return {name: part for name, part in own.items() if name != "_guard"}
+
+    def __setstate__(self, own: dict[str, Any]) -> None:
+        vars(self).update(own, _guard=threading.RLock())
 
     @property
     @stored
@@ -318,8 +325,7 @@ class Campaign(CampaignTrials):
         It ends early where :attr:`stop_reason` gives one; a trial that was designed by
         then stays pending.
 
-        An exception of the real system passes through; the trial stays pending, and
-        the next ``run`` goes on with it.
+        An exception of the real system passes through; the trial stays pending.
 
         Args:
             real_system: Takes an action, shape (action_dim,), and gives x.
@@ -368,9 +374,8 @@ class Campaign(CampaignTrials):
             evaluate=evaluate,
             designed=find_method(self.state.method).designs,
         )
-        chosen = [*report.tracing.chosen]
-        found = {"digest": report.digest, "verdict": report.verdict, "chosen": chosen}
-        self._storage.write("examined", **found)
+        found = {"digest": report.digest, "verdict": report.verdict}
+        self._storage.write("examined", **found, chosen=[*report.tracing.chosen])
         return report
 
     @stored
@@ -387,8 +392,7 @@ class Campaign(CampaignTrials):
             The belief over (theta, phi).
 
         Raises:
-            ValueError: If the verdict names none, or the report belongs to another
-                model than the current one.
+            ValueError: If the verdict names none, or is of another model.
         """
         self.update()
         self._learner = revise(self.state, self.actions, report)

@@ -26,3 +26,18 @@ def isolated(method: Method) -> Method:
             return method(*arguments, **options)
 
     return apart  # type: ignore[return-value]
+
+
+def guarded(method: Method) -> Method:
+    """Return a method of a campaign that one thread at a time runs.
+
+    A trial that is told while another thread designs or learns waits for it: both
+    change the same history.
+    """
+
+    @functools.wraps(method)
+    def alone(campaign: Any, *arguments: Any, **options: Any) -> Any:
+        with campaign._guard:
+            return method(campaign, *arguments, **options)
+
+    return alone  # type: ignore[return-value]

@@ -12,8 +12,8 @@ import cloudpickle
 
 from sbi_active.campaign.stopping import StopRules
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.state import UNSCORED, Status, Trial
 from sbi_active.campaign.telling import find_trial, new_trial, told_trial
 from sbi_active.campaign.view import CampaignView
@@ -24,6 +24,7 @@ class CampaignTrials(CampaignView):
 
     on_trial: Callable[[Trial], None] | None
 
+    @guarded
     @isolated
     def tell(
         self,
@@ -67,6 +68,7 @@ class CampaignTrials(CampaignView):
         )
         return self._record("corrected" if again else "told", told)
 
+    @guarded
     def attach(
         self,
         action: Tensor | np.ndarray | Sequence[float] | float,
@@ -90,6 +92,7 @@ class CampaignTrials(CampaignView):
         told = self._checked(x, trial=new, action=action, status=status)
         return self._record("attached", told)
 
+    @guarded
     def correct(
         self,
         trial: Trial | int,
@@ -145,6 +148,7 @@ class CampaignTrials(CampaignView):
             self.on_trial(trial)
         return trial
 
+    @guarded
     def withdraw(self, trial: Trial | int, *, reason: str = "") -> Trial:
         """Take a trial out; it stays in the history, with the status "withdrawn".
 

@@ -20,6 +20,7 @@ from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
+from sbi_active.page.page import legible
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -224,7 +225,7 @@ class CampaignView:
         Raises:
             ValueError: If ``theta_true`` has more numbers than there are parameters.
         """
-        return plot_campaign(
+        figure = plot_campaign(
             self.state,
             None if self.simulator is None else self._learner.at,
             self.prior,
@@ -232,3 +233,4 @@ class CampaignView:
             theta_true=theta_true,
             num_predicted=0 if self.state.meter.limit else num_predicted,
         )
+        return legible(figure)

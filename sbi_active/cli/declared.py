@@ -100,8 +100,9 @@ def _is_texts(value: Any) -> bool:
 
 def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
     """Write where everything is, and remember that it was written here."""
-    text = json.dumps(declared, indent=2) + "\n"
-    (folder / DECLARED).write_text(text, encoding="utf-8")
+    from sbi_active.simulation.bank.segments import write_file
+
+    write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
     _remember(folder)
 
 

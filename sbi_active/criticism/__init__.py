@@ -40,7 +40,7 @@ __getattr__ = former_names(
         "JointPrior": "sbi_active.criticism.effects:JointPrior",
         "NextAction": "sbi_active.criticism.results:NextAction",
         "Residuals": "sbi_active.criticism.results:Residuals",
-        "SevereTest": "sbi_active.criticism.results:SevereTest",
+        "SevereTest": "sbi_active.criticism.contradictions:SevereTest",
         "Tracing": "sbi_active.criticism.results:Tracing",
     },
 )

@@ -25,6 +25,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.screening.screening import Screening
 from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.leave_one_out import leave_one_out
+from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
@@ -76,7 +77,8 @@ def report_of(
         exploratory: The same.
     """
     tracing = loop.judged(evaluation)
-    if tracing.refuted and held_out is not None:
+    is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
+    if is_withdrawn and evaluation is not None and held_out is not None:
         evaluation = evaluate_held_out(loop.rivals, tracing, held_out)
     simulator, prior = loop.add(tracing.chosen)
     space = loop.actions if plan else None
@@ -112,5 +114,23 @@ def report_of(
         exploratory=exploratory,
         leave_one_out=left_out,
         severe_tests=tests,
-        warnings=(*given,),
+        warnings=(*given, *_outlying(loop, tracing)),
     )
+
+
+def _outlying(loop: Steps, tracing: Tracing) -> list[str]:
+    """Return which fitted trials err far more than the others, a sentence each."""
+    misfit = tracing.misfit
+    trials = loop.rivals.trials
+    if misfit is None or misfit.left_out != "trials":
+        return []
+    squares = misfit.of(tracing.model).parts
+    measured = [k for k, valid in enumerate(trials.valid.tolist()) if valid]
+    if len(squares) != len(measured):  # a trial that no other tells about
+        return []
+    return [
+        f"trial {trials.names[measured[k]]} is far outside what the other trials show: "
+        f"its error on the fit to them is {times:.3g} times theirs; check its record "
+        "and its unit, and see what the verdict is without it"
+        for k, times in outlying_trials(squares)
+    ]

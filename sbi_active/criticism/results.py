@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.criticism.contradictions import Bounds, MissedTrial
 from sbi_active.criticism.under_misfit import Misfit
 
 Array = NDArray[Any]
@@ -263,8 +264,9 @@ class Tracing:
         instead_of: Effects that the evidence is for and the verdict does not name,
             since a trial that may have a gross error alone speaks for them, or further
             trials speak against them; "" for none.
-        refuted: The RMSE of these further trials before and after, which is why;
-            None where it is not.
+        refuted: The RMSE of these further trials, or of left-out ones, before and
+            after, which is why; None where it is not.
+        refuted_on: Which trials these are; "" for all that had no part in the verdict.
         misfit: Why, where every model misses by more than the sensor's error. Effects
             that help are then ``chosen``, those that are probably the cause are the
             verdict, and the rest stand in ``beside``.
@@ -274,6 +276,7 @@ class Tracing:
         p_value: Tail probability of the chi-square of the verdict's model, its
             parameters all taken as determined; NaN where nobody asked.
         log_process: Log Bayes factor of a residual process beside that model, nats.
+        bounds: Parameters at bounds of the prior, and what a wider one would give.
     """
 
     verdict: str
@@ -293,11 +296,13 @@ class Tracing:
     needed: tuple[float, ...] = ()
     instead_of: str = ""
     refuted: tuple[float, float] | None = None
+    refuted_on: str = ""
     misfit: Misfit | None = None
     trial_names: dict[float, str] = field(default_factory=dict)
     stand_in: tuple[str, ...] = ()
     p_value: float = float("nan")
     log_process: float = -float("inf")
+    bounds: Bounds = Bounds()
 
     @property
     def key(self) -> ModelKey:
@@ -335,6 +340,7 @@ class Evaluation:
         names: What each scored trial is called; empty for its position.
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
+        missed: Held-out trials far outside what that model predicts, farthest first.
     """
 
     scheme: Literal["held out", "leave one out"]
@@ -345,6 +351,7 @@ class Evaluation:
     selected: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     p_value: float = float("nan")
+    missed: tuple[MissedTrial, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,20 +388,3 @@ class NextAction:
     within_gain: float = 0.0
     beyond: Array | None = None
     beyond_gain: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class SevereTest:
-    """An action at which a verdict that names effects would be put to the test.
-
-    Attributes:
-        action: Shape (action_dim,).
-        is_permitted: Whether it is among the permitted actions.
-        difference: Between the verdict's prediction and that of a free residual, root
-            mean square over the numbers of x, in standard deviations of the verdict's
-            prediction, noise included.
-    """
-
-    action: Array
-    is_permitted: bool
-    difference: float

@@ -113,6 +113,8 @@ class ModelError:
         left_out: Root mean square on left-out trials by channel, units of x, (c,).
         held_out: The same on held-out trials; None without any.
         remains: Share of the bare model's excess error on left-out trials.
+        parts: Mean squared error of each left-out trial, or part of one, in sensor
+            variances, (f,); empty where nobody asked.
     """
 
     name: str
@@ -120,6 +122,7 @@ class ModelError:
     left_out: Array
     held_out: Array | None
     remains: float
+    parts: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

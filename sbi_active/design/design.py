@@ -12,6 +12,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.design.drawing import draw, labels_of
 from sbi_active.information_gain.base import Bound
 from sbi_active.notebook import Markup, card, facts, items, number, table
+from sbi_active.page.page import legible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -143,7 +144,9 @@ class Design:
             The axes; where there are several panels the ones around them, whose
             ``child_axes`` they are.
         """
-        return draw(self, ax)
+        drawn = draw(self, ax)
+        legible(drawn.get_figure(root=True))
+        return drawn
 
 
 def action_name(actions: ActionSpace) -> str:

@@ -34,8 +34,8 @@ from sbi_active.diagnostics.calibration import Verdict, worst
 from sbi_active.diagnostics.check import is_campaign
 from sbi_active.diagnostics.log_score import smooth
 from sbi_active.inference.beliefs.belief import names_of
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.stages import refine
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.refinement.refining import refine
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 

@@ -130,8 +130,9 @@ class Calibration:
     def plot(self) -> Figure:
         """Draw ranks as sbi does, coverage, and gaps and coverage by stratum."""
         from sbi_active.diagnostics.figure import plot_calibration
+        from sbi_active.page.page import legible
 
-        return plot_calibration(self)
+        return legible(plot_calibration(self))
 
 
 def describe(stratum: Stratum) -> str:

@@ -5,12 +5,12 @@ which part. Which action comes next lives in ``design``.
 """
 
 from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.ratio_network import RatioClassifier
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.stages import refine
+from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import ActionEmbedding
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.alhi import ALHI

@@ -11,8 +11,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from sbi_active.callers import stack_level
+from sbi_active.criticism.data.table_rows import (
+    is_stamp,
+    read_csv,
+    require_real,
+    seconds,
+)
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.mujoco.models.names import names_of, start_places
+from sbi_active.messages import warn
+from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
 
 __all__ = ["require_in_range", "trials_of"]
@@ -23,6 +31,13 @@ TIME = "time"
 START = "start "
 #: Relative excess over a range that is rounding.
 SLACK = 1e-6
+#: Time steps between two samples, beyond which a log looks like one in ms: a sample
+#: every 2 s at MuJoCo's default step; a log at 50 Hz in ms has ten times as many.
+MOST_APART = 1_000
+#: Time steps before the first sample, beyond which a time is one of a clock.
+MOST_STEPS = 1e7
+#: Times a joint's range, beyond which an angle looks like degrees, 57 times a radian.
+DEGREES = 10.0
 
 
 def trials_of(
@@ -36,7 +51,8 @@ def trials_of(
 
     Each has a column "time", s from the start of the trial, one of each input and one
     of each sensor, and may have "start hinge" or "start hinge velocity", of which the
-    first row counts. A sensor may have NaN where it was not read; an input is held.
+    first row counts. Where a sensor is called as an input, the input's column is
+    "hinge control". A sensor may have NaN where it was not read; an input is held.
 
     Args:
         model: Compiled.
@@ -59,6 +75,9 @@ def trials_of(
     ]
     times = [frame[TIME].to_numpy(float) for frame in frames]
     x = [frame[names].to_numpy(float) for frame in frames]
+    for k, values in enumerate(x):
+        for channel, own in zip(channels, values.T, strict=True):
+            _note_angles(model, channel, own, f"recording {k}")
     if len(names) == 1:
         x = [part[:, 0] for part in x]
     same = all(t.shape == times[0].shape and (t == times[0]).all() for t in times)
@@ -67,7 +86,10 @@ def trials_of(
         None,
         x,
         sample_times=times[0] if same else times,
-        inputs={name: [f[name].to_numpy(float) for f in frames] for name in inputs}
+        inputs={
+            name: [f[_column(name, f, names)].to_numpy(float) for f in frames]
+            for name in inputs
+        }
         or None,
         input_times=times if inputs else None,
         start={
@@ -110,11 +132,12 @@ def _frame(
     what = f"recording {k}"
     if isinstance(given, str | Path):
         what = f"{what} ({given})"
-        given = pd.read_csv(given, comment="#")
+        given = read_csv(Path(given))
     frame = pd.DataFrame(given)
     frame.columns = [str(c).strip() for c in frame.columns]
-    starts = [START + name for name in start_places(model)]
-    wanted = [TIME, *inputs, *names]
+    starts = [START + name for name in (*start_places(model), *held_places(model))]
+    controls = [_column(name, frame, names) for name in inputs]
+    wanted = [TIME, *controls, *names]
     spare = [c for c in frame.columns if c not in {*wanted, *starts}]
     for name in wanted:
         if name not in frame.columns:
@@ -131,7 +154,8 @@ def _frame(
                 f"expected start states of joints in {what}; got {name!r}; did you "
                 f"mean {near[0]!r}?"
             )
-    for name in [TIME, *inputs]:
+    frame = _as_numbers(frame, wanted + [c for c in frame if c in starts], what)
+    for name in [TIME, *controls]:
         lost = np.flatnonzero(~np.isfinite(frame[name].to_numpy(float)))
         if len(lost):
             raise ValueError(
@@ -144,6 +168,91 @@ def _frame(
             f"expected a time that increases in {what}; got {frame[TIME][row]:g} in "
             f"row {row}; sort the log, and split it where it starts again"
         )
-    for name in inputs:
-        require_in_range(model, name, frame[name].to_numpy(float), what)
+    _require_seconds(frame[TIME].to_numpy(float), float(model.opt.timestep), what)
+    for name, column in zip(inputs, controls, strict=True):
+        require_in_range(model, name, frame[column].to_numpy(float), what)
     return frame
+
+
+def _as_numbers(frame: pd.DataFrame, names: Sequence[str], what: str) -> pd.DataFrame:
+    """Return a log whose columns are numbers, dates as seconds since the first."""
+    frame = frame.copy()
+    for name in names:
+        cells = frame[name]
+        if name == TIME and is_stamp(cells):
+            frame[name] = seconds(cells, what)
+            continue
+        require_real(cells, name, what)
+        blank = cells.map(lambda cell: str(cell).strip() == "")
+        numbers = pd.to_numeric(cells.where(~blank), errors="coerce")
+        wrong = np.flatnonzero(numbers.isna() & cells.notna() & ~blank)
+        if len(wrong) and str(cells.iloc[wrong[0]]).strip().lower() != "nan":
+            raise ValueError(
+                f"expected numbers in column {name!r} of {what}; got "
+                f"{cells.iloc[wrong[0]]!r} in row {wrong[0]}; correct it, or leave "
+                "what was not read empty"
+            )
+        frame[name] = numbers
+    return frame
+
+
+def _require_seconds(time: Array, step: float, what: str) -> None:
+    """Raise or warn where times can hardly be seconds from the start of a trial.
+
+    Args:
+        time: Times of a log, which increase, shape (k,).
+        step: Time step of the model, s.
+        what: Name of the log in messages.
+    """
+    if len(time) and (time[0] < 0 or time[0] > MOST_STEPS * step):
+        raise ValueError(
+            f"expected times from the start of the trial in {what}; got {time[0]:g} s "
+            "at first; subtract the time at which the trial starts"
+        )
+    spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if spacing > MOST_APART * step:
+        warn(
+            f"{what} has a sample every {spacing:g} s, {spacing / step:,.0f} time "
+            f"steps of {step:g} s, and asks for {time[-1] / step:,.0f} steps: is its "
+            "time in ms? Convert it to seconds, or raise the time step",
+            stacklevel=stack_level(),
+        )
+
+
+def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
+    """Warn of angles that wrap, or that look like degrees.
+
+    Args:
+        model: Compiled model.
+        channel: What was read; angles are those in rad.
+        x: Readings, shape (k,).
+        what: Name of the log in messages.
+    """
+    seen = x[np.isfinite(x)]
+    if channel.unit != "rad" or len(seen) < 2:
+        return
+    jumps = np.abs(np.diff(seen))
+    for turn, unit in ((2 * np.pi, "2 pi"), (360.0, "360")):
+        wraps = np.abs(jumps - turn) < 0.1 * turn
+        if wraps.any() and np.median(jumps) < 0.2 * turn:
+            warn(
+                f"{channel.name} in {what} jumps by about {unit} in {int(wraps.sum())} "
+                "places, as an angle that wraps: pass numpy.unwrap of it",
+                stacklevel=stack_level(),
+            )
+    names = names_of(model, "joint")
+    if channel.name in names:
+        joint = names.index(channel.name)
+        limit = float(np.abs(model.jnt_range[joint]).max())
+        if model.jnt_limited[joint] and np.abs(seen).max() > DEGREES * limit:
+            warn(
+                f"{channel.name} in {what} reaches {np.abs(seen).max():g}, where its "
+                f"joint's range ends at {limit:g} rad: are these degrees? Convert them",
+                stacklevel=stack_level(),
+            )
+
+
+def _column(name: str, frame: pd.DataFrame, sensors: Sequence[str]) -> str:
+    """Return the column of an input; one that a sensor shares is the sensor's."""
+    own = f"{name} control"
+    return own if name in sensors or own in frame.columns else name

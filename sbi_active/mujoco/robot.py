@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from sbi.utils import BoxUniform
 from torch import Tensor
 
@@ -17,6 +18,8 @@ from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
+    held_places,
+    meaning,
     names_of,
     require_name,
     start_places,
@@ -48,6 +51,11 @@ def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
     vars(box)["names"] = tuple(p.name for p in parameters)
     vars(box)["units"] = tuple(p.unit for p in parameters)
     return box
+
+
+#: Time steps before the first reading, beyond which a time is taken for one of a clock:
+#: hours at MuJoCo's default step of 2 ms. Half and twice refuse the same.
+MOST_STEPS = 1e7
 
 
 class Robot(NamedTuple):
@@ -97,15 +105,19 @@ def from_mjcf(
             "hinge" or "hinge velocity", for which it has no sensor.
         actions: What is chosen in each trial, beside a signal too: its names are
             joints (start positions), joints with ``" velocity"`` behind, actuators
-            (a control that is held), or "model".
+            (a control that is held), or "model". A name that a joint and an actuator
+            share is the actuator's; the joint's start is then "hinge position".
         times: At which sensors are read, s from the start of a trial, shape (k,); None
             takes those of the inputs, of the recordings, or they come with the trials.
         noise: Of the sensors, as ``SimulatorModel`` takes it, or standard deviations by
             sensor; None takes ``noise`` of the sensors in the MJCF, where it is given.
-        start: Of every trial whose action or recording does not say: positions and
-            velocities by name, or the name of a keyframe. None is the model's.
+        start: Start of every trial whose action or recording does not say: positions,
+            velocities, controls that are held ("motor control") and poses of mocap
+            bodies ("target mocap[0]") by name, or the name of a keyframe, which gives
+            all of these. None is the model's.
         recordings: Logs, one a trial, as in :func:`.trials_of`.
-        threads: Of MuJoCo's rollout, in each process. Results do not depend on it.
+        threads: Number of threads of MuJoCo's rollout, in each process. Results do
+            not depend on it.
 
     Raises:
         ValueError: If the MJCF does not compile, a name does not exist (the nearest are
@@ -130,6 +142,8 @@ def from_mjcf(
     declared = bounded(sources[0].compile(), parameters)
     machines = [Machine(source, declared) for source in sources]
     require_alike(machines)
+    for each in machines:
+        each.require_inertia()
     machine = machines[0]
     channels = channels_of(machine.model, sensors)
     space, driven = _inputs(machine.model, inputs)
@@ -142,6 +156,8 @@ def from_mjcf(
     if times is None and space is not None:
         times = space.input_times
     grid = None if times is None else np.asarray(times, dtype=np.float64)
+    if grid is not None:
+        _require_times(grid, float(machine.model.opt.timestep))
     function = MujocoFunction(
         machines,
         channels,
@@ -218,15 +234,25 @@ def _actions(
     """Return the actions, and what each entry sets in the model; "" for a signal's."""
     if actions is None:
         return space, ()
-    held = names_of(model, "actuator")
-    if space is not None:
-        held = [n for n in held if n not in space.inputs(space.sample((1,), seed=0))]
-    known = [*start_places(model), *held, MODEL]
+    played = [] if space is None else [*space.inputs(space.sample((1,), seed=0))]
+    controls = [n for n in names_of(model, "actuator") if n not in played]
+    places = [*start_places(model), *held_places(model)]
+    known = [*places, *controls, *(f"{n} position" for n in names_of(model, "joint"))]
     for k, name in enumerate(actions.names):
-        require_name(name, known, "joint, a joint with ' velocity', or an actuator")
-        if name in held:
+        require_name(
+            *(name, [*known, MODEL]),
+            "joint, a joint with ' velocity', or an actuator",
+        )
+        sets = meaning(name, model)
+        control = sets.removesuffix(" control") if sets.endswith(" control") else ""
+        if control in played:
+            raise ValueError(
+                f"expected {name!r} to be set once; got an action and a signal of this "
+                f"actuator; call the start of a joint '{name} position'"
+            )
+        if control in controls:
             drawn = actions.sample((64,), seed=0)[:, k]
-            require_in_range(model, name, drawn.numpy(), "an action")
+            require_in_range(model, control, drawn.numpy(), "an action")
     if space is None:
         return actions, (*actions.names,)
     return MixedActions(space, actions), (*[""] * space.action_dim, *actions.names)
@@ -237,14 +263,34 @@ def _start(
 ) -> dict[str, float] | None:
     if start is None:
         return None
-    places = start_places(model)
     if isinstance(start, str):
         i = element_id(model, "key", start)
         state = [*model.key_qpos[i], *model.key_qvel[i], *model.key_act[i]]
-        return {name: float(state[place]) for name, place in places.items()}
+        held = [*model.key_ctrl[i], *model.key_mpos[i], *model.key_mquat[i]]
+        return {
+            **{name: float(state[at]) for name, at in start_places(model).items()},
+            **{name: float(held[at]) for name, at in held_places(model).items()},
+        }
+    known = [*start_places(model), *held_places(model)]
     for name in start:
-        require_name(name, places, "joint, or one with ' velocity',")
+        require_name(name, known, "joint, or one with ' velocity',")
     return {name: float(value) for name, value in start.items()}
+
+
+def _require_times(times: NDArray[Any], step: float) -> None:
+    """Raise where times are not seconds from the start of a trial."""
+    increase = times.ndim == 1 and len(times) > 0 and (np.diff(times) > 0).all()
+    if not (increase and np.isfinite(times).all() and times[0] >= 0):
+        raise ValueError(
+            "expected times that increase from 0 s on, shape (k,); got "
+            f"{np.array2string(times, threshold=6)}; count them from the trial's start"
+        )
+    if times[0] > MOST_STEPS * step:
+        raise ValueError(
+            f"expected times from the start of a trial; got a first one of "
+            f"{times[0]:g} s, {times[0] / step:.0e} time steps of {step:g} s; subtract "
+            "the time at which the trial starts"
+        )
 
 
 def _noise(model: Any, channels: Sequence[Any], noise: Any) -> Any:

@@ -13,8 +13,14 @@ from torch import Tensor
 
 from sbi_active.mujoco.models.changes import StateChange, require_changes
 from sbi_active.mujoco.models.machine import Machine, Model, Rows
-from sbi_active.mujoco.models.names import names_of, require_name, start_places
-from sbi_active.mujoco.models.running import readings
+from sbi_active.mujoco.models.names import (
+    held_places,
+    meaning,
+    names_of,
+    require_name,
+    start_places,
+)
+from sbi_active.mujoco.models.running import held_states, readings
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.readout import held, num_steps, sampled
 
@@ -57,16 +63,19 @@ class MujocoFunction:
 
     Entries of an action are the names of joints (a start position), of joints with
     " velocity", of actuators (a control that is held), or "model", the number of the
-    model that runs. Where the action parametrizes signals, or trials bring their own,
-    they come as ``inputs``, named by actuators.
+    model that runs. A name that a joint and an actuator share is the actuator's; the
+    joint's start is then "hinge position". Where the action parametrizes signals, or
+    trials bring their own, they come as ``inputs``, named by actuators.
 
     Args:
         machines: Models of one set of parameters.
         channels: What is returned.
         roles: Meaning of each entry of an action; "" for one that only names a trial.
         times: At which it is returned where trials do not say, shape (k,).
-        start: Positions and velocities of all trials that do not say, by name.
-        threads: Of MuJoCo's rollout.
+        start: Start states of all trials that do not say, by name: positions,
+            velocities, controls that are held ("motor control"), poses of mocap bodies
+            ("target mocap[0]" to "target mocap[6]").
+        threads: Number of threads of MuJoCo's rollout.
         readout: What lies between the model's sensors and what is returned, with
             ``readout.late(theta)``, by how much each channel reads what was there
             before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
@@ -94,6 +103,10 @@ class MujocoFunction:
         self.machines, self.channels = tuple(machines), tuple(channels)
         self.roles, self.threads = tuple(roles), threads
         self.times, self.start = times, dict(start or {})
+        if not isinstance(threads, int) or threads < 1:
+            raise ValueError(
+                f"expected at least one thread; got threads={threads!r}; pass 1 or more"
+            )
 
     @property
     def model(self) -> Any:
@@ -192,7 +205,7 @@ class MujocoFunction:
         step = base.opt.timestep
         begin = 0.0 if grid is None else float(grid[0])
         num = num_steps(times, begin, step)
-        width = base.nu + base.nsensordata + base.nq + base.nv + 1
+        width = base.nu + 7 * base.nmocap + base.nsensordata + base.nq + base.nv + 1
         size = max(1, NUMBERS // (num * width))
         if rows.is_stepped:
             size = min(size, TOGETHER)
@@ -203,7 +216,10 @@ class MujocoFunction:
 
         def run(model: Model, models: list[Any], some: Rows) -> Array:
             at = some.controls[:, 0].astype(int)
-            some.controls = self._controls(base, series, grid, actions, at, num, step)
+            default = held_states(model)
+            some.controls = self._controls(
+                base, default, some.start, series, grid, at, num, step
+            )
             if watch is not None:
                 watch(model, models, some)
             x = readings(model, models, some, threads=self.threads)
@@ -216,18 +232,20 @@ class MujocoFunction:
     def _controls(
         self,
         model: Any,
+        default: Array,
+        start: dict[str, Array],
         series: dict[str, Array],
         grid: Array | None,
-        actions: Array,
         at: Array,
         num: int,
         step: float,
     ) -> Array:
+        """Return controls and poses of mocap bodies, (n, num, nu + 7 nmocap)."""
+        controls = np.tile(default, (len(at), num, 1))
+        for name, place in held_places(model).items():
+            if name in start:
+                controls[:, :, place] = start[name][:, None]
         names = names_of(model, "actuator")
-        controls = np.zeros((len(at), num, model.nu))
-        for role, value in zip(self.roles, actions[at].T, strict=False):
-            if role in names:
-                controls[:, :, names.index(role)] = value[:, None]
         for name, u in series.items():
             require_name(name, names, "actuator")
             assert grid is not None
@@ -245,7 +263,7 @@ class MujocoFunction:
         return np.broadcast_to(self.times, (num, len(self.times)))
 
     def _starts(self, start: Any, actions: Array, num: int) -> dict[str, Array]:
-        known = {*start_places(self.model), MODEL}
+        known = {*start_places(self.model), *held_places(self.model), MODEL}
         found = {name: np.full(num, value) for name, value in self.start.items()}
         if RECORDING in self.roles and start is None:
             number = np.rint(actions[:, self.roles.index(RECORDING)]).astype(int)
@@ -253,8 +271,9 @@ class MujocoFunction:
             for name in each[0]:
                 found[name] = np.array([own[name] for own in each])[number]
         for role, value in zip(self.roles, actions.T, strict=False):
-            if role in known:
-                found[role] = value
+            name = meaning(role, self.model)
+            if name in known:
+                found[name] = value
         if start is None:
             return found
         if not isinstance(start, Mapping):

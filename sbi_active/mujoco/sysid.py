@@ -92,6 +92,8 @@ def from_sysid(
         source, channels = _readable(Source(group.spec), signals)
         machines.append(Machine(source, declared, edit=edit))
     require_alike(machines)
+    for machine in machines:
+        machine.require_inertia()
     step = float(machines[0].model.opt.timestep)
     is_sensor = [s.kind == "MjSensor" for s in signals for _ in range(s.width)]
     readout = SignalReadout.of(transform, params, signals, np.array(is_sensor) * step)

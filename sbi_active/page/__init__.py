@@ -4,6 +4,6 @@ Here lives how a page looks and how figures and tables enter it. What it says li
 what it is about: in ``campaign.display`` and ``criticism.report``.
 """
 
-from sbi_active.page.page import Part, Picture, Table, render
+from sbi_active.page.page import Part, Picture, Table, legible, render
 
-__all__ = ["Part", "Picture", "Table", "render"]
+__all__ = ["Part", "Picture", "Table", "legible", "render"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,6 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+#: Control characters and halves of pairs, which neither SVG nor UTF-8 can hold.
+UNSEEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,7 @@ class Picture:
         from matplotlib import rc_context
 
         buffer = io.BytesIO()
+        legible(figure)
         with rc_context({"svg.hashsalt": "sbi-active"}):
             figure.savefig(
                 buffer, format="svg", transparent=True, metadata={"Date": None}
@@ -97,9 +103,27 @@ def render(
         badge: A word and its kind, "good", "fair" or "bad", before the lead.
         footer: Where it comes from.
     """
-    return _template().render(
+    page = _template().render(
         title=title, parts=parts, lead=lead, badge=badge, footer=footer
     )
+    return UNSEEN.sub("\ufffd", page)
+
+
+def legible(figure: Figure) -> Figure:
+    """Return a figure whose texts are what they say: no formulas, no control marks.
+
+    Names of parameters and actions are a user's: "cost [$]" is no formula to set.
+
+    Args:
+        figure: A figure, changed in place.
+    """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
+        text.set_text(UNSEEN.sub("\ufffd", text.get_text()))
+    return figure
 
 
 @cache

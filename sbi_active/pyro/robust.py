@@ -11,7 +11,8 @@ from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import Belief, named, require_support
+from sbi_active.inference.beliefs.belief import Belief, named
+from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.trainers.asbi import ASBI

@@ -221,6 +221,11 @@ class SimulatorModel:
         assert self.noise is not None
         return self.noise.log_prob(x, mean)
 
+    @property
+    def draws_by_noise_alone(self) -> bool:
+        """Whether a draw is the mean with ``noise`` as declared, and no more."""
+        return self.noise is not None
+
     def without_noise(self) -> SimulatorModel:
         """Return a model of ``fn`` alone, which has other worker processes."""
         bare = SimulatorModel(

@@ -123,12 +123,12 @@ def test_a_run_stops_once_the_parameters_are_known():
 
 
 def test_an_alarm_switches_the_stop_rules_off():
-    stop = StopRules(max_sd=0.08, min_information_gain=0.5)
+    stop = StopRules(max_sd=0.5, min_information_gain=0.5)
     c = campaign(effects=(), method="nsbi", stop=stop)
     tell(c, shift=0.8, actions=(2.0, -2.0))
     c.update()
     assert c.health == "alarm"
-    assert float(c.belief.stddev) < 0.08  # narrow, and wrong
+    assert float(c.belief.stddev) < 0.5  # as wide as trials scatter, and within
     assert c.stop_reason is None
     num_told = len(c.history)
     run(c, shift=0.8, num_rounds=2)

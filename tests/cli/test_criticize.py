@@ -34,13 +34,14 @@ def write(rows, header="action_speed,x_distance"):
         file.write("\n".join([header, *rows]) + "\n")
 
 
-def measure(drag=0.004):
-    """Write trials of a robot with drag, three of them held out."""
+def measure(drag=0.004, last=1.0):
+    """Write trials of a robot with drag, three of them held out, the last in a unit."""
     gen = torch.Generator().manual_seed(0)
     rows = []
     for i, v in enumerate(SPEEDS):
         x = v**2 / (2 * 9.81 * 0.4) - drag * v**4
         x += 0.005 * float(torch.randn((), generator=gen))
+        x *= last if i == len(SPEEDS) - 1 else 1.0
         rows.append(f"{v},{x:.4f},{'fit' if i < 8 else 'held out'}")
     write(rows, "action_speed,x_distance,role")
 
@@ -61,6 +62,17 @@ def test_a_file_gives_a_report(capsys):
     assert "saved: found/report.html" in printed
     with open("found/report.txt") as file:
         assert file.read().strip() in printed
+
+
+def test_a_held_out_row_in_another_unit_is_named(capsys):
+    measure(last=100.0)
+    options = [*OPTIONS, "--effects", "my_robot:effects", "--out", "found"]
+    assert run("--simulator", "my_robot:distance", *options) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("Verdict: drag (P")  # whatever that row says
+    assert "held-out trial 10 is far outside it" in first
+    page = Path("found/report.html").read_text()
+    assert page.count("eld-out trial 10 is far outside") >= 3
 
 
 SLIDE = """

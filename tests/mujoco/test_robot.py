@@ -230,6 +230,14 @@ def test_a_state_that_diverges_is_invalid_and_counted():
         ({"parameters": {"hinge.damping": (1, 0)}}, "low < high"),
         ({"parameters": {"hinge.damping": 3}}, "as .low, high"),
         ({"parameters": {}}, "at least one parameter"),
+        ({"parameters": {"bob.mass": (0, 1)}}, "inertia; got none of 'hinge'"),
+        ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
+        ({"times": [0.1, np.nan]}, "times that increase from 0 s on"),
+        ({"times": [-0.1, 0.1]}, "times that increase from 0 s on"),
+        ({"times": [0.2, 0.1]}, "times that increase from 0 s on"),
+        ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
+        ({"threads": 0}, "at least one thread; got threads=0"),
+        ({"threads": 1.5}, "at least one thread; got threads=1.5"),
         ({"sensors": ["hinges"]}, "did you mean 'hinge'"),
         ({"actions": BoxActions([0], [1], names=["hingo"])}, "did you mean 'hinge'"),
         ({"start": {"hinge_": 1.0}}, "did you mean 'hinge'"),
@@ -246,6 +254,111 @@ def test_a_model_that_does_not_compile_is_said():
         from_mjcf(PENDULUM.replace("capsule", "no shape"), {"hinge.damping": (0, 1)})
     with pytest.raises(FileNotFoundError, match="no such file"):
         from_mjcf("no/such.xml", {"hinge.damping": (0, 1)})
+
+
+#: A servo, called as its joint is, holds an arm that a mocap body pulls at.
+HELD = """<mujoco>
+  <worldbody>
+    <body name="hand" mocap="true" pos="0 0 1"/>
+    <body name="arm"><joint name="hinge" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 .5 0 0" size=".02" mass="1"/></body>
+  </worldbody>
+  <actuator><position name="{name}" joint="hinge" kp="50"/></actuator>
+  <equality><connect body1="arm" body2="hand" anchor=".5 0 0"/></equality>
+  <sensor><jointpos name="angle" joint="hinge"/></sensor>
+  <keyframe><key name="home" qpos=".7" qvel="-1" ctrl=".6" mpos=".3 0 .2"/></keyframe>
+</mujoco>"""
+
+
+def held(name: str, **options) -> list[float]:
+    robot = from_mjcf(
+        HELD.format(name=name),
+        {"hinge.damping": (0.0, 1.0)},
+        **{"times": [0.0, 0.5], "noise": 0.01, **options},
+    )
+    value = torch.tensor([[0.2]], dtype=torch.float64)
+    return robot.simulator.mean(torch.tensor([[0.1]]).double(), value)[0].tolist()
+
+
+def by_hand(*, key: bool, **start: float) -> list[float]:
+    model = mujoco.MjModel.from_xml_string(HELD.format(name="servo"))
+    model.dof_damping[0] = 0.1
+    data = mujoco.MjData(model)
+    if key:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    for field, value in start.items():
+        getattr(data, field)[0] = value
+    for _ in range(251):
+        mujoco.mj_step(model, data)
+        if data.time == model.opt.timestep:
+            first = float(data.sensordata[0])
+    return [first, float(data.sensordata[0])]
+
+
+def test_a_keyframe_gives_controls_and_mocap_poses_too():
+    x = held("servo", start="home")
+    assert x == pytest.approx(by_hand(key=True), abs=1e-12)
+    assert held("servo") == pytest.approx(by_hand(key=False), abs=1e-12)
+    start = {"hinge": 0.7, "hinge velocity": -1.0, "servo control": 0.6}
+    start |= {"hand mocap[0]": 0.3, "hand mocap[2]": 0.2}
+    assert held("servo", start=start) == pytest.approx(x, abs=1e-12)
+
+
+def test_a_keyframe_holds_beside_forces_that_are_stepped():
+    robot = from_mjcf(
+        HELD.format(name="servo"),
+        {"hinge.damping": (0.0, 1.0)},
+        **{"times": [0.0, 0.5], "noise": 0.01, "start": "home"},
+    )
+
+    def push(q, v, t, phi):
+        return phi
+
+    x = robot.simulator.mean(
+        torch.tensor([[0.1]]).double(),
+        torch.zeros(1, 1).double(),
+        force={push: torch.zeros(1, 1).double()},
+    )
+    assert x[0].tolist() == pytest.approx(by_hand(key=True), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["servo", "hinge"])
+def test_an_action_sets_one_thing_where_joint_and_actuator_share_a_name(name):
+    control = by_hand(key=True, ctrl=0.2)
+    for called in (name, f"{name} control"):
+        actions = BoxActions([0.1], [0.3], names=[called])
+        x = held(name, start="home", actions=actions)
+        assert x == pytest.approx(control, abs=1e-12)
+    actions = BoxActions([0.1], [0.3], names=["hinge position"])
+    x = held(name, start="home", actions=actions)
+    assert x == pytest.approx(by_hand(key=True, qpos=0.2), abs=1e-12)
+
+
+def test_a_name_that_a_signal_drives_is_no_start_of_its_joint():
+    grid = np.arange(0, 1, 0.02)
+    signal = step("hinge", length=1.0)
+    played = SignalActions(signal, [-1.0, 0.1], [1.0, 0.5], input_times=grid)
+    for name, message in (("hinge", "'hinge position'"), ("hinge position", None)):
+        actions = BoxActions([0.1], [0.3], names=[name])
+        given = {"inputs": played, "actions": actions, "noise": 0.01}
+        arm = HELD.format(name="hinge"), {"hinge.damping": (0.0, 1.0)}
+        if message:
+            with pytest.raises(ValueError, match=message):
+                from_mjcf(*arm, **given)
+        else:
+            assert from_mjcf(*arm, **given).actions.names[-1] == name
+
+
+def test_a_log_has_a_column_each_for_a_sensor_and_an_input_of_one_name():
+    time = np.arange(0, 0.2, 0.01)
+    log = {"time": time, "hinge": 0 * time, "hinge control": 0.3 + 0 * time}
+    arm = HELD.format(name="hinge"), {"hinge.damping": (0.0, 1.0)}
+    given = {"sensors": ["hinge"], "noise": 0.01}
+    robot = from_mjcf(*arm, **given, recordings=[log])
+    assert robot.trials.inputs["hinge"].unique().item() == pytest.approx(0.3)
+    del log["hinge control"]
+    with pytest.raises(ValueError, match="column 'hinge control' in recording 0"):
+        from_mjcf(*arm, **given, recordings=[log])
 
 
 def out_of_range(frame):
@@ -333,3 +446,70 @@ def test_a_center_of_mass_moves_where_the_model_has_room_for_it():
     sliding = ball.replace('axis="0 1 0" pos="0 0 .3"', 'type="slide" axis="1 0 0"')
     with pytest.raises(ValueError, match="compiles as simple"):
         from_mjcf(sliding, {"ball.com_x": (-0.1, 0.1)}, noise=0.01, **given)
+
+
+def encoder_log(**changes):
+    time = np.arange(0.0, 1.0, 0.02)
+    log = {"time": time, "angle": 0.3 * np.sin(3 * time), "servo": 0 * time}
+    return {**log, **changes}
+
+
+def read_logs(*logs, xml=HELD):
+    return from_mjcf(
+        xml.format(name="servo"),
+        {"hinge.damping": (0.0, 1.0)},
+        noise=0.01,
+        recordings=[*logs],
+    ).trials
+
+
+def test_dates_are_seconds_since_the_first():
+    for unit in ("ms", "us", "ns"):
+        stamps = np.datetime64("2026-01-01") + (20 * np.arange(50)).astype(
+            "timedelta64[ms]"
+        ).astype(f"timedelta64[{unit}]")
+        dates = pd.Series(stamps).dt.tz_localize("UTC")
+        for time in (stamps, dates):
+            trials = read_logs(encoder_log(time=time))
+            assert trials.sample_times.tolist() == pytest.approx(
+                (0.02 * np.arange(50)).tolist()
+            )
+
+
+def test_a_log_of_milliseconds_is_said_before_anything_runs():
+    with pytest.warns(UserWarning, match="10,000 time steps of 0.002 s.*in ms"):
+        read_logs(encoder_log(time=1_000 * encoder_log()["time"]))
+
+
+def test_angles_that_wrap_or_are_degrees_are_said():
+    turning = np.linspace(0, 15, 50)
+    with pytest.warns(UserWarning, match=r"jumps by about 2 pi in 2 places"):
+        read_logs(encoder_log(angle=np.remainder(turning, 2 * np.pi)))
+    limited = HELD.replace('axis="0 1 0"', 'axis="0 1 0" limited="true" range="-90 90"')
+    limited = limited.replace('name="angle"', 'name="hinge"')
+    log = encoder_log(hinge=np.linspace(0, 60, 50))
+    del log["angle"]
+    with pytest.warns(UserWarning, match="range ends at 1.57.* rad: are these degrees"):
+        read_logs(log, xml=limited)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"time": encoder_log()["time"] + 1.7e9}, "subtract the time at which"),
+        ({"time": encoder_log()["time"] - 1}, "subtract the time at which"),
+        ({"angle": encoder_log()["angle"] + 1j}, "real numbers in column angle"),
+        ({"angle": ["0.1 rad"] * 50}, "numbers in column 'angle'.*'0.1 rad' in row 0"),
+    ],
+)
+def test_a_log_that_is_no_log_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_logs(encoder_log(**changes))
+
+
+def test_a_file_of_a_log_keeps_its_cells(tmp_path):
+    frame = pd.DataFrame(encoder_log())
+    path = tmp_path / "log.csv"
+    path.write_text("# a comment\n" + frame.to_csv(index=False), encoding="utf-8-sig")
+    trials = read_logs(path)
+    assert trials.x[0].tolist() == pytest.approx(frame["angle"].tolist())

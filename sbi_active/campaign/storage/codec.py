@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.messages import Explained
 
 #: Packages whose classes are stored by their attributes.
@@ -34,6 +35,8 @@ TRUSTED = (
 )
 #: Levels of attributes below what is given again in which to look for references.
 DEPTH = 5
+#: Bytes that any file may hold, and times its size that it may hold beyond.
+LEAST_LIMIT, MOST_SHRUNK = 16 * 2**20, 100
 TAG = "!"  # of whatever JSON does not hold by itself
 
 _SEQUENCES: dict[str, Callable[[list[Any]], Any]] = {
@@ -90,7 +93,13 @@ def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
         ValueError: If the content is nothing that :func:`encode` writes.
     """
     try:
-        stored = torch.load(io.BytesIO(zlib.decompress(content)), weights_only=True)
+        # What was written shrinks less: a small file that fills memory was crafted.
+        limit = LEAST_LIMIT + MOST_SHRUNK * len(content)
+        reader = zlib.decompressobj()
+        plain = reader.decompress(content, limit)
+        if not reader.eof:
+            raise ValueError(f"expected a whole file of {limit} bytes at most")
+        stored = torch.load(io.BytesIO(plain), weights_only=True)
         return _Reader(known, stored["arrays"]).value(json.loads(stored["structure"]))
     except Exception as error:  # each library has its own
         raise ValueError(
@@ -169,6 +178,8 @@ class _Writer:
                 return {TAG: "known", "path": self._places[id(value)]}
             raise NotStorableError(f"{kind.__module__}.{kind.__qualname__}")
         state = {**getattr(value, "__dict__", {})}
+        if isinstance(value, RowCache):  # what it lacks is simulated again
+            state = vars(RowCache(value.most))
         for base in kind.__mro__:
             for slot in _slots(base):
                 if hasattr(value, slot):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from sbi_active.messages import Explained
@@ -22,3 +24,39 @@ class DamagedCampaignError(Explained, OSError):
             "or load the campaign with repair=True, which gives up what is damaged, "
             "keeps a copy and names what has to be told again"
         )
+
+
+class LogChangedError(Explained, ValueError):
+    """Another writer added to a campaign's log since it was loaded here.
+
+    Attributes:
+        path: The log.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        super().__init__(
+            f"expected the campaign in {path.parent} as it was loaded; got trials that "
+            "another process told since; load it again, and tell this once more: "
+            "nothing was written"
+        )
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what fails while a file's content is made sense of into damage of the file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DamagedCampaignError: In place of any other error, which names no file.
+    """
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:  # what a crafted file leads to has no end
+        raise DamagedCampaignError(
+            path, f"content that leads to {type(error).__name__}: {str(error):.200}"
+        ) from error

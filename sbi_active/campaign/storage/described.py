@@ -15,10 +15,10 @@ from torch import distributions as td
 from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.stopping import StopRules
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.ratio_network import RatioClassifier
-from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.simulation.workers.settings import Workers
 
 #: Arguments by which each is made anew.

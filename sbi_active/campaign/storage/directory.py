@@ -9,6 +9,7 @@ all else can be computed again: ``state.bin`` and ``belief-*.bin`` save that wor
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,14 +17,22 @@ from typing import Any
 
 import torch
 
+from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
-from sbi_active.campaign.storage.log import TrialLog, mend_log
+from sbi_active.campaign.storage.damage import (
+    DamagedCampaignError,
+    LogChangedError,
+    reading,
+)
+from sbi_active.campaign.storage.log import TrialLog, keep_aside, mend_log
 from sbi_active.campaign.storage.manifest import read_manifest
-from sbi_active.campaign.telling import recorded
+from sbi_active.campaign.telling import LOST, recorded
 from sbi_active.simulation.bank.lock import WriterLock
 from sbi_active.simulation.bank.segments import write_file
 
+#: Names that a saved belief has; a user's own file has another.
+OWN_BELIEF = re.compile(r"belief-[0-9a-f]{16}\.bin")
 LOG, STATE, BELIEF, SIMULATIONS = "trials.jsonl", "state.bin", "belief", "simulations"
 
 
@@ -50,16 +59,19 @@ class CampaignDirectory:
     def __init__(self, path: Path, *, repair: bool = False) -> None:
         self.path, self.notes = path, []
         self.manifest = read_manifest(path, repair=repair)
-        if repair and (lost := mend_log(path / LOG)):
-            (path / STATE).unlink(missing_ok=True)  # it counts other lines
-            self.notes = [f"given up, tell it again: {text}" for text in lost]
+        lost = mend_log(path / LOG) if repair else []
+        self.notes += [f"given up, tell it again: {text}" for text in lost]
         self._log = TrialLog(path / LOG)
         self._lock = WriterLock(path)
+        self._saved = self._saved_state()
+        with reading(path / STATE):
+            self._require_whole(repair=repair, mended=bool(lost))
         self._belief_written: tuple[int, str | None] = (-1, None)
         self._kept: Any = None
-        for entry in self._log.entries:
-            if entry["event"] == "simulator changed":
-                self.manifest["simulator"] = entry["simulator"]
+        with reading(path / LOG):
+            for entry in self._log.entries:
+                if entry["event"] == "simulator changed":
+                    self.manifest["simulator"] = entry["simulator"]
 
     def write(self, event: str, trial: Trial | None = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
@@ -111,6 +123,7 @@ class CampaignDirectory:
             self._belief_written = id(belief), name
         saved = {
             "lines": len(self._log),
+            "digest": self._log.digest(len(self._log)),
             "trials": state.trials,
             "processed": state.processed,
             "draws": state.draws,
@@ -122,7 +135,7 @@ class CampaignDirectory:
         }
         self._put(STATE, encode(saved, known={}))
         for old in self.path.glob(f"{BELIEF}-*.bin"):
-            if old.name != name:
+            if old.name != name and OWN_BELIEF.fullmatch(old.name):
                 with suppress(OSError):
                     old.unlink()
 
@@ -135,19 +148,21 @@ class CampaignDirectory:
         Returns:
             The file of the belief; None where it is the prior, or to be computed.
         """
-        saved = self._saved_state()
+        saved, self._saved = self._saved, None
         name, lines = None, 0
         if saved is not None:
-            lines, name = saved["lines"], saved["belief"]
-            state.trials[:] = saved["trials"]
-            state.processed[:] = saved["processed"]
-            state.draws |= saved.get("draws", {})  # earlier files have none
-            state.versions[:] = saved["versions"]
-            state.batches[:] = saved.get("batches", [])
-            state.meter.spent = saved.get("num_simulated", 0)
-            state.is_stale = saved["is_stale"]
-        for entry in self._log.entries[lines:]:
-            apply(state, entry)
+            with reading(self.path / STATE):
+                lines, name = saved["lines"], saved["belief"]
+                state.trials[:] = saved["trials"]
+                state.processed[:] = saved["processed"]
+                state.draws |= saved.get("draws", {})  # earlier files have none
+                state.versions[:] = saved["versions"]
+                state.batches[:] = saved.get("batches", [])
+                state.meter.spent = saved.get("num_simulated", 0)
+                state.is_stale = saved["is_stale"]
+        with reading(self.path / LOG):
+            for entry in self._log.entries[lines:]:
+                apply(state, entry)
         if name == "" and state.processed or saved is None and len(state.versions) > 1:
             state.is_stale = True
         return name or None
@@ -176,17 +191,14 @@ class CampaignDirectory:
 
         Raises:
             LockedError: If another process has it.
-            ValueError: If another process wrote since the campaign was loaded.
+            LogChangedError: If another process wrote since the campaign was loaded.
         """
         if self._lock.held:
             return
         self._lock.acquire()
-        if len(TrialLog(self.path / LOG)) != len(self._log):
+        if TrialLog(self.path / LOG).entries != self._log.entries:
             self._lock.release()
-            raise ValueError(
-                f"expected the campaign in {self.path} as it was loaded; got trials "
-                "that another process told since; load it again"
-            )
+            raise LogChangedError(self.path / LOG)
 
     def _saved_state(self) -> dict[str, Any] | None:
         try:
@@ -196,10 +208,41 @@ class CampaignDirectory:
         except ValueError as error:
             self.notes.append(f"{STATE} is computed again: {error}")
             return None
-        if saved["lines"] > len(self._log):
-            self.notes.append(f"{STATE} is computed again: it is of another log")
-            return None
         return saved
+
+    def _require_whole(self, *, repair: bool, mended: bool) -> None:
+        """Raise where the log lacks lines that the saved state has counted.
+
+        A repair takes their trials from the state, and has all else computed again.
+        """
+        saved = self._saved
+        if saved is None:
+            return
+        lines, known = saved["lines"], saved.get("digest")  # earlier files have none
+        if lines <= len(self._log) and known in (None, self._log.digest(lines)):
+            return
+        told = [t for t in saved["trials"] if t.status != "pending"]
+        if not repair:
+            raise DamagedCampaignError(
+                self.path / LOG,
+                f"{len(self._log)} lines, and not the {lines} that {STATE} has counted "
+                f"with {len(told)} trials that were told",
+            )
+        if not mended:
+            keep_aside(self.path / LOG)
+        state = CampaignState("asbi", 0, CampaignOptions())
+        for entry in self._log.entries:
+            if "trial" in entry:
+                apply(state, entry)
+        lacking = [t for t in told if not _has(state, t)]
+        self._saved = None
+        (self.path / STATE).rename(self.path / f"{STATE}.damaged")
+        for trial in lacking:
+            self.write("restored", trial)
+            self.notes.append(
+                f"restored from {STATE}: trial {trial.index}, x = {trial.x}"
+            )
+        self.close()
 
     def _put(self, name: str, content: bytes) -> None:
         digest = hashlib.sha256(content).hexdigest()
@@ -226,6 +269,15 @@ def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:
         state.versions.append(ModelVersion(**version))
         state.processed[:] = version["trials"]
         state.is_stale = True
+
+
+def _has(state: CampaignState, trial: Trial) -> bool:
+    """Return whether a state has a trial that was told, as it was told or since."""
+    if trial.index >= len(state.trials):
+        return False
+    return state.trials[trial.index].reason != LOST and (
+        state.trials[trial.index].status != "pending"
+    )
 
 
 def _facts(trial: Trial) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from sbi_active.campaign.learning.revision import rebuilt
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent
+from sbi_active.campaign.storage.damage import reading
 from sbi_active.campaign.storage.described import (
     actions_from,
     describe_options,
@@ -27,7 +28,7 @@ from sbi_active.campaign.storage.described import (
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.drawn import drawn_from, stood_for
-from sbi_active.campaign.storage.manifest import require_same_simulator
+from sbi_active.campaign.storage.manifest import MANIFEST, require_same_simulator
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
@@ -127,26 +128,25 @@ def load(
     """Return the parts of a campaign, see :meth:`.Campaign.load`."""
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest = disk.manifest
-    settings: CampaignOptions = _given("options", options, manifest, options_from)
-    if options is not None and describe_options(options) != manifest["options"]:
+    settings: CampaignOptions = _given("options", options, disk, options_from)
+    if options is not None and describe_options(options) != manifest.get("options"):
         warn(
             f"options= hold for this process: the campaign in {directory} keeps "
-            f"{manifest['options_text']}; pass them at each load",
+            f"{manifest.get('options_text')}; pass them at each load",
             stacklevel=4,
         )
     reads = simulator is None
-    space: ActionSpace = _given("actions", actions, manifest, actions_from, reads=reads)
-    first_prior: Distribution = _given(
-        "prior", prior, manifest, prior_from, reads=reads
-    )
-    state = CampaignState(
-        manifest["method"],
-        manifest["seed"],
-        settings,
-        num_earlier=manifest["num_earlier"],
-    )
+    space: ActionSpace = _given("actions", actions, disk, actions_from, reads=reads)
+    first_prior: Distribution = _given("prior", prior, disk, prior_from, reads=reads)
+    with reading(disk.path / MANIFEST):
+        state = CampaignState(
+            manifest["method"],
+            manifest["seed"],
+            settings,
+            num_earlier=manifest["num_earlier"],
+        )
+        shape = torch.Size(manifest["x_shape"])
     name = disk.restore(state)
-    shape = torch.Size(manifest["x_shape"])
     for note in disk.notes:
         warn(note, stacklevel=3)
     if simulator is None:
@@ -196,7 +196,7 @@ def _belief(
 def _given(
     what: str,
     given: Any,
-    manifest: dict[str, Any],
+    disk: CampaignDirectory,
     made: Callable[[Any], Any],
     *,
     reads: bool = False,
@@ -207,12 +207,15 @@ def _given(
     """
     if given is not None:
         return given
-    drawn = manifest.get("drawn", {}).get(what)  # earlier files have none
-    if reads and drawn is not None:
-        return drawn_from(drawn)
-    if manifest[what] is None:
+    with reading(disk.path / MANIFEST):
+        described, text = disk.manifest[what], disk.manifest[f"{what}_text"]
+        drawn = disk.manifest.get("drawn", {}).get(what)  # earlier files have none
+        if reads and drawn is not None:
+            return drawn_from(drawn)
+    if described is None:
         raise ValueError(
             f"expected {what}=, which only its author can make again; got None; pass "
-            f"what the campaign was made with: {manifest[f'{what}_text']:.200}"
+            f"what the campaign was made with: {text:.200}"
         )
-    return made(manifest[what])
+    with reading(disk.path / MANIFEST):
+        return made(described)

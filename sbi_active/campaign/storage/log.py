@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import zlib
@@ -10,15 +11,20 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from sbi_active.campaign.storage.damage import DamagedCampaignError
+from sbi_active.campaign.storage.damage import DamagedCampaignError, LogChangedError
+from sbi_active.simulation.bank.lock import require_no_link
 from sbi_active.simulation.bank.segments import synchronize, write_file
+
+BEGINNING = b'{"line": '  # of each line
 
 
 class TrialLog:
     """A file of JSON lines that is only ever added to.
 
     A line ends with the CRC-32 of what is before it. A last line that was not finished,
-    as its writer was killed, is no line: nothing had returned that depends on it.
+    as its writer was killed, is no line: nothing had returned that depends on it. What
+    is in the file and was neither read nor written here is never cut off: a line is
+    added to what is known, or there is an error and nothing is written.
 
     Args:
         path: The file, made with the first line.
@@ -32,7 +38,8 @@ class TrialLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.entries, self._size = read_log(path)
+        require_no_link(path)
+        self.entries, self._known, self._torn = read_log(path)
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -46,20 +53,26 @@ class TrialLog:
         time = datetime.now(timezone.utc).isoformat(timespec="seconds")
         line = {"line": len(self.entries) + 1, "time": time, **entry}
         content = _sealed(line)
-        is_new = not self.path.exists()
+        is_new = not self._known
+        size = len(self._known)
         try:
-            mode = "wb" if is_new else "r+b"
-            with open(self.path, mode, buffering=0) as file:
-                file.truncate(self._size)  # of a writer that was killed
-                file.seek(self._size)
+            self._require_known()
+            with open(self.path, "ab", buffering=0) as file:
+                if self._torn:  # by a writer that was killed
+                    file.truncate(size)
+                    self._torn = b""
                 try:
                     rest = memoryview(content)
                     while rest:  # a disk that gets full takes a part
                         rest = rest[file.write(rest) :]
                     os.fsync(file.fileno())
                 except OSError:
-                    file.truncate(self._size)
+                    written = len(content) - len(rest)
+                    if os.fstat(file.fileno()).st_size == size + written:
+                        file.truncate(size)
                     raise
+        except DamagedCampaignError:
+            raise
         except OSError as error:
             raise type(error)(
                 error.errno,
@@ -71,17 +84,40 @@ class TrialLog:
         if is_new:
             synchronize(self.path.parent)
         self.entries.append(line)
-        self._size += len(content)
+        self._known += content
+
+    def digest(self, lines: int) -> str:
+        """Return a digest of the first lines."""
+        parts = bytes(self._known).splitlines(keepends=True)[:lines]
+        return hashlib.sha256(b"".join(parts)).hexdigest()
+
+    def _require_known(self) -> None:
+        """Raise where the file is not what was read and written here."""
+        content = self.path.read_bytes() if self.path.exists() else b""
+        if content == self._known + self._torn:
+            return
+        if content.startswith(self._known):
+            raise LogChangedError(self.path)
+        raise DamagedCampaignError(
+            self.path,
+            f"{len(content)} bytes other than the {len(self._known)} that were written "
+            "since it was loaded; nothing was written to it now",
+        )
 
 
-def read_log(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """Return the lines of a log, and the bytes that they take.
+def read_log(path: Path) -> tuple[list[dict[str, Any]], bytearray, bytes]:
+    """Return the lines of a log, their bytes, and those of a line not finished.
 
     Raises:
         DamagedCampaignError: If a line does not hold what was written.
     """
     content = path.read_bytes() if path.exists() else b""
     whole = content[: content.rfind(b"\n") + 1]
+    torn = content[len(whole) :]
+    if not torn.startswith(BEGINNING[: len(torn)]):
+        raise DamagedCampaignError(
+            path, f"{len(torn)} bytes at its end that are no line of a log"
+        )
     entries, damaged = [], []
     for number, line in enumerate(whole.splitlines(), 1):
         entry = _opened(line)
@@ -94,7 +130,7 @@ def read_log(path: Path) -> tuple[list[dict[str, Any]], int]:
             f"line {damaged[0]} with another checksum, {len(damaged)} of "
             f"{len(entries)} lines damaged, the others whole",
         )
-    return entries, len(whole)
+    return entries, bytearray(whole), torn
 
 
 def mend_log(path: Path) -> list[str]:
@@ -113,10 +149,19 @@ def mend_log(path: Path) -> list[str]:
     ]
     if not lost:
         return []
-    path.with_suffix(".damaged").write_bytes(content)
+    keep_aside(path)
     renumbered = [{**entry, "line": k} for k, entry in enumerate(kept, 1)]
     write_file(path, b"".join(map(_sealed, renumbered)))
     return lost
+
+
+def keep_aside(path: Path) -> None:
+    """Keep a copy of a damaged file, beside those of earlier repairs."""
+    number, copy = 1, path.with_suffix(".damaged")
+    while copy.exists():
+        number += 1
+        copy = path.with_suffix(f".damaged-{number}")
+    write_file(copy, path.read_bytes())
 
 
 def _sealed(entry: Mapping[str, Any]) -> bytes:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from torch.distributions import Distribution
 
-from sbi_active.campaign.isolation import isolated
+from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import CampaignDirectory
@@ -28,6 +28,7 @@ def stored(method: Method) -> Method:
     """
     apart = isolated(method)
 
+    @guarded
     @functools.wraps(method)
     def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
         learner, version = campaign._learner, campaign.state.version.number

@@ -73,7 +73,9 @@ def find_recordings(folder: Path) -> list[Path]:
     """
     if (folder / TABLE).is_file():
         return [folder / TABLE]
-    found = sorted(folder.glob("*.csv"), key=lambda path: _natural(path.name))
+    # Copies to other systems leave files of attributes, "._run.csv".
+    visible = (p for p in folder.glob("*.csv") if not p.name.startswith("."))
+    found = sorted(visible, key=lambda path: _natural(path.name))
     if not found:
         raise ValueError(
             f"expected recordings in {folder}; got no {TABLE} and no other *.csv; "

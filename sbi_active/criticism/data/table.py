@@ -250,8 +250,10 @@ class _TrialRows(Rows):
 
     def _note_empty(self, x: Array, rows: Array) -> None:
         """Warn of what counts as not measured."""
+        # Sensors that are read at times of their own leave each other's cells empty.
+        others = np.isfinite(x).any(1) & (self.columns.time is not None)
         for column, values in zip(self.columns.x, x.T, strict=True):
-            at = np.sort(rows[np.isnan(values[rows])])
+            at = np.sort(rows[np.isnan(values[rows]) & ~others[rows]])
             if len(at):
                 some = ", ".join(map(self.place, at[:SHOWN]))
                 more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""

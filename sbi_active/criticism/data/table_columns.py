@@ -13,7 +13,7 @@ PREFIXES = {"action": "action_", "x": "x_", "input": "input_", "start": "start_"
 OPTIONAL = ("role", "index", "repeat_of")
 KEYS = (TRIAL, TIME, *PREFIXES, *OPTIONAL)
 #: Seconds in a unit of time.
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,13 @@ class Rows:
         """Return the time of each row in s, in order within a trial; 0 without one."""
         if self.columns.time is None:
             return np.zeros(len(self.frame))
-        time = self.numbers(self.columns.time) * self.columns.seconds
+        cells = self.frame[self.columns.time]
+        if is_stamp(cells):  # from the start of each trial
+            time = np.empty(len(cells))
+            for at in self.members:
+                time[at] = seconds(cells.iloc[at], self.source)
+        else:
+            time = self.numbers(self.columns.time) * self.columns.seconds
         self._require_order(time, self.columns.time)
         return time
 
@@ -94,7 +101,7 @@ class Rows:
         """Return a column as text, shape (n,), "" where it is empty."""
         cells = self.frame[column]
         if pd.api.types.is_float_dtype(cells):  # 1.0 and 1 name one trial
-            text = [f"{value:g}" for value in cells]
+            text = [_digits(value) for value in cells]
         else:
             text = [str(value).strip() for value in cells]
         words = ["" if word.lower() in EMPTY else word for word in text]
@@ -103,6 +110,7 @@ class Rows:
     def numbers(self, column: str, *, empty: bool = False) -> Array:
         """Return a column as numbers, shape (n,), NaN where cells may be empty."""
         cells = self.frame[column]
+        require_real(cells, column, self.source)
         text = cells.map(lambda cell: str(cell).strip())
         blank = text.str.lower().isin(EMPTY).to_numpy()
         is_number = pd.api.types.is_numeric_dtype(cells)
@@ -157,6 +165,42 @@ class Rows:
                 )
 
 
+def is_stamp(cells: pd.Series) -> bool:
+    """Return whether a column holds dates or durations."""
+    kinds = pd.api.types
+    return kinds.is_datetime64_any_dtype(cells) or kinds.is_timedelta64_dtype(cells)
+
+
+def seconds(cells: pd.Series, source: str) -> Array:
+    """Return dates or durations of any unit in seconds since the first, shape (n,).
+
+    Raises:
+        ValueError: If one is missing.
+    """
+    lost = np.flatnonzero(cells.isna())
+    if len(lost):
+        raise ValueError(
+            f"expected a time in row {lost[0] + 1}; got none in {source}; fill it in"
+        )
+    return (cells - cells.iloc[0]).dt.total_seconds().to_numpy(float)
+
+
+def require_real(cells: pd.Series, column: str, source: str) -> None:
+    """Raise where numbers have an imaginary part, which nothing here could keep."""
+    if pd.api.types.is_complex_dtype(cells) or any(
+        isinstance(cell, complex) for cell in cells
+    ):
+        raise ValueError(
+            f"expected real numbers in column {column}; got complex ones in {source}; "
+            "give the real and the imaginary part a column each"
+        )
+
+
+def _digits(value: float) -> str:
+    """Return a number that names a trial, with all its digits; 1.0 and 1 are one."""
+    return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
 def _if_it_varies(column: str) -> str:
     """Return what to do about a column that varies within a trial."""
     if column.startswith(PREFIXES["action"]):
@@ -188,13 +232,11 @@ def read_csv(path: Path) -> pd.DataFrame:
         )
     try:
         _require_commas(path)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            # A "#" within a cell is a part of it: only whole lines are comments.
+            lines = [line for line in file if not line.lstrip().startswith("#")]
         table = pd.read_csv(
-            path,
-            header=None,
-            dtype=str,
-            keep_default_na=False,
-            comment="#",
-            encoding="utf-8-sig",
+            io.StringIO("".join(lines)), header=None, dtype=str, keep_default_na=False
         )
     except UnicodeDecodeError as error:
         raise ValueError(

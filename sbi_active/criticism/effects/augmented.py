@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -96,6 +97,17 @@ class AugmentedSimulator(SimulatorModel):
             theta, action, *own = check
             context = self._row_context(action, given=own[0] if own else None)
             self._check_null(theta[:, : theta.shape[1] - known], action, context)
+
+    @property
+    @override
+    def draws_by_noise_alone(self) -> bool:
+        return not any(e.hook == "noise" or e.scope == "trial" for e in self.effects)
+
+    @override
+    def without_noise(self) -> AugmentedSimulator:
+        bare = copy.copy(self)
+        bare.noise = None
+        return bare
 
     def evaluate(
         self,

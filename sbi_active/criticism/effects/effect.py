@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.inference.beliefs.priors import is_discrete, parts_of
 from sbi_active.seeding import forked_generators
 
 Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
@@ -230,6 +231,11 @@ def _require_parts(effect: Effect) -> None:
         raise ValueError(
             f"expected a torch distribution as prior of effect {effect.name!r}; got "
             f"{effect.prior!r}; pass for example Normal(0.0, 1.0)"
+        )
+    if any(is_discrete(part) for part in parts_of(effect.prior.support)):
+        raise ValueError(
+            f"expected a continuous prior of effect {effect.name!r}; got a discrete "
+            "one; declare one effect for each value, which then compete"
         )
     if not callable(effect.apply):
         raise ValueError(

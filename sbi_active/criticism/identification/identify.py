@@ -37,8 +37,6 @@ FEWEST, FEWEST_KEPT = 50, 100
 INSIDE = 1e-6
 #: Multiple of the declared deviation from which errors are no longer the sensor's.
 BEYOND = 3.0
-#: Share of the draws within this share of the prior's range from a bound that is told.
-EDGE, AT_EDGE = 0.01, 0.05
 
 
 class IdentifiedBelief(KernelBelief):
@@ -293,18 +291,9 @@ def _beyond(errors: dict[str, dict[str, float]], declared: Array) -> list[str]:
 
 def _at_bounds(found: Fitted, u: Array, names: Sequence[str]) -> list[str]:
     """Return which parameters may be beyond a bound of the prior."""
-    c, notes = found.rival.coordinates, []
-    for k, name in enumerate(names):
-        low, high = c.low[k], c.high[k]
-        if not np.isfinite(low) or not np.isfinite(high):
-            continue
-        place = (found.u[k] + u[:, k] - low) / (high - low)
-        # A parameter that the trials leave open is near any bound now and then.
-        if place.std() > 0.2:
-            continue
-        near = max((place < EDGE).mean(), (place > 1 - EDGE).mean())
-        if near > AT_EDGE:
-            notes.append(
-                f"{name} is at a bound of its prior; move the bound, or say why"
-            )
-    return notes
+    sides = found.rival.coordinates.sides((found.u + u)[:, : len(names)])
+    return [
+        f"{name} is at a bound of its prior; move the bound, or say why"
+        for name, side in zip(names, sides, strict=True)
+        if side
+    ]

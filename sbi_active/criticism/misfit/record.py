@@ -249,6 +249,7 @@ def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelErro
         left_out=np.sqrt(own),
         held_out=None if held_out is None else _held_out(misfit, key, held_out),
         remains=float(min(excess, 1.0)),
+        parts=(*left.square[np.isfinite(left.square)].tolist(),),
     )
 
 

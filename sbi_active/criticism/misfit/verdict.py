@@ -44,6 +44,8 @@ Array = NDArray[Any]
 
 #: Trials with the largest error, each of which alone may be what no model fits.
 NUM_SUSPECTS = 3
+#: Trials below which none can be told to be the one that errs.
+FEWEST_TRIALS = 3
 
 
 @dataclass
@@ -332,15 +334,16 @@ def _misses(
 
 def _is_one_trial(search: Search, most: int) -> bool:
     """Return whether the models of so many effects fit all trials but one."""
-    errors = search.errors
-    if not errors.is_by_trial:
+    errors, trial = search.errors, search.rivals.measurements.trial
+    if len(np.unique(trial)) < FEWEST_TRIALS:  # two that agree outvote one
         return False
     models = [c for k, c in search.found.items() if len(k.effects) <= most]
     best = max(models, key=lambda c: c.log_prior + c.posterior.log_sensor)
-    square = np.bincount(errors.fold, best.model.residual**2, errors.num_folds)
-    for fold in np.argsort(-square)[:NUM_SUSPECTS]:
+    square = np.bincount(trial, best.model.residual**2)
+    for suspect in np.argsort(-square)[:NUM_SUSPECTS]:
+        # Of few trials a part is a piece of one: all pieces of the suspect go.
         use = np.ones(errors.num_folds, bool)
-        use[fold] = False
+        use[np.unique(errors.fold[trial == suspect])] = False
         if not _misses(search, use, most):
             return True
     return False

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
+from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.candidates import (
     following,
@@ -34,7 +35,7 @@ from sbi_active.criticism.next_trial.candidates import (
     simulated,
 )
 from sbi_active.criticism.next_trial.outside import extrapolated
-from sbi_active.criticism.results import UNEXPLAINED, ModelKey, SevereTest, Tracing
+from sbi_active.criticism.results import UNEXPLAINED, ModelKey, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
 
 Array = NDArray[Any]

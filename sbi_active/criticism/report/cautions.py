@@ -14,7 +14,12 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
 from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.report.section import called
-from sbi_active.criticism.report.suspects import of_noise, of_trials
+from sbi_active.criticism.report.suspects import (
+    of_bounds,
+    of_missed,
+    of_noise,
+    of_trials,
+)
 from sbi_active.criticism.results import (
     NONE,
     SCATTER,
@@ -81,6 +86,8 @@ def find_warnings(
         *_of_errors(residuals, residuals_after, tracing),
         *_of_evidence(tracing, detection),
         *of_noise(detection),
+        *of_missed(evaluation),
+        *of_bounds(tracing.bounds),
         *of_trials(tracing),
         *_of_verdict(tracing, effects, evaluation, exploratory=exploratory),
     )
@@ -229,7 +236,8 @@ def _of_verdict(
             "not robust to its prior: effect priors a third or three times as wide "
             "give another verdict"
         )
-    if tracing.verdict == UNEXPLAINED and not tracing.chosen:
+    is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
+    if is_bare and not tracing.bounds.replaces:
         place = (
             f"beside {ModelKey(tracing.beside)}" if tracing.beside else "in its place"
         )

@@ -10,6 +10,7 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import summary_sentence
 from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.report.section import named_entries, setting
+from sbi_active.criticism.report.suspects import of_bounds, of_missed
 
 #: Parameters and entries of the action that a sentence names at most.
 MOST_NAMED = 3
@@ -17,7 +18,9 @@ MOST_NAMED = 3
 
 def first_paragraph(report: Contents) -> str:
     """Return what was found, and what a verdict that names effects does not know."""
-    return " ".join([summary_sentence(report), *conditions(report)])
+    against = [*of_missed(report.evaluation), *of_bounds(report.tracing.bounds)]
+    said = [f"{text[0].upper()}{text[1:]}." for text in against]
+    return " ".join([summary_sentence(report), *said, *conditions(report)])
 
 
 def conditions(report: Contents) -> Iterator[str]:

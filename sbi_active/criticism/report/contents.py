@@ -9,14 +9,15 @@ import pandas as pd
 import torch
 from torch.distributions import Distribution
 
+from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
     Detection,
     Evaluation,
+    Evidence,
     NextAction,
     Residuals,
-    SevereTest,
     Tracing,
 )
 from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
@@ -122,17 +123,21 @@ class Contents:
 
     @property
     def parameters(self) -> pd.DataFrame:
-        """Columns parameter, before, before_sd, after, after_sd; phi has no before."""
+        """Columns parameter, before, before_sd, after, after_sd; phi has no before.
+
+        Means and deviations of posteriors; of a model that misses the trials the best
+        fit, with a deviation that knows of it.
+        """
         evidences = self.tracing.evidences
         before, after = evidences[NONE], evidences.get(self.tracing.model)
         rows = {
-            name: [*_moments(before.draws[:, i]), np.nan, np.nan]
+            name: [*_moments(before, i), np.nan, np.nan]
             for i, name in enumerate(before.names)
         }
         if after is not None and self.tracing.model != NONE:
             for i, name in enumerate(after.names):
                 row = rows.setdefault(name, [np.nan] * 4)
-                row[2:] = _moments(after.draws[:, i])
+                row[2:] = _moments(after, i)
         names = ["before", "before_sd", "after", "after_sd"]
         table = pd.DataFrame.from_dict(rows, orient="index", columns=pd.Index(names))
         return table.rename_axis("parameter").reset_index()
@@ -151,5 +156,15 @@ class Contents:
         return combinations_of_draws(draws, prior, evidence.names[:dim])
 
 
-def _moments(draws: np.ndarray) -> list[float]:
-    return [float(draws.mean()), float(draws.std())]
+def _moments(evidence: Evidence, i: int) -> list[float]:
+    """Return a parameter's mean and deviation in a model.
+
+    Of one that misses the trials draws are spread by the misfit, and moved within the
+    prior: their mean is no fit.
+    """
+    draws, center = evidence.draws[:, i], evidence.draws[:, i].mean()
+    if evidence.best is not None:
+        center = evidence.best[i]
+    elif evidence.narrow is not None:
+        center = evidence.narrow[:, i].mean()
+    return [float(center), float(draws.std())]

@@ -69,6 +69,11 @@ def effects(report: Contents) -> Section:
         f"{FEWEST_DRAWS:.0f} too few for a deviation of phi. 90 % set: the smallest "
         "set of models that holds 90 % of the probability."
     ]
+    if tracing.instead_of:
+        text.append(
+            f"P is among the declared models and priors by the fitted trials alone; "
+            f"{tracing.instead_of} is not named, as the warnings say."
+        )
     if any_set:
         text.append(
             "P in any set: probability that the effect is there, alone or with others."

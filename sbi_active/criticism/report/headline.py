@@ -5,9 +5,24 @@ from __future__ import annotations
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.numbers import number, stated
-from sbi_active.criticism.report.suspects import in_words, label, verdict_clause
+from sbi_active.criticism.report.suspects import (
+    NO_PART,
+    in_words,
+    label,
+    missed_clause,
+    narrow_prior,
+    verdict_clause,
+)
 from sbi_active.criticism.report.under_misfit import misfit_line, misfit_sentences
-from sbi_active.criticism.results import NONE, OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.results import (
+    NONE,
+    OUTLIER,
+    SCATTER,
+    UNEXPLAINED,
+    ModelKey,
+    Tracing,
+)
+from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.criticism.under_misfit import UNDECLARED
 
 #: Probability from which a form of a force is named, and one from which it is listed.
@@ -17,13 +32,20 @@ CERTAIN, SHOWN = 0.9, 0.01
 def verdict_line(report: Contents) -> str:
     """Return the verdict with what limits it, in one line."""
     tracing, verdict = report.tracing, report.verdict
-    p = tracing.probabilities.get(verdict)
+    p = tracing.probabilities.get(verdict) if not tracing.instead_of else None
     line = f"Verdict: {verdict}" + ("" if p is None else f" ({stated(p)})")
-    if tracing.misfit is not None and not tracing.instead_of:
+    if tracing.misfit is not None and verdict != OUTLIER:
         line = misfit_line(verdict, tracing.misfit)
     elif (family := open_form(report)) is not None:
         line = f"Verdict: {family}"
-    line += verdict_clause(tracing)
+    likeliest = max(tracing.probabilities, key=tracing.probabilities.__getitem__)
+    if verdict == NONE and likeliest != NONE:
+        share = stated(tracing.probabilities[likeliest])
+        line += f", no alarm, though {likeliest} is likelier ({share})"
+    line += _withdrawn_for(tracing) or verdict_clause(tracing)
+    bounds = tracing.bounds
+    if verdict != NONE and not bounds.replaces and bounds.p_value > LEVEL:
+        line += f"; {narrow_prior(tracing)}"
     if tracing.beside and tracing.misfit is None:
         line += f", beside {ModelKey(tracing.beside)}"
     if tracing.stand_in:
@@ -37,7 +59,17 @@ def verdict_line(report: Contents) -> str:
     same = sorted(frozenset().union(*groups) - named)
     if same:
         line += f"; no permitted action tells it from {', '.join(same)}"
-    return line
+    return line + missed_clause(report.evaluation)
+
+
+def _withdrawn_for(tracing: Tracing) -> str:
+    """Return why effects are not named, "" where only the warnings say it."""
+    if tracing.bounds.replaces:
+        return f", and not {tracing.instead_of}: {narrow_prior(tracing)}"
+    if tracing.misfit is not None and tracing.refuted and tracing.verdict != OUTLIER:
+        where = tracing.refuted_on or NO_PART
+        return f": {tracing.instead_of} does not lower the error on {where}"
+    return ""
 
 
 def open_form(report: Contents) -> str | None:
@@ -82,7 +114,7 @@ def added(report: Contents) -> str:
 def summary_sentence(report: Contents) -> str:
     """Return what was found, in a few sentences."""
     misfit = report.tracing.misfit
-    if misfit is not None and not report.tracing.instead_of:
+    if misfit is not None and report.verdict != OUTLIER:
         return misfit_sentences(report, misfit)
     detection, trials = report.detection, f"{report.num_trials} trials"
     against = (
@@ -97,7 +129,7 @@ def summary_sentence(report: Contents) -> str:
     if report.tracing.beside:
         most = ModelKey(report.tracing.beside)
         found.append(f"{most} explains most of what it misses, and not all.")
-    elif report.verdict == UNEXPLAINED:
+    elif report.verdict == UNEXPLAINED and not report.tracing.bounds.replaces:
         found.append("No declared effect explains what it misses.")
     elif report.verdict == SCATTER:
         found.append(
@@ -125,8 +157,10 @@ def summary_sentence(report: Contents) -> str:
     if report.evaluation is not None:
         rows = report.before_after.set_index("metric").to_dict("index")
         rmse = rows["rmse"]
-        folds = report.tracing.refuted and report.evaluation.scheme != "held out"
-        model = report.tracing.instead_of if folds else added(report)
+        tracing = report.tracing
+        folds = tracing.refuted or tracing.bounds.replaces
+        folds = folds and report.evaluation.scheme != "held out"
+        model = tracing.instead_of if folds else added(report)
         sentence = (
             f"With {model}, the RMSE on trials that had no part in it goes "
             f"from {number(rmse['before'])} to {number(rmse['after'])}"

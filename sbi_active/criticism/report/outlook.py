@@ -108,6 +108,12 @@ def parameters(report: Contents) -> Section:
         rows.append((label, *cells))
     together = report.combinations
     text = (f"Of parameters together, {together}.",) if together else ()
+    models = [evidences[n] for n in (NONE, report.tracing.model) if n in evidences]
+    if any(e.narrow is not None or e.best is not None for e in models):
+        text += (
+            "Of a model that misses the trials the best fit stands here, with a "
+            "deviation that knows of it; of others the posterior's mean and deviation.",
+        )
     if min(draws) < FEWEST_DRAWS:
         text += (
             f'"about": below {FEWEST_DRAWS:.0f} effective samples are behind it, too '

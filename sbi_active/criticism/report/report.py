@@ -16,6 +16,7 @@ from sbi_active.criticism.report.cautions import find_warnings
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import verdict_line
 from sbi_active.messages import explained
+from sbi_active.page.page import legible
 
 
 class Report(Contents):
@@ -57,12 +58,16 @@ class Report(Contents):
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        (directory / "report.txt").write_text(f"{self}\n", encoding="utf-8")
-        (directory / "report.md").write_text(self.to_markdown(), encoding="utf-8")
+        (directory / "report.txt").write_text(
+            f"{self}\n", encoding="utf-8", errors="replace"
+        )
+        (directory / "report.md").write_text(
+            self.to_markdown(), encoding="utf-8", errors="replace"
+        )
         page = directory / "report.html"
-        page.write_text(self.to_html(), encoding="utf-8")
+        page.write_text(self.to_html(), encoding="utf-8", errors="replace")
         for name, figure in rendering.figures(self).items():
-            figure.savefig(directory / f"{name}.png", dpi=150)
+            legible(figure).savefig(directory / f"{name}.png", dpi=150)
         return page
 
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
-from sbi_active.criticism.results import OUTLIER, Detection, Tracing
-from sbi_active.criticism.steps.detection import TOO_SMALL
+from sbi_active.criticism.contradictions import BoundParameter, Bounds
+from sbi_active.criticism.report.numbers import number
+from sbi_active.criticism.results import NONE, OUTLIER, Detection, Evaluation, Tracing
+from sbi_active.criticism.steps.detection import LEVEL, TOO_SMALL
 
 #: Share of the probability that the suspects hold together.
 MASS = 0.9
+#: Held-out trials that the verdict's line names at most; the paragraph names all.
+MOST_NAMED = 3
+#: Which trials refute a verdict.
+NO_PART = "trials that had no part in it"
 
 
 def suspects(tracing: Tracing) -> tuple[float, ...]:
@@ -68,16 +75,79 @@ def of_trials(tracing: Tracing) -> Iterator[str]:
 
 
 def _why_withdrawn(tracing: Tracing) -> str:
+    if tracing.bounds.replaces:
+        return narrow_prior(tracing)
     if tracing.refuted:
         before, after = tracing.refuted
+        where = tracing.refuted_on or NO_PART
         return (
-            "it does not lower the error on trials that had no part in it: RMSE "
-            f"{before:.3g} before and {after:.3g} after"
+            f"it does not lower the error on {where}: RMSE {before:.3g} before and "
+            f"{after:.3g} after"
         )
     return (
         f"it {_rests(tracing)}, and {in_words(tracing)} may as well have a "
         "gross error: repeat its action before adding it"
     )
+
+
+def narrow_prior(tracing: Tracing) -> str:
+    """Return what a wider prior gives the bare model where it needs nothing else."""
+    bounds = tracing.bounds
+    where = [place(p) for p in bounds.parameters if p.model == NONE]
+    if not where:
+        return (
+            "no permitted action tells it from the bare model with parameters that its "
+            "prior makes improbable, and with a wider prior the model is as good"
+        )
+    what = "explains the trials as well"
+    if bounds.p_value > LEVEL:
+        what = "needs no effect"
+    return f"{' and '.join(where)}, and with a wider prior the model {what}"
+
+
+def place(parameter: BoundParameter) -> str:
+    """Return at which bound a parameter lies, in words."""
+    p = parameter
+    return f"{p.name} lies at its prior's {p.side} bound {p.bound:.6g}"
+
+
+def of_bounds(bounds: Bounds) -> Iterator[str]:
+    """Yield what each parameter at a bound of its prior would be, a sentence each."""
+    for p in bounds.parameters:
+        where = "in the bare model" if p.model == NONE else f"with {p.model}"
+        beyond = ""
+        if not math.isnan(p.beyond):
+            beyond = f" with the bound moved the best fit has {p.beyond:.3g};"
+        yield (
+            f"{p.name} is at a bound of its prior {where}, the {p.side} one "
+            f"({p.bound:.6g});{beyond} move the bound, or say why"
+        )
+
+
+def of_missed(evaluation: Evaluation | None) -> Iterator[str]:
+    """Yield a sentence on each held-out trial far outside what is predicted."""
+    for trial in () if evaluation is None else evaluation.missed:
+        how = f"missed by {number(trial.size)} {trial.unit}"
+        if math.isinf(trial.size):
+            how = "measured where the model is sure of no measurement"
+        yield (
+            f"held-out trial {trial.name} is far outside what the verdict's model "
+            f"predicts, {how}: check its record and its unit, or the model is wrong "
+            "there"
+        )
+
+
+def missed_clause(evaluation: Evaluation | None) -> str:
+    """Return which held-out trials a verdict misses, "" for none."""
+    missed = () if evaluation is None else evaluation.missed
+    if not missed:
+        return ""
+    which = f"{len(missed)} held-out trials are"
+    if len(missed) <= MOST_NAMED:
+        names = " and ".join(trial.name for trial in missed)
+        which = f"held-out trial{'s' * (len(missed) > 1)} {names} "
+        which += "is" if len(missed) == 1 else "are"
+    return f"; {which} far outside it"
 
 
 def of_noise(detection: Detection | None) -> Iterator[str]:

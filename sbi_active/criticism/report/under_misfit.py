@@ -44,7 +44,7 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
         return (
             f"{begin}: {_size(report, own.left_out)} on left-out {misfit.left_out}. "
             "No declared effect helps to predict them."
-            f"{_guessed(report)}"
+            f"{_withdrawn(report, misfit)}{_guessed(report)}"
         )
     bare, model = misfit.of("none"), misfit.of(str(ModelKey(misfit.helps)))
     change = f"{_change(report, bare.left_out, model.left_out)}"
@@ -79,6 +79,20 @@ def misfit_sentences(report: Contents, misfit: Misfit) -> str:
         change = _change(report, bare.held_out, model.held_out)
         found.append(f"On held-out trials: {change}.")
     return " ".join(found)
+
+
+def _withdrawn(report: Contents, misfit: Misfit) -> str:
+    """Return the errors with effects that are not named since these do not fall."""
+    name = report.tracing.instead_of
+    if not (name and report.tracing.refuted):
+        return ""
+    bare, own = misfit.of("none"), misfit.of(name)
+    left = _change(report, bare.left_out, own.left_out)
+    said = f" With {name} the error on left-out {misfit.left_out} goes from {left}"
+    if own.held_out is not None and bare.held_out is not None:
+        held = _change(report, bare.held_out, own.held_out)
+        said += f", on held-out trials from {held}"
+    return f"{said}."
 
 
 def _either(names: Sequence[str]) -> str:
@@ -131,6 +145,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         near = "tenth"
     if misfit.left_out == "trials":  # fewer of them do not tell
         error += ", or a parameter that differs from trial to trial"
+    model = report.tracing.instead_of or "the verdict's model"
     text = [
         f"Every model carries {error}, so "
         "that P is one evidence for alarm and verdict. Admitted are the models whose "
@@ -140,7 +155,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         "mean squares of models fitted without what they predict. The "
         f"sensor's error is {_size(report, misfit.sensor)}; the excess is what is "
         "beyond it, as a share of the bare model's.",
-        f"Beside the verdict's model {name} has {misfit.size:.2g} times the "
+        f"Beside {model} {name} has {misfit.size:.2g} times the "
         f"sensor's standard deviation{scale}.",
     ]
     items = [

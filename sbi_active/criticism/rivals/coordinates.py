@@ -23,6 +23,10 @@ Array = NDArray[Any]
 NUM_DRAWS = 1_000
 #: A positive number whose prior spans this ratio (5 % to 95 %) is searched in logs.
 WIDE = 100.0
+#: Share of draws within a share of the prior's range from a bound from which they lie
+#: at it, and the deviation, in that range, from which trials leave a parameter open:
+#: it is near any bound now and then. (Of a uniform prior it is .29.)
+AT_EDGE, EDGE, OPEN = 0.05, 0.01, 0.2
 
 
 class SearchCoordinates:
@@ -95,6 +99,24 @@ class SearchCoordinates:
         """Return (theta, phi), natural values of shape (n, k), within their bounds."""
         low, high = (end[: z.shape[1]] for end in self._bounds())
         return np.clip(z, low, high)
+
+    def sides(self, u: Array) -> NDArray[np.int64]:
+        """Return the bound at which each of the first coordinates lies, (k,).
+
+        Args:
+            u: Draws of a posterior, shape (n, k).
+
+        Returns:
+            -1 for the lower one, 1 for the upper one, 0 for none.
+        """
+        low, high = self.low[: u.shape[1]], self.high[: u.shape[1]]
+        bounded = np.isfinite(low) & np.isfinite(high)
+        low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 1.0)
+        place = (u - low) / (high - low)
+        below, above = (place < EDGE).mean(0), (place > 1 - EDGE).mean(0)
+        is_there = np.maximum(below, above) > AT_EDGE
+        is_there &= bounded & (place.std(0) <= OPEN)
+        return np.where(is_there, np.where(below > above, -1, 1), 0)
 
     def split(self, u: Array) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect, as the simulator takes them."""

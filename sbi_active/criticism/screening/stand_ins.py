@@ -8,6 +8,7 @@ from dataclasses import replace
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import Evaluation, Tracing
+from sbi_active.criticism.screening.wider_prior import beyond_bounds
 from sbi_active.criticism.steps.influence import unless_refuted, withdrawn
 
 #: Tail probability of the chi-square below which a model is not adopted, on fitted
@@ -24,14 +25,15 @@ def judged(
 
     A force is adopted as an explanation only where the chi-square of its model has a
     tail probability of at least .01, and the error on trials that had no part in it
-    falls. One with which that error rises is withdrawn.
+    falls. One with which that error rises is withdrawn, and so are effects that a wider
+    prior makes up for.
 
     Args:
         rivals: The models.
         tracing: Which effects the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
-    tracing = unless_refuted(tracing, evaluation)
+    tracing = beyond_bounds(rivals, unless_refuted(tracing, evaluation))
     effects = {e.name: e for e in rivals.library}
     if not any(is_force(effects[name]) for name in tracing.chosen):
         return tracing

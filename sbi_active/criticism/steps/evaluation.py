@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
+from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.progress import stage
 from sbi_active.simulation import GaussianNoise
@@ -36,14 +37,16 @@ def evaluate_held_out(
     held_out: Trials,
     *,
     num_draws: int = NUM_DRAWS,
+    level: float = LEVEL,
 ) -> Evaluation:
-    """Return the error on held-out trials.
+    """Return the error on held-out trials, and which of them are far outside.
 
     Args:
         rivals: The models, fitted to other trials.
         tracing: What was traced in those.
         held_out: Trials to score.
         num_draws: From each posterior.
+        level: Probability that a right verdict has any trial called far outside.
     """
     before, after = _predictions(rivals, tracing, held_out, num_draws)
     num = len(held_out)
@@ -55,6 +58,8 @@ def evaluate_held_out(
         (tracing.verdict,) * num,
         held_out.names,
     )
+    missed = missed_trials(rivals, tracing, held_out, before, after, level=level)
+    found = replace(found, missed=missed)
     return replace(found, p_value=tail(after, held_out)) if _is_known(rivals) else found
 
 

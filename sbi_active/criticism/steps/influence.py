@@ -31,6 +31,7 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -41,6 +42,8 @@ FEWEST = 20.0
 OVERESTIMATED = 5.0
 #: Odds against a gross error from which one trial may speak for an effect alone.
 DECISIVE = 50.0
+#: Score of trials that speaks against effects.
+DENSITY = "log predictive density"
 
 
 def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
@@ -85,20 +88,77 @@ def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
     """Return what was traced, its effects withdrawn where further trials refute them.
 
     Their squared error is then the larger with the effects, and their density the
-    smaller by a Bayes factor of 20.
+    smaller by a Bayes factor of 20. Where every model misses, what was said to predict
+    better must lower the errors that are reported: on left-out trials and on held-out
+    ones.
 
     Args:
         tracing: Which effect the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
-    if not tracing.chosen or evaluation is None:
+    if not tracing.chosen:
         return tracing
-    density = "log predictive density"
-    change = evaluation.after[density] - evaluation.before[density]
-    rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
-    if rmse["ratio"] <= 1 or change.sum() >= -THRESHOLD:
+    if tracing.misfit is not None:
+        for where, error in _reported(tracing.misfit, evaluation).items():
+            if error[1] >= error[0]:
+                made = replace(withdrawn(tracing), refuted=error)
+                return replace(made, refuted_on=where)
+    if evaluation is None:
         return tracing
-    return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+    change = evaluation.after[DENSITY] - evaluation.before[DENSITY]
+    told = _told(evaluation)
+    before, after = _rmse(evaluation, told)
+    if after <= before or change[told].sum() >= -THRESHOLD:
+        return tracing
+    return replace(withdrawn(tracing), refuted=(before, after))
+
+
+def _reported(
+    misfit: Misfit, evaluation: Evaluation | None
+) -> dict[str, tuple[float, float]]:
+    """Return the errors before and after that a verdict under misfit is told with.
+
+    Of several channels in sensor deviations.
+    """
+    bare, own = misfit.of(NONE), misfit.of(str(ModelKey(misfit.helps)))
+    unit = misfit.sensor if len(misfit.sensor) > 1 else 1.0
+    beside = " in sensor deviations" if len(misfit.sensor) > 1 else ""
+
+    def pair(before: Array, after: Array) -> tuple[float, float]:
+        first, last = (np.sqrt(np.mean((e / unit) ** 2)) for e in (before, after))
+        return float(first), float(last)
+
+    found = {}
+    told = None if evaluation is None else _told(evaluation)
+    if evaluation is not None and told is not None and not told.all():
+        found["the other held-out trials"] = _rmse(evaluation, told)
+    elif bare.held_out is not None and own.held_out is not None:
+        found[f"held-out trials{beside}"] = pair(bare.held_out, own.held_out)
+    left_out = pair(bare.left_out, own.left_out)
+    return found | {f"left-out {misfit.left_out}{beside}": left_out}
+
+
+def _told(evaluation: Evaluation) -> NDArray[np.bool_]:
+    """Return the scored trials that tell models apart, (s,).
+
+    A few that no model predicts by far may have gross errors, and the chance by which
+    one model is nearer would outweigh all others. Where most are, they are the model's.
+    """
+    told = np.ones(len(evaluation.trials), bool)
+    told[[trial.position for trial in evaluation.missed if trial.by_both]] = False
+    return told if 2 * told.sum() >= len(told) else np.ones(len(told), bool)
+
+
+def _rmse(evaluation: Evaluation, told: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the error before and after, over some of the scored trials."""
+    if told.all():
+        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
+        return rmse["before"], rmse["after"]
+    before, after = (
+        float(np.sqrt(np.mean(scores["rmse"][told] ** 2)))
+        for scores in (evaluation.before, evaluation.after)
+    )
+    return before, after
 
 
 def withdrawn(tracing: Tracing) -> Tracing:
@@ -106,12 +166,14 @@ def withdrawn(tracing: Tracing) -> Tracing:
     p = tracing.probabilities
     outlier, other = p.get(OUTLIER, 0.0), p.get(UNEXPLAINED, 0.0)
     by_chance = is_left_to_chance(tracing) or outlier > other
+    misfit = tracing.misfit
     return replace(
         tracing,
         verdict=OUTLIER if by_chance else UNEXPLAINED,
         chosen=(),
         beside=(),
         instead_of=str(ModelKey(tracing.chosen)),
+        misfit=None if misfit is None else replace(misfit, helps=()),
     )
 
 

@@ -145,7 +145,7 @@ def predict(
         mean = mean + shift
     cells, sizes = rival.error.noise_posterior(own_residual, rng)
     sizes = noise.by_number(sizes)
-    errors, sd = _errors(noise, cells, sizes, rng)
+    errors, sd = correlated_errors(noise, cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
@@ -172,7 +172,7 @@ def predict(
     )
 
 
-def _errors(
+def correlated_errors(
     noise: NoiseGrid,
     cells: Array,
     sizes: Array,

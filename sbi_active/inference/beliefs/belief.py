@@ -23,8 +23,6 @@ from sbi_active.seeding import forked_generators
 NUM_DRAWS = 20_000
 #: Below this share of q inside the support, rejection is too wasteful.
 MINIMAL_ACCEPTANCE = 1e-3
-#: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
-FEWEST_STEPS = 64
 NUM_SHOWN = 2_000  # draws behind the page of a notebook
 NUM_COMPARED = 5_000  # draws behind a realized information gain
 
@@ -304,72 +302,3 @@ def parameter_dim(prior: Distribution) -> int:
     """Return the number of parameters, without drawing from the prior."""
     shape = prior.event_shape or prior.batch_shape
     return shape[-1] if shape else 1
-
-
-def require_support(prior: Distribution | None) -> Distribution:
-    """Return the prior, or raise where it has no support to keep a belief in.
-
-    Raises:
-        ValueError: If there is no prior, it is a batch of them, or its ``support`` is
-            not implemented.
-    """
-    if prior is None:
-        raise ValueError(
-            "expected a prior, since a belief starts from it; got None; pass one "
-            "at construction, ASBI(prior)"
-        )
-    try:
-        support = prior.support
-    except (NotImplementedError, AttributeError):
-        support = None
-    if support is None:
-        raise ValueError(
-            "expected a prior with a support, which every belief keeps; got "
-            f"{type(prior).__name__} without one; use sbi.utils.BoxUniform, a torch "
-            "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
-        )
-    if prior.batch_shape:
-        with forked_generators(0):
-            draws = prior.sample(torch.Size([2]))
-        if prior.log_prob(draws).shape != (2,):
-            name = type(prior).__name__
-            raise ValueError(
-                "expected a prior of one density a parameter set; got a batch of "
-                f"{tuple(prior.batch_shape)} densities, {name}; pass "
-                f"torch.distributions.Independent({name}(...), 1)"
-            )
-    return prior
-
-
-def require_width(
-    prior: Distribution, names: Sequence[str] | None = None, *, seed: int
-) -> None:
-    """Raise where a prior is empty, or has no width that float32 can hold.
-
-    Args:
-        prior: Of the parameters.
-        names: Of the parameters, for the error.
-        seed: Of some draws.
-    """
-    with forked_generators(seed):
-        draws = prior.sample(torch.Size([256])).reshape(256, -1).float()
-    inside = within_support(prior, draws)
-    if not bool(inside.any()):
-        raise ValueError(
-            f"expected a prior with draws in its support; got {draws[0].tolist()} "
-            "outside; pass finite bounds, the lower one below the upper one"
-        )
-    draws = draws.double()
-    size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
-    steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
-    narrow = (steps < FEWEST_STEPS).nonzero()[:, 0].tolist()
-    if not narrow:
-        return
-    k = narrow[0]
-    name = f"parameter {k}" if names is None else names[k]
-    raise ValueError(
-        f"expected a prior in which parameters vary; got {name} "
-        f"within [{draws[:, k].min():.9g}, {draws[:, k].max():.9g}], fewer than "
-        f"{FEWEST_STEPS} steps of float32 wide; fix the parameter in the simulator, or "
-        "shift it to deviations from its value"
-    )

@@ -80,6 +80,10 @@ class LearnedBelief(Belief):
         largest = float(particles.log_weight.max())
         self._log_bound = min(largest, self._log_normalizer - np.log(MIN_ACCEPTANCE))
 
+    def log_likelihood(self, z: Array) -> Array:
+        """Return the learned log likelihood at the prior's coordinates (n, d), (n,)."""
+        return self._surrogate.log_likelihood(z)
+
     def _log_prob(self, theta: Tensor) -> Tensor:
         coordinates = self._surrogate.coordinates
         z = coordinates.to_z(theta)

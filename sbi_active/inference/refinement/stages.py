@@ -1,8 +1,8 @@
-"""Refinement: the posterior of all trials, simulated where it is."""
+"""Stages of a refinement: propose, simulate, regress, sample, judge."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,20 +12,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import parameter_dim, require_support
-from sbi_active.inference.beliefs.comparison import compare_orders
-from sbi_active.inference.refinement.bridged import refine_many
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.outcome_checks import check_outcomes
-from sbi_active.inference.refinement.regression_error import SMALL, widened
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.simulated import ExactRecord, refine_exactly
-from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
-from sbi_active.inference.refinement.simulated_likelihood import (
+from sbi_active.inference.declared.bridged import BridgedBelief, refine_many
+from sbi_active.inference.declared.contradiction import (
+    Contradiction,
+    compared,
+)
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.simulated import refine_exactly
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
 )
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.outcome_checks import check_outcomes
+from sbi_active.inference.refinement.regression_error import SMALL, widened
 from sbi_active.inference.refinement.trust import (
     SERIOUS_MISFIT,
     Course,
@@ -53,7 +55,6 @@ from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.outcomes import MissingRowsWarning
-from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
@@ -63,109 +64,9 @@ MOST_FORCED = 32  # regions that split misfit, as many as the options allow
 MIN_STAGE = 60  # histories below which another stage adds nothing; more by dimension
 
 
-def refine(
-    simulator: Callable[..., Any],
-    prior: Distribution,
-    action: Tensor,
-    x: Tensor,
-    *,
-    start: Distribution | Sequence[Distribution] | None = None,
-    past: HistoryRecord | None = None,
-    settings: RefinementOptions | None = None,
-    seed: int,
-) -> LearnedBelief | SimulatedBelief:
-    r"""Return the posterior of all trials given the original prior.
-
-    Stage by stage, over the whole prior and then in ellipsoids around what is still
-    plausible: simulate every executed action at each parameter set, regress the
-    outcomes on the parameters (:mod:`.surrogate`), sample prior
-    times surrogate likelihood without simulations
-    (:func:`.population_monte_carlo`), and put new
-    ellipsoids around the sample. It ends when the residuals are pure noise and a stage
-    changes nothing, or when the budget is spent.
-
-    Misfit that stays, as of a response that jumps, is no noise. Where the simulator is
-    noise-free beside a declared noise, a simulation gives the likelihood itself, and
-    the posterior is then sampled with that
-    (:func:`.importance_sample`), from the learned posterior or from the draws of the
-    earlier call; beyond six parameters at once, from Gauss-Newton modes.
-
-    A trial without a measurement counts by the probability of having none, one that was
-    partly observed by the numbers that were (:mod:`.outcomes`).
-
-
-    Args:
-        simulator: ``simulator(theta, action)``; not kept in the result.
-        prior: The original prior, with a support.
-        action: Executed actions, shape (t, action_dim).
-        x: Their observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
-        start: Where else to look first, for example a chained belief and the belief
-            before the last trial. It adds simulations and no weight, so it cannot bias.
-        past: ``belief.histories`` of an earlier call whose trials are the first of
-            these: what still lies in a region is simulated at the new actions only.
-        settings: Budget and shares; None is ``RefinementOptions()``.
-        seed: Of everything random here.
-
-    Returns:
-        The belief; ``belief.diagnostics`` says how far to trust it.
-
-    Raises:
-        ValueError: If shapes do not fit, there is no trial, the simulator is
-            deterministic, it almost never gives a measurement that a trial gave, or an
-            outcome is so far away that no parameters have a likelihood.
-
-    References:
-        Wood, Nature 2010; Price et al., J. Comp. Graph. Stat. 2018 (synthetic
-        likelihood); Cappe et al., J. Comp. Graph. Stat. 2004 (population Monte Carlo).
-
-    Example:
-        >>> from sbi.utils import BoxUniform
-        >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
-        >>> def simulator(theta, action):
-        ...     return theta * action + 0.1 * torch.randn_like(theta)
-        >>> action, x = torch.tensor([[1.0], [2.0]]), torch.tensor([[0.3], [0.6]])
-        >>> belief = refine(simulator, prior, action, x, seed=0)
-        >>> bool((belief.mean - 0.3).abs() < 0.05)
-        True
-    """
-    prior = require_support(prior)
-    settings = RefinementOptions() if settings is None else settings
-    action, outcome = _trials(action, x)
-    hints = [] if start is None else start
-    hints = [hints] if isinstance(hints, Distribution) else [*hints]
-    task = _Task(simulator, prior, action, outcome, [*hints], settings)
-    with single_thread():
-        many = {"past": past, "settings": settings, "seed": seed}
-        belief = None
-        if parameter_dim(prior) > MANY:
-            belief = refine_many(simulator, prior, action, outcome, hints=hints, **many)
-        if belief is not None:
-            return belief
-        if isinstance(past, ExactRecord) and past.leads_to(simulator, action, outcome):
-            past.table.workers = settings.workers
-            belief = refine_exactly(
-                prior,
-                SimulatedLikelihood(past.table, action, outcome),
-                past.coordinates,
-                first=[],
-                histories=past,
-                pool=past.pool,
-                settings=settings,
-                seed=seed,
-            )
-        if belief is None:
-            belief = _Stages(task, past, seed).run()
-        if settings.check_order and isinstance(belief, LearnedBelief):
-            other = replace(task, action=action.flip(0), outcome=outcome.flip(0))
-            compare_orders(
-                belief, _Stages(other, None, derive_seed(seed, "reversed")).run()
-            )
-    return belief
-
-
 @dataclass(frozen=True)
-class _Task:
-    """What is to be refined, as in :func:`refine`."""
+class Task:
+    """What is to be refined, as in :func:`.refine`."""
 
     simulator: Callable[..., Any]
     prior: Distribution
@@ -173,6 +74,40 @@ class _Task:
     outcome: Tensor
     hints: list[Distribution]
     settings: RefinementOptions
+
+    def table(self, coordinates: PriorCoordinates) -> MeanTable | None:
+        """Return where noise-free outcomes are simulated; None without declared noise.
+
+        Args:
+            coordinates: Coordinates of the prior.
+        """
+        few = coordinates.sample_prior(8, np.random.default_rng(0))
+        theta, action = coordinates.to_theta(few), self.action[:1].expand(8, -1)
+        if not declares_noise(self.simulator, theta, action):
+            return None
+        return MeanTable(self.simulator, self.settings.workers)
+
+    def many(
+        self, past: HistoryRecord | None, seed: int, *, weighted: bool = False
+    ) -> BridgedBelief | None:
+        """Return the belief by Gauss-Newton steps and sequential Monte Carlo.
+
+        Args:
+            past: Of an earlier call, as in :func:`.refine`.
+            seed: Seed of everything random.
+            weighted: Whether to end with an importance sample.
+        """
+        return refine_many(
+            self.simulator,
+            self.prior,
+            self.action,
+            self.outcome,
+            hints=self.hints,
+            past=past,
+            settings=self.settings,
+            seed=seed,
+            weighted=weighted,
+        )
 
     def jumps(self, stage: Stage) -> bool:
         """Return whether misfit is serious and the likelihood can be simulated."""
@@ -182,10 +117,17 @@ class _Task:
         return declares_noise(self.simulator, few, self.action[:1].expand(8, -1))
 
 
-class _Stages:
+class Stages:
     """The stages of one refinement: propose, simulate, fit, sample, judge."""
 
-    def __init__(self, task: _Task, past: HistoryRecord | None, seed: int) -> None:
+    def __init__(
+        self,
+        task: Task,
+        past: HistoryRecord | None,
+        seed: int,
+        *,
+        further_noise: Array | None = None,
+    ) -> None:
         self.task, self.settings, self.seed = task, task.settings, seed
         self.rng = np.random.default_rng(derive_seed(seed, "refine"))
         self.coordinates = PriorCoordinates(task.prior, self.rng)
@@ -193,6 +135,7 @@ class _Stages:
         self.histories = Histories(
             *(task.simulator, task.action, observed, self.coordinates),
             *(seed, past, self.settings.workers),
+            further_noise=further_noise,
         )
         self.regions = [whole_space(self.coordinates.dim)]
         for hint in task.hints:
@@ -206,6 +149,7 @@ class _Stages:
         self.least = max(MIN_STAGE, 2 * fewest_rows(self.coordinates.dim))
 
     def run(self) -> LearnedBelief | SimulatedBelief:
+        """Return the belief of the last stage."""
         while True:
             self._simulate(self._size())
             next_size = self._size()
@@ -220,8 +164,35 @@ class _Stages:
             if is_settled or (enough and self.task.jumps(stage)):
                 break
             self._propose(stage, next_size)
-        exact = self._simulated(stage) if self.task.jumps(stage) else None
+        can_be_exact = self.histories.further_noise is None and self.task.jumps(stage)
+        exact = self._simulated(stage) if can_be_exact else None
         return self._learned(stage, fitted) if exact is None else exact
+
+    def contradiction(self) -> Contradiction | None:
+        """Return what contradicts at the draw that the last stage explains best."""
+        stage, task = self.course.stages[-1], self.task
+        t, label = len(task.action), stage.surrogate.assign(stage.draws)
+        best: Array | None = None
+        for k, fit in enumerate(stage.surrogate.regressions):
+            if not (label == k).any():
+                continue
+            error, widening = fit.whitened(stage.draws[label == k])
+            squares = (error.reshape(len(error), t, -1) ** 2).sum(2)
+            squares = squares / np.minimum(widening, 2.0)[:, None]
+            least = squares[squares.sum(1).argmin()]
+            best = least if best is None or least.sum() < best.sum() else best
+        if best is None:
+            return None
+        sds = torch.from_numpy(self.histories.noise_sds).mean(0)
+        sds = torch.where(sds > 0, sds, torch.inf)
+        return compared(
+            task.action,
+            task.outcome,
+            lambda gap: gap.flatten(1) / sds,
+            best,
+            num_fitted=self.coordinates.dim,
+            level=self.settings.contradiction_level,
+        )
 
     def _size(self) -> int:
         """Return the histories of the next stage."""
@@ -387,14 +358,3 @@ def _unbounding(coordinates: PriorCoordinates) -> Unbounding | None:
     """Return the map to where edges are no concern, which a few edges are not."""
     is_needed = coordinates.bounded.sum() > MANY
     return Unbounding(coordinates.bounded) if is_needed else None
-
-
-def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    action, x = torch.as_tensor(action), torch.as_tensor(x)
-    if action.ndim != 2 or x.ndim < 1 or len(action) != len(x) or len(action) == 0:
-        raise ValueError(
-            "expected action (t, action_dim) and x (t, *x_shape) with as many trials, "
-            f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; stack "
-            "the trials along axis 0"
-        )
-    return action.float().cpu(), x.double().cpu().reshape(len(x), *x.shape[1:] or (1,))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
+from sbi_active.inference.declared.simulated import misplaced
 from sbi_active.inference.refinement.regression_error import (
-    LARGE,
     SMALL,
     expected_error,
 )
@@ -30,8 +30,7 @@ LIGHT_TAILS = -0.3  # excess kurtosis; -1.2 for uniform noise, 0 for Gaussian
 SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 UNSETTLED = 0.1  # nats a dimension
 CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
-EDGE = 0.5  # mass within 1 % of the edge of one parameter that calls for a warning
-RARE = 1e-3  # tail probability of the observation that calls for a warning
+UNTRUSTED = 0.1  # nats off, by the number of simulations, that call for a warning
 
 
 @dataclass(frozen=True)
@@ -200,7 +199,7 @@ def diagnose(
             "its noise",
         ),
         "small_error": (
-            last.error <= LARGE,
+            last.error <= UNTRUSTED,
             last.error,
             "the belief is off by about {:.2g} nats, since its regressions rest on few "
             "simulations for so many parameters and numbers; raise num_histories",
@@ -237,27 +236,6 @@ def diagnose(
             "share_invalid": share_invalid,
         },
     )
-
-
-def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
-    """Return warnings of a belief that may be far from the truth.
-
-    By the tail probability of each trial and of all, and the belief's mass near the
-    edge of one parameter.
-    """
-    warnings = []
-    if joint < RARE or min(tail) < RARE / len(tail):
-        warnings.append(
-            f"the observations are unlike anything simulated (tail probability "
-            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
-            "excludes the truth, or a measurement is wrong"
-        )
-    if edge_mass > EDGE:
-        warnings.append(
-            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
-            "prior may exclude the truth"
-        )
-    return warnings
 
 
 def _noise_shape(

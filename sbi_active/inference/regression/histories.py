@@ -81,6 +81,8 @@ class Histories:
         past: Histories of the first of these trials; those that are still of use are
             simulated at the further actions only.
         workers: Of the simulations.
+        further_noise: Standard deviations of noise to add to each trial's outcomes,
+            shape (t, q); None adds none.
 
     Attributes:
         z: Coordinates of the parameters, shape (n, d).
@@ -104,9 +106,11 @@ class Histories:
         seed: int,
         past: HistoryRecord | None = None,
         workers: Workers = IN_PROCESS,
+        *,
+        further_noise: Array | None = None,
     ) -> None:
         self.simulator, self.action = simulator, action
-        self.workers = workers
+        self.workers, self.further_noise = workers, further_noise
         self._seen = np.isfinite(x)
         self.used = self._seen.reshape(-1)
         self.observed = np.where(self._seen, x, 0.0).reshape(-1)
@@ -170,6 +174,18 @@ class Histories:
             present = np.concatenate([present, further[1]], 1)
         self._append(theta, x, present, twice, is_overview=is_overview)
         return len(theta)
+
+    def fresh(self, theta: Tensor) -> tuple[Array, NDArray[np.bool_]]:
+        """Return outcomes less the observed ones (n, t * q), and which rows lack some.
+
+        They do not join the histories.
+
+        Args:
+            theta: Parameters, shape (n, d).
+        """
+        x, _ = self._simulate(theta, 0)
+        lacks = ~np.isfinite(x[:, self.used]).all(1) | (x == LOST).any(1)
+        return x - self.observed, lacks
 
     def record(self) -> HistoryRecord:
         """Return the histories for a later call with further trials."""
@@ -257,6 +273,10 @@ class Histories:
                 "pass x (t, *x_shape) of the simulator's shape"
             )
         x = np.where(np.isfinite(x), x, np.nan)
+        if self.further_noise is not None:
+            rng = np.random.default_rng(derive_seed(seed, "further noise"))
+            sds = self.further_noise[trial.numpy()]
+            x = x + sds * rng.standard_normal(x.shape)
         lost = (rows.status == Outcome.MISSING).numpy()
         self.num_missing += int(lost.sum())
         x[lost] = LOST
@@ -295,6 +315,14 @@ class Histories:
         self._is_overview = np.concatenate([self._is_overview, overview])
         self.first += (start + twice).tolist()
         self.second += range(start + num_places, start + len(theta))
+
+    @property
+    def noise_sds(self) -> Array:
+        """Standard deviations of the noise by repeated simulations, shape (t, q)."""
+        gap = self.x[self.first] - self.x[self.second]
+        with np.errstate(all="ignore"):
+            variance = np.nanmean(0.5 * gap**2, 0)
+        return np.sqrt(np.nan_to_num(variance)).reshape(self._seen.shape)
 
     @property
     def agrees(self) -> NDArray[np.bool_]:

@@ -199,6 +199,10 @@ class LocalRegression:
         leverage = ((features @ self.root) ** 2).sum(1)
         return features @ self.coefficient, 1 + leverage
 
+    def whitened_outcomes(self, x: Array) -> Array:
+        """Return outcomes less the observed ones, whitened, shape (n, q)."""
+        return _spread(self.covariance.whiten(x[:, self.used]), self.used)
+
     @cached_property
     def compact(self) -> Array:
         """Fewest numbers whose squares add up to those of the outcomes, (p, min(p, q)).

@@ -71,6 +71,8 @@ class PriorCoordinates:
     def inside(self, z: Array) -> NDArray[np.bool_]:
         """Return whether the parameters lie in the prior's support, shape (n,)."""
         theta = self.to_theta(z)
+        if not len(theta):  # which constraints of a mixed prior cannot reshape
+            return np.zeros(0, dtype=bool)
         finite = theta.isfinite().all(-1)
         inside = within_support(self.prior, torch.nan_to_num(theta))
         return (finite & inside).numpy()
@@ -105,7 +107,9 @@ class PriorCoordinates:
     def sample_prior(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return coordinates of draws from the prior, shape (n, d)."""
         with forked_generators(int(rng.integers(2**31))):
-            return self.to_z(self.prior.sample(torch.Size([num_samples])))
+            # Some priors cannot draw nothing.
+            theta = self.prior.sample(torch.Size([max(num_samples, 1)]))
+        return self.to_z(theta[:num_samples])
 
     def _forward(self, theta: Array) -> Array:
         with np.errstate(invalid="ignore", divide="ignore"):

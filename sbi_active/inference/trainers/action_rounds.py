@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.belief import require_support
+from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import RoundRows, check_proposal, round_rows
 from sbi_active.inference.rounds.sbi_arguments import given_arguments

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -17,13 +18,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.belief import (
-    Belief,
-    ChainedBelief,
-    UnchangedBelief,
-    require_support,
-)
+from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, UnchangedBelief
 from sbi_active.inference.beliefs.comparison import compare
+from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
@@ -32,7 +29,7 @@ from sbi_active.inference.networks.training import (
     train_mixture_density,
 )
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.stages import refine
+from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
@@ -204,7 +201,14 @@ class ASBI(MixtureRounds, NPE_C):
 
     def _model(self, estimator: Any, *arguments: Any) -> ActionPosterior:
         with kept_generators():
-            packed = NPE_C._create_posterior(self, estimator, *arguments)
+            try:
+                packed = NPE_C._create_posterior(self, estimator, *arguments)
+            except (AssertionError, NotImplementedError):
+                # sbi has no transform of a mixture, nor of a prior without moments. It
+                # serves the search of ``map`` alone.
+                *others, parameters = arguments
+                plain = replace(parameters, enable_transform=False)
+                packed = NPE_C._create_posterior(self, estimator, *others, plain)
         assert self._action_dim is not None
         assert self._outcome_shape is not None
         return ActionPosterior(packed, self._outcome_shape, self._action_dim)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief, named
-from sbi_active.inference.refinement.settings import RefinementOptions
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.inference.rounds.rows import Observation
 

@@ -14,8 +14,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.belief import Belief, require_support
+from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
+from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.factors import ActionFactor
 from sbi_active.inference.products.belief import sample_product
 from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, MarkovChainBelief
@@ -24,7 +26,6 @@ from sbi_active.inference.products.product import (
     TrainedRegion,
     widened,
 )
-from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds

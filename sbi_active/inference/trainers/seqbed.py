@@ -13,11 +13,12 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.belief import Belief, require_support
+from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
+from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.lfire_model import LFIREModel, fit_log_ratios
-from sbi_active.inference.refinement.settings import RefinementOptions
 from sbi_active.inference.rounds.rows import (
     Observation,
     RoundRows,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.mujoco.models.machine import Rows
 from sbi_active.mujoco.models.names import element_id, start_places
-from sbi_active.mujoco.models.running import start_states
+from sbi_active.mujoco.models.running import begin, start_states
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
@@ -165,17 +165,16 @@ def _released(model: Any) -> dict[str, Any]:
 def _watched(model: Any, models: Sequence[Any], rows: Rows) -> dict[str, Array]:
     """Return states and forces along rows."""
     mujoco = mujoco_of()
-    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
     found: dict[str, list[Array]] = {}
     steps = rows.controls.shape[1]
     every = max(1, steps // NUM_STATES)
     starts = start_states(model, rows)
     for own, start, controls in zip(models, starts, rows.controls, strict=True):
         data = mujoco.MjData(own)
-        mujoco.mj_setState(own, data, start, kind)
+        begin(own, data, start, controls[0])
         inertia = np.array(own.dof_M0)
         for k in range(steps):
-            data.ctrl[:] = controls[k]
+            data.ctrl[:] = controls[k, : own.nu]
             mujoco.mj_step(own, data)
             if k % every or data.warning.number.any():
                 continue

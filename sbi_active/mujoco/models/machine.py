@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.fields import copied, restore
-from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
 from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
 
@@ -148,6 +148,24 @@ class Machine:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_models": {}}
+
+    def require_inertia(self) -> None:
+        """Raise where a joint has no inertia at the lowest parameters.
+
+        Every state is then NaN, which would pass for an outcome that was invalid.
+        """
+        low = np.array([p.low for p in self.parameters])
+        with quiet():
+            inertia = self._model(()).written(0, low, {}).dof_M0
+        lost = np.flatnonzero(~(inertia > mujoco_of().mjMINVAL))
+        if len(lost):
+            joint = int(self.model.dof_jntid[lost[0]])
+            bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
+            raise ValueError(
+                "expected joints that have inertia; got none of "
+                f"{names_of(self.model, 'joint')[joint]!r} at {bounds}; raise the "
+                "lower bounds of masses above 0, or give the joint an armature"
+            )
 
     def models(
         self, rows: Rows, run: Callable[[Model, list[Any], Rows], Array], size: int

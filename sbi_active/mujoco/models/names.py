@@ -8,7 +8,15 @@ from typing import Any
 
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["KINDS", "element_id", "names_of", "require_name", "start_places"]
+__all__ = [
+    "KINDS",
+    "element_id",
+    "held_places",
+    "meaning",
+    "names_of",
+    "require_name",
+    "start_places",
+]
 
 #: Kinds of elements: what MuJoCo calls them, and the count in a model.
 KINDS = {
@@ -89,3 +97,36 @@ def start_places(model: Any) -> dict[str, int]:
             state = f"{name} activation"
             found[state if number == 1 else f"{state}[{k}]"] = first + at + k
     return found
+
+
+def held_places(model: Any) -> dict[str, int]:
+    """Return places of what a trial holds in (ctrl, mocap_pos, mocap_quat), by name.
+
+    Controls are "motor control"; the pose of a mocap body is "target mocap[0]" to
+    "target mocap[6]", a position and a quaternion.
+    """
+    held = {f"{n} control": i for i, n in enumerate(names_of(model, "actuator"))}
+    first, turn = model.nu, model.nu + 3 * model.nmocap
+    for body, name in enumerate(names_of(model, "body")):
+        k = int(model.body_mocapid[body])
+        if k < 0:
+            continue
+        held |= {f"{name} mocap[{j}]": first + 3 * k + j for j in range(3)}
+        held |= {f"{name} mocap[{3 + j}]": turn + 4 * k + j for j in range(4)}
+    return held
+
+
+def meaning(name: str, model: Any) -> str:
+    """Return what an entry of an action sets, by its name among start states.
+
+    A name that a joint and an actuator share is the actuator's, as in "hinge control";
+    the joint's start is then "hinge position".
+
+    Args:
+        name: Name of the entry.
+        model: Compiled model.
+    """
+    if name in names_of(model, "actuator"):
+        return f"{name} control"
+    joint = name.removesuffix(" position")
+    return name if name in start_places(model) else joint

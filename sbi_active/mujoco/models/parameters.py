@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from sbi_active.mujoco.models.fields import Entry, field_of, set_to
 from sbi_active.mujoco.models.quantities import (
     FRAMES,
+    NEVER_NEGATIVE,
     Quantity,
     find_quantity,
     is_movable,
@@ -131,6 +132,11 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
             found.append(Bounded(name, low, high, edit=rest[0]))
             continue
         quantity = find_quantity(model, rest[0] if rest else name)
+        if quantity.attribute in NEVER_NEGATIVE and low < 0:
+            raise ValueError(
+                f"expected bounds of {str(quantity)!r} from 0 on; got {low:g} to "
+                f"{high:g}; raise the lower one"
+            )
         if quantity.attribute.startswith("com_"):
             _require_movable(model, quantity.name)
         unit = quantity.unit(model)

@@ -45,6 +45,7 @@ from sbi_active.mujoco.models.spec import mujoco_of
 __all__ = [
     "ATTRIBUTES",
     "FRAMES",
+    "NEVER_NEGATIVE",
     "Quantity",
     "find_quantity",
     "is_hinge",
@@ -256,6 +257,18 @@ ATTRIBUTES: dict[str, dict[str, Entries]] = {
         "viscosity": lambda model, i: [Entry("opt.viscosity", ())],
     },
 }
+
+#: Attributes that MuJoCo's equations have no meaning for below zero.
+NEVER_NEGATIVE = frozenset(
+    {
+        "armature",
+        "friction",
+        "frictionloss",
+        "mass",
+        "rolling_friction",
+        "torsional_friction",
+    }
+)
 
 #: Of hinges and slides.
 _UNITS = {

@@ -20,7 +20,7 @@ from sbi_active.mujoco.models.machine import Model, Rows
 from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["readings", "start_states"]
+__all__ = ["begin", "held_states", "readings", "start_states"]
 
 Array = NDArray[Any]
 
@@ -31,7 +31,7 @@ def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -
     Args:
         model: Of all rows.
         models: One a row.
-        rows: Of controls of shape (n, steps, nu).
+        rows: Rows whose controls have shape (n, steps, nu + 7 nmocap).
         threads: Of MuJoCo's rollout.
 
     Returns:
@@ -56,8 +56,40 @@ def start_states(model: Model, rows: Rows) -> Array:
     states = np.repeat(state[None], len(rows), 0)
     places = start_places(base)
     for name, value in rows.start.items():
-        states[:, 1 + places[name]] = value  # the time comes first
+        if name in places:  # and not held, as a control is
+            states[:, 1 + places[name]] = value  # the time comes first
     return states
+
+
+def begin(model: Any, data: Any, state: Array, held: Array) -> None:
+    """Set the start of a row.
+
+    Args:
+        model: Model of the row.
+        data: Data of the model, to set.
+        state: Physics state, shape (nstate,).
+        held: Controls and poses of mocap bodies, shape (nu + 7 nmocap,).
+    """
+    mujoco = mujoco_of()
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+    mujoco.mj_setState(model, data, held, held_kind())
+
+
+def held_kind() -> int:
+    """Return which of MuJoCo's states a row's controls are."""
+    state = mujoco_of().mjtState
+    kinds = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
+    return sum(kind.value for kind in kinds)
+
+
+def held_states(model: Model) -> Array:
+    """Return what is held where nothing says otherwise, shape (nu + 7 nmocap,)."""
+    mujoco = mujoco_of()
+    mujoco.mj_resetData(model.base, model.data)
+    held = np.empty(mujoco.mj_stateSize(model.base, held_kind()))
+    mujoco.mj_getState(model.base, model.data, held, held_kind())
+    return held
 
 
 def _settle(model: Model, models: list[Any], rows: Rows, start: Array) -> None:
@@ -67,8 +99,7 @@ def _settle(model: Model, models: list[Any], rows: Rows, start: Array) -> None:
     mujoco = mujoco_of()
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
     for i, own in enumerate(models):
-        mujoco.mj_resetData(own, model.data)
-        mujoco.mj_setState(own, model.data, start[i], kind)
+        begin(own, model.data, start[i], rows.controls[i, 0])
         mujoco.mj_forward(own, model.data)
         for change in model.inserted:
             change.settle(own, model.data, rows.changes[change][i])
@@ -82,7 +113,10 @@ def _rolled_out(
     steps = rows.controls.shape[1]
     data = [mujoco.MjData(model.base) for _ in range(threads)]
     state, sensors = mujoco.rollout.rollout(
-        models, data, start, rows.controls, nstep=steps, persistent_pool=threads > 1
+        *(models, data, start, rows.controls),
+        control_spec=held_kind(),
+        nstep=steps,
+        persistent_pool=threads > 1,
     )
     # A rollout ends where MuJoCo warns, and repeats its last state from there on.
     span = steps * np.array([m.opt.timestep for m in models])
@@ -94,14 +128,12 @@ def _stepped(
     model: Model, models: list[Any], start: Array, rows: Rows, threads: int
 ) -> tuple[Array, Array]:
     mujoco = mujoco_of()
-    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
     steps, step = rows.controls.shape[1], model.base.opt.timestep
     while len(model.datas) < len(models):
         model.datas.append(mujoco.MjData(model.base))
     datas = model.datas[: len(models)]
-    for own, data, state in zip(models, datas, start, strict=True):
-        mujoco.mj_resetData(own, data)
-        mujoco.mj_setState(own, data, state, kind)
+    for i, (own, data) in enumerate(zip(models, datas, strict=True)):
+        begin(own, data, start[i], rows.controls[i, 0])
     x = np.empty((len(rows), steps, model.base.nsensordata))
     # Views: what MuJoCo writes is there at the next look.
     q, v = [d.qpos for d in datas], [d.qvel for d in datas]
@@ -110,7 +142,7 @@ def _stepped(
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
     following = _Following(model, models, datas, rows)
-    given = [*rows.controls]
+    given = [*rows.controls[..., : model.base.nu]]
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
             if rows.forces:

@@ -10,6 +10,9 @@ from pathlib import Path
 import filelock
 
 from sbi_active.messages import Explained
+from sbi_active.simulation.bank.segments import write_file
+
+_inherited: list[filelock.BaseFileLock] = []
 
 
 class LockedError(Explained, OSError):
@@ -29,6 +32,19 @@ class LockedError(Explained, OSError):
         )
 
 
+def require_no_link(path: Path) -> None:
+    """Raise where a file that is written to is a link: it would lead elsewhere.
+
+    Raises:
+        OSError: If the path is a symbolic link.
+    """
+    if path.is_symlink():
+        raise OSError(
+            f"expected {path} as a file; got a link to {path.readlink()}; remove it, "
+            "after a look at where the folder comes from"
+        )
+
+
 class WriterLock:
     """Exclusive right to write to a folder, lost with the process that holds it.
 
@@ -37,8 +53,8 @@ class WriterLock:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._lock = filelock.FileLock(folder / "writer.lock", thread_local=False)
+        self._folder, self._process = folder, os.getpid()
+        self._lock = self._new()
         # The lock file itself is truncated by whoever tries to lock it.
         self._holder = folder / "writer.json"
 
@@ -49,10 +65,13 @@ class WriterLock:
     def __exit__(self, *_: object) -> None:
         self.release()
 
+    def _new(self) -> filelock.BaseFileLock:
+        return filelock.FileLock(self._folder / "writer.lock", thread_local=False)
+
     @property
     def held(self) -> bool:
-        """Whether this object holds the lock."""
-        return self._lock.is_locked
+        """Whether this object holds the lock, in this process."""
+        return self._lock.is_locked and self._process == os.getpid()
 
     def acquire(self) -> None:
         """Take the lock.
@@ -60,6 +79,12 @@ class WriterLock:
         Raises:
             LockedError: If another writer, in this process or another, holds it.
         """
+        if self._process != os.getpid():
+            # A forked child does not hold what its parent does, and must not give it
+            # back: the object that it inherited stays.
+            _inherited.append(self._lock)
+            self._lock, self._process = self._new(), os.getpid()
+        require_no_link(self._folder / "writer.lock")
         try:
             self._lock.acquire(timeout=0)
         except filelock.Timeout as error:
@@ -73,7 +98,8 @@ class WriterLock:
                 str(self._folder),
             ) from error
         text = json.dumps({"pid": os.getpid(), "host": platform.node()})
-        self._holder.write_text(text)
+        # By another name: a link in a folder that somebody sent leads to his file.
+        write_file(self._holder, text.encode())
 
     def release(self) -> None:
         """Give the lock back; nothing happens where it is not held."""

@@ -79,9 +79,11 @@ def test_a_hidden_bias_alarms_and_is_adopted(adopted):
     c, before, health, report = adopted
     assert health == "alarm"
     assert report.verdict == "bias"
-    # The right slope, on the bare simulator, lies far outside the belief.
-    log_p = before.log_prob(torch.tensor([0.5]))
-    assert bool(log_p < before.log_prob(before.sample((500,))).quantile(0.02))
+    # The bare simulator explains the trials at no slope: its belief is as wide as they
+    # scatter, and says so.
+    assert not before.diagnostics.trustworthy
+    assert before.diagnostics.noise_inflation > 3
+    assert float(before.log_prob(torch.tensor([0.5]))) > -2
     assert c.simulator is report.simulator
     assert c.prior is report.prior
     # Five measurements of noise .1: below .1 each.

@@ -126,7 +126,7 @@ SHORT = "trial,time,action_v,x_y"
         (
             ["1,0,1,2"],
             "trial,time[h],action_v,x_y",
-            "times in s, ms, us, min; got h in",
+            "times in s, ms, us, ns, min; got h in",
         ),
         (["1,0,1,2,3"], f"{SHORT},time_s", "one column time; got time, time_s"),
         (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),

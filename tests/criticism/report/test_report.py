@@ -11,8 +11,8 @@ from sbi.utils import BoxUniform
 
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Trials, joint_prior
+from sbi_active.criticism.contradictions import MissedTrial, SevereTest
 from sbi_active.criticism.report import find_warnings, with_error
-from sbi_active.criticism.results import SevereTest
 from tests.criticism.report.reports import (
     DRAG,
     evaluation,
@@ -41,6 +41,36 @@ def test_the_verdict_line_says_what_limits_it():
         "Verdict: drag (P = 0.81), not robust to its prior; no permitted action tells "
         "it from bias"
     )
+
+
+def test_a_verdict_of_none_says_what_is_likelier():
+    made = tracing("none")
+    line = str(report(tracing=made, residuals_after=None)).splitlines()[0]
+    assert line == (
+        "Verdict: none (P < .01), no alarm, though drag is likelier (P = 0.81)"
+    )
+    sure = replace(made, probabilities=made.probabilities | {"none": 0.9, "drag": 0.05})
+    line = str(report(tracing=sure, residuals_after=None)).splitlines()[0]
+    assert line == "Verdict: none (P = 0.90)"
+
+
+def test_what_is_withdrawn_has_no_probability_that_is_another_s():
+    made = tracing("unexplained", instead_of="drag", refuted=(1.0, 2.0))
+    text = flat(report(tracing=made))
+    assert text.startswith("Verdict: unexplained, and not drag ")
+    assert "drag is not named, as the warnings say" in text
+
+
+def test_many_held_out_trials_are_counted_in_the_line_and_named_below():
+    missed = tuple(
+        MissedTrial(position=i, name=f"{i}", size=60.0 - i, p_value=0.0, by_both=True)
+        for i in range(4)
+    )
+    made = report(evaluation=replace(evaluation(), missed=missed))
+    assert str(made).splitlines()[0].endswith("; 4 held-out trials are far outside it")
+    for i in range(4):
+        assert f"Held-out trial {i} is far outside what" in flat(made)
+        assert any(f"held-out trial {i} is far" in w for w in made.warnings)
 
 
 def test_a_guess_is_called_a_guess():

@@ -85,3 +85,17 @@ def test_nuisances_of_all_trials_move_together():
     assert phi["wide"].numpy() == pytest.approx(2.0)
     expected = np.arange(3.0, 9.0).reshape(1, 3, 2)
     assert phi["start"].numpy() == pytest.approx(expected)
+
+
+def test_a_coordinate_is_at_the_bound_where_its_draws_pile_up():
+    c, rng = coordinates(), np.random.default_rng(0)
+    for z, side in (
+        (1.0 + 0.02 * rng.random((200, 1)), -1),
+        (3.0 - 0.02 * rng.random((200, 1)), 1),
+        (2.0 + 0.02 * rng.normal(size=(200, 1)), 0),
+        (1.0 + 2.0 * rng.random((200, 1)), 0),  # the trials leave it open
+    ):
+        whole = np.concatenate([z, np.ones((200, c.dim - 1))], 1)
+        assert c.sides(c.from_z(whole)[:, :1]).tolist() == [side]
+        # Beside it are numbers without a bound, or with one.
+        assert c.sides(c.from_z(whole))[1:].tolist() == [0] * (c.dim - 1)

@@ -13,14 +13,14 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.refinement import (
-    LearnedBelief,
+from sbi_active.inference.declared import (
     MeanTable,
     SimulatedBelief,
     SimulatedLikelihood,
     declares_noise,
     importance_sample,
 )
+from sbi_active.inference.refinement import LearnedBelief
 from sbi_active.inference.regression import PriorProposal
 from sbi_active.inference.sampling import (
     EitherProposal,

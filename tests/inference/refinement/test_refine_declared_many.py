@@ -8,9 +8,9 @@ from torch.distributions import Independent, LogNormal, MultivariateNormal, Norm
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
-from sbi_active.inference.refinement.bridged import BridgedBelief
-from sbi_active.inference.refinement.gauss_newton import WhitenedTrials, find_laplace
-from sbi_active.inference.refinement.simulated_likelihood import (
+from sbi_active.inference.declared.bridged import BridgedBelief
+from sbi_active.inference.declared.gauss_newton import WhitenedTrials, find_laplace
+from sbi_active.inference.declared.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
 )

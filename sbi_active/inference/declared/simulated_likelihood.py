@@ -32,6 +32,8 @@ def declares_noise(
     """
     if not isinstance(simulator, SimulatorModel) or simulator.noise is None:
         return False
+    if not simulator.draws_by_noise_alone:
+        return False
     if not bool((simulator.noise.parameters > 0).all()):
         return False
     return simulator.is_deterministic(theta, action)
@@ -104,12 +106,15 @@ class SimulatedLikelihood:
         table: Outcomes of f, shared among likelihoods.
         action: Executed actions, shape (t, action_dim).
         x: Observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
+        inflation: Factor of the noise's standard deviation.
     """
 
-    def __init__(self, table: MeanTable, action: Tensor, x: Tensor) -> None:
+    def __init__(
+        self, table: MeanTable, action: Tensor, x: Tensor, *, inflation: float = 1.0
+    ) -> None:
         noise = table.simulator.noise
         assert noise is not None
-        self.table, self.noise = table, noise
+        self.table, self.noise, self.inflation = table, noise, inflation
         self.action, self.x = action.float(), x.double()
         filled = self.x.nan_to_num(0.0)
         peak = noise.log_prob(self.x, filled).double()
@@ -134,8 +139,11 @@ class SimulatedLikelihood:
         rows = np.flatnonzero(agrees)
         if len(rows):
             known = torch.from_numpy(mean[rows])
-            log_prob = self.noise.log_prob(x.expand_as(known), known)
-            term[rows] = log_prob.double().numpy()
+            outcome = x.expand_as(known)
+            if self.inflation != 1:
+                outcome = known + (outcome - known) / self.inflation
+            log_prob = self.noise.log_prob(outcome, known).double().numpy()
+            term[rows] = log_prob - seen.sum() * np.log(self.inflation)
         return term
 
     def __call__(

@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
 from sbi_active.inference.sampling.student_mixture import Proposal

@@ -12,22 +12,29 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.diagnostics import Assumption
-from sbi_active.inference.refinement.gauss_newton import (
+from sbi_active.inference.declared.contradiction import (
+    MAX_INFLATIONS,
+    find_contradiction,
+)
+from sbi_active.inference.declared.gauss_newton import (
+    STEP,
     WIDER,
     Laplace,
     WhitenedTrials,
     find_laplace,
+    unchanged,
 )
-from sbi_active.inference.refinement.importance import WeightedPool
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.simulated import (
+from sbi_active.inference.declared.importance import WeightedPool
+from sbi_active.inference.declared.mixture import mixture_sample
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.simulated import (
     COARSE,
     ROUGH,
     ExactRecord,
     diagnose_exactly,
 )
-from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
-from sbi_active.inference.refinement.simulated_likelihood import (
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
@@ -37,7 +44,7 @@ from sbi_active.inference.sampling.bridge import Bridged, NormalMixture, bridge
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture
-from sbi_active.inference.sampling.weights import log_sum_exp
+from sbi_active.inference.sampling.weights import log_sum_exp, systematic
 from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
@@ -50,6 +57,8 @@ REMEMBERED = 0.3  # correlation of particles with where they began that is too m
 NUM_INTEGRAL = 4_000  # draws, which cost no simulation
 UNCHANGED = 2e-3  # deviations of the noise, which single precision may change
 NUM_PROBES = 16  # draws at which uninformed parameters are changed
+NUM_AROUND = 64  # parameters among which heavy tails have their best fit
+STABLE = 1.1  # growth of the inflation below which it is settled
 MOVING = 0.02  # share of moves accepted, below which particles are stuck
 
 
@@ -83,6 +92,7 @@ class BridgedBelief(SimulatedBelief):
         self.free, self._normal = free, coordinates
         rng = np.random.default_rng(0)
         u = coordinates.from_z(self._z)
+        u = u[systematic(self._weight, len(u), 0.5)]
         fit = GaussianMixture.fit(u, 2 if len(u) > 8 * u.shape[1] else 1, rng)
         self._fitted = NormalMixture(np.exp(fit.log_weight), fit.mean, fit.factor)
 
@@ -115,6 +125,7 @@ def refine_many(
     past: HistoryRecord | None,
     settings: RefinementOptions,
     seed: int,
+    weighted: bool = False,
 ) -> BridgedBelief | None:
     """Return the posterior of many parameters, if its likelihood can be simulated.
 
@@ -127,6 +138,8 @@ def refine_many(
         past: Of an earlier call: where to look, and what needs no simulation again.
         settings: Budget.
         seed: Of everything random.
+        weighted: Whether to try an importance sample from a mixture first: of few
+            parameters it takes fewer simulations, and reaches heavier tails.
 
     Returns:
         None for another simulator, or where the budget does not reach the posterior.
@@ -156,54 +169,88 @@ def refine_many(
         z = base.to_z(torch.cat(near))
         inside = base.inside(z)
         points = coordinates.from_z(z[inside]) if inside.any() else None
+    declared = likelihood
     trials = WhitenedTrials(likelihood, coordinates)
     laplace = find_laplace(trials, rng, points)
     if laplace is None:
         return None
+    contradiction = None
+    for _ in range(MAX_INFLATIONS):
+        best = laplace.modes[:1]
+        residual, jacobian = trials.jacobian(best, unchanged, STEP)
+        around = laplace.modes[0] + WIDTHS[-1][0] * (
+            laplace.guess.sample(NUM_AROUND, rng) - laplace.modes[0]
+        )
+        found = find_contradiction(
+            declared,
+            coordinates.to_theta(np.concatenate([best, around])),
+            residual[0] * likelihood.inflation,
+            jacobian[0] * likelihood.inflation,
+            level=settings.contradiction_level,
+            rng=rng,
+        )
+        if found is None or found.inflation < STABLE * likelihood.inflation:
+            break
+        contradiction = found
+        likelihood = SimulatedLikelihood(
+            table, action, x, inflation=contradiction.inflation
+        )
+        trials = WhitenedTrials(likelihood, coordinates)
+        laplace = find_laplace(trials, rng, laplace.modes) or laplace
     free = _free(laplace, trials, rng)
-    found = _bridged(laplace, likelihood, coordinates, free, settings, rng)
-    if found is None:
-        return None
-    z = coordinates.to_z(found.u)
-    z = base.to_z(base.to_theta(z))  # the parameters that were simulated
-    ok = base.inside(z)
-    pool = _pool(z[ok], found.log_likelihood[ok], found.log_evidence, base, len(x))
+    pool, doubts, moved = None, [], {}
+    if weighted and not free.any():
+        pool = mixture_sample(likelihood, coordinates, laplace.guess, settings, rng)
+    if pool is not None:
+        effective = pool.effective_sample_size
+        error = effective**-0.5
+    else:
+        found = _bridged(laplace, likelihood, coordinates, free, settings, rng)
+        if found is None:
+            return None
+        z = coordinates.to_z(found.u)
+        z = base.to_z(base.to_theta(z))  # the parameters that were simulated
+        ok = base.inside(z)
+        pool = _pool(z[ok], found.log_likelihood[ok], found.log_evidence, base, len(x))
+        effective, error = found.effective_sample_size, found.standard_error
+        moves = found.acceptance >= MOVING and found.memory <= REMEMBERED
+        moved = {"particles_move": Assumption(moves, found.acceptance)}
+        if not moves:
+            doubts.append(
+                f"{found.acceptance:.1%} of the moves of the particles were accepted, "
+                "too few for them to reach the posterior; raise num_histories"
+            )
     belief = BridgedBelief(
         prior, coordinates, likelihood, pool, free, defensive=settings.defensive
     )
-    known = diagnose_exactly(likelihood, base, pool, seed)
-    doubts = []
-    moves = found.acceptance >= MOVING and found.memory <= REMEMBERED
-    if not moves:
-        doubts.append(
-            f"{found.acceptance:.1%} of the moves of the particles were accepted, too "
-            "few for them to reach the posterior; raise num_histories"
-        )
+    known = diagnose_exactly(declared, base, pool, seed)
+    if contradiction is not None:
+        known = contradiction.noted(known)
     twice = laplace.num_found >= 2
     if not twice:
         doubts.append(
             f"the best mode was found by one of {laplace.num_starts} searches, so that "
             "a better one may be missed; check against another seed"
         )
-    enough = found.effective_sample_size >= COARSE
+    enough = effective >= COARSE
     if not enough:
         doubts.append(
-            f"the belief rests on {found.effective_sample_size:.0f} independent "
-            "particles; raise num_effective"
+            f"the belief rests on {effective:.0f} independent particles; raise "
+            "num_effective"
         )
     belief.diagnostics = known.warned(*doubts).extended(
         assumptions={
-            "enough_draws": Assumption(enough, found.effective_sample_size),
-            "particles_move": Assumption(moves, found.acceptance),
+            "enough_draws": Assumption(enough, effective),
+            **moved,
             "mode_found_twice": Assumption(twice, float(laplace.num_found)),
         },
-        effective_sample_size=found.effective_sample_size,
-        error_nats=found.standard_error,
+        effective_sample_size=effective,
+        error_nats=error,
         num_simulations=table.num_simulations - spent[0],
         num_missing=table.num_missing - spent[1],
         num_modes=len(laplace.modes),
         num_uninformed=int(free.sum()),
-        log_evidence_error=found.standard_error,
+        log_evidence_error=error,
     )
     histories = _nothing(action, x, base.dim)
     belief.histories = ExactRecord.of(histories, likelihood, base, pool)

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.sampling.bridge import NormalMixture
 from sbi_active.inference.sampling.least_squares import Whitener, descend
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
@@ -65,7 +65,8 @@ class WhitenedTrials:
             y, _ = own.table.mean(theta, action)
             if y.shape[1:] != x.shape:  # all rows are lost or without a number
                 y = np.full((len(u), *x.shape), np.nan)
-            part = whitened(own.noise, x - torch.from_numpy(y)).flatten(1).numpy()
+            part = whitened(own.noise, (x - torch.from_numpy(y)) / own.inflation)
+            part = part.flatten(1).numpy()
             seen = x.isfinite().flatten().numpy()
             parts.append(np.where(seen, part, 0.0))
         r = np.concatenate(parts, 1)
@@ -137,7 +138,7 @@ def find_laplace(
         if near is not None and num == 0:
             u = np.concatenate([np.clip(near, c.low, c.high), u])
         num, screened = num + len(u), 2 * screened
-        u, cost = descend(trials, u, _same, STEP, ITERATIONS)
+        u, cost = descend(trials, u, unchanged, STEP, ITERATIONS)
         found.append(u)
         costs.append(cost)
         known = np.concatenate(costs)
@@ -150,7 +151,7 @@ def find_laplace(
     if not np.isfinite(cost.min()):
         return None
     num_found = int((cost < cost.min() + SAME).sum())
-    _, jac = trials.jacobian(u, _same, STEP)
+    _, jac = trials.jacobian(u, unchanged, STEP)
     precision = np.einsum("nij,nik->njk", jac, jac) + np.eye(c.dim)
     keep: list[int] = []
     for i in np.argsort(cost):
@@ -170,5 +171,6 @@ def find_laplace(
     return Laplace(NormalMixture(mass, modes, factors), modes, informed, num_found, num)
 
 
-def _same(residual: Array) -> Array:
+def unchanged(residual: Array) -> Array:
+    """Return residuals as they are: they are whitened already."""
     return residual

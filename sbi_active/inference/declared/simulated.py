@@ -13,14 +13,13 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
-from sbi_active.inference.refinement.importance import WeightedPool, importance_sample
-from sbi_active.inference.refinement.settings import RefinementOptions
-from sbi_active.inference.refinement.simulated_belief import SimulatedBelief
-from sbi_active.inference.refinement.simulated_likelihood import (
+from sbi_active.inference.declared.importance import WeightedPool, importance_sample
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
 )
-from sbi_active.inference.refinement.trust import misplaced
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -35,6 +34,8 @@ USABLE = 5.0  # effective draws, below which the learned likelihood is kept
 COARSE = 60.0  # effective draws, below which a warning is due
 ROUGH = 3  # times the budget: what jumps needs more simulations than a regression
 NUM_CHECKED = 200  # draws that tail probabilities rest on
+EDGE = 0.5  # mass within 1 % of the edge of one parameter that calls for a warning
+RARE = 1e-3  # tail probability of the observation that calls for a warning
 NUM_REPEATS = 50  # of the noise a draw
 
 
@@ -166,6 +167,27 @@ def diagnose_exactly(
             "prior_edge_mass": edge_mass,
         },
     )
+
+
+def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
+    """Return warnings of a belief that may be far from the truth.
+
+    By the tail probability of each trial and of all, and the belief's mass near the
+    edge of one parameter.
+    """
+    warnings = []
+    if joint < RARE or min(tail) < RARE / len(tail):
+        warnings.append(
+            f"the observations are unlike anything simulated (tail probability "
+            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
+            "excludes the truth, or a measurement is wrong"
+        )
+    if edge_mass > EDGE:
+        warnings.append(
+            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
+            "prior may exclude the truth"
+        )
+    return warnings
 
 
 def _tail_probability(

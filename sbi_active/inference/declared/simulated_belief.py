@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.refinement.importance import WeightedPool
-from sbi_active.inference.refinement.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.declared.importance import WeightedPool
+from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.sampling.coordinates import PriorCoordinates

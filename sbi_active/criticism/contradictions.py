@@ -1,0 +1,85 @@
+"""What speaks against a verdict, or would: trials, bounds of the prior, actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissedTrial:
+    """A held-out trial far outside what the model of a verdict predicts.
+
+    Attributes:
+        position: Place among the held-out trials.
+        name: What the trial is called.
+        size: Root mean square error; inf where the model is sure of no measurement.
+        unit: Of ``size``: sensor deviations, or the simulator's where it is the draw.
+        p_value: Probability of an error as large, if the model holds.
+        by_both: Whether it is as far outside what the bare model predicts.
+    """
+
+    position: int
+    name: str
+    size: float
+    p_value: float
+    by_both: bool
+    unit: str = "sensor deviations"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundParameter:
+    """A parameter that the trials press against a bound of its prior.
+
+    Attributes:
+        name: What the parameter is called.
+        model: In which model: "none", or effects joined by " + ".
+        side: "lower" or "upper".
+        bound: Where the prior ends.
+        beyond: Best fit with the bound moved; NaN where the simulator gives nothing
+            beyond it.
+    """
+
+    name: str
+    model: str
+    side: str
+    bound: float
+    beyond: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounds:
+    """Parameters at bounds of the prior, and whether they make up for effects.
+
+    Attributes:
+        parameters: Those of the bare model, then of the model of the verdict.
+        p_value: Tail probability of the chi-square of the bare model with its bounds
+            moved; NaN where none of its parameters is at one.
+        replaces: Effects that the verdict named, and that the bare model does without
+            if its bounds are moved, or that nothing tells from it; "" for none.
+    """
+
+    parameters: tuple[BoundParameter, ...] = ()
+    p_value: float = float("nan")
+    replaces: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SevereTest:
+    """An action at which a verdict that names effects would be put to the test.
+
+    Attributes:
+        action: Shape (action_dim,).
+        is_permitted: Whether it is among the permitted actions.
+        difference: Between the verdict's prediction and that of a free residual, root
+            mean square over the numbers of x, in standard deviations of the verdict's
+            prediction, noise included.
+    """
+
+    action: Array
+    is_permitted: bool
+    difference: float

@@ -1,0 +1,203 @@
+"""Parameters at bounds of the prior, and what a wider one would give."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sbi_active.criticism.contradictions import BoundParameter, Bounds
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.results import NONE, UNEXPLAINED, ModelKey, Tracing
+from sbi_active.criticism.rivals.error_models import Whitener
+from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.influence import withdrawn
+from sbi_active.inference.sampling.least_squares import descend
+from sbi_active.seeding import derive_seed
+
+Array = NDArray[Any]
+
+#: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
+NUM_DRAWS, STEPS = 400, 30
+#: By how much a bound is moved, in widths of the prior. Half of it still reaches what a
+#: prior barely excludes, twice asks of the simulator what nobody meant.
+WIDER = 1.0
+#: Share of a positive parameter's bound that a moved one keeps of it: what has a sign
+#: keeps it, since a simulator may not know what a negative friction is.
+KEPT = 0.1
+#: Of the null of an effect to a bound, in deviations of its prior: what rounding is.
+NEAR = 1e-6
+
+
+def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
+    """Return what was traced, and what a wider prior would give.
+
+    Parameters of the bare model and of that of the verdict that lie at a bound are
+    fitted again with it moved. Where the bare model then explains the trials as well
+    as with the effects of the verdict, which have no Bayes factor of 20 left against
+    it, nothing tells these from a prior that is too narrow: they are not named. Nor is
+    what no permitted action tells from the bare model, whatever its prior is.
+
+    Args:
+        rivals: The models.
+        tracing: Which effects the data point to.
+    """
+    keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
+    sides = {key: _sides(rivals, key) for key in keys}
+    if not any(side.any() for side in sides.values()):
+        return _unless_none(tracing, Bounds())
+    last = keys[-1]
+    whiten, square = _explained(rivals, last)
+    found: list[BoundParameter] = []
+    p_value, replaces = float("nan"), ""
+    for key, side in sides.items():
+        if not side.any():
+            continue
+        rival = _moved(rivals.rival(key), side)
+        u = _best(rivals, rival, whiten, _starts(rivals, key, last))
+        held = _told(rivals, key, side, rival, u)
+        found += held
+        if key != ModelKey() or u is None or not held:
+            continue
+        rest = rival.residual(u[None])[0][0]
+        spare = max(len(rest) - rival.dim, 1)
+        p_value = _tail(rivals, tracing, rest, whiten, spare)
+        more = float((whiten(rest) ** 2).sum()) - square
+        if tracing.chosen and more < 2 * THRESHOLD * max(square / spare, 1.0):
+            replaces = str(ModelKey(tracing.chosen))
+    bounds = Bounds(parameters=(*found,), p_value=p_value, replaces=replaces)
+    return _unless_none(tracing, bounds)
+
+
+def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
+    """Return what was traced without effects that are the bare model's parameters."""
+    as_none = frozenset().union(*[g for g in tracing.equivalent if NONE in g])
+    if tracing.chosen and as_none.issuperset(tracing.chosen):
+        bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
+    if bounds.replaces:
+        tracing = replace(withdrawn(tracing), verdict=UNEXPLAINED)
+    return replace(tracing, bounds=bounds)
+
+
+def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
+    """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
+    fit = rivals.fits[key]
+    c = fit.rival.coordinates
+    own = sum(c.joint.sizes)
+    if fit.sample.best is None:
+        rng = np.random.default_rng(derive_seed(rivals.seed, "bounds"))
+        u = fit.sample.draws(NUM_DRAWS, rng)
+    else:  # where draws are as wide as misfit asks, some reach any bound
+        u = fit.sample.best[None]
+    side = c.sides(u[:, :own])
+    # An effect that vanishes at a bound is a weak one, and no prior is too narrow.
+    nulls = [e.null_phi(1).double().numpy()[0] for e in fit.rival.effects]
+    z = c.to_z(c.center[None])[0]
+    first = c.joint.sizes[0]
+    z[first:own] = np.concatenate([z[:0], *nulls])
+    ends = np.where(side < 0, c.low[:own], c.high[:own])
+    vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < NEAR
+    side[first:][vanishes[first:]] = 0
+    return side
+
+
+def _explained(rivals: RivalSet, key: ModelKey) -> tuple[Whitener, float]:
+    """Return what whitens residuals of a model's best fit, and its chi-square."""
+    rival = rivals.rival(ModelKey(key.effects))
+    start = _start(rivals, key)
+    whiten = rivals.noise.whitener(rival.residual(start[None])[0][0])
+    u = _best(rivals, rival, whiten, start[None])
+    assert u is not None
+    return whiten, float((whiten(rival.residual(u[None])[0][0]) ** 2).sum())
+
+
+def _start(rivals: RivalSet, key: ModelKey) -> Array:
+    """Return the coordinates that a model predicts from, (d,)."""
+    sample = rivals.fits[key].sample
+    return rivals.fits[key].likeliest[0] if sample.best is None else sample.best
+
+
+def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:
+    """Return where a refit starts: a model's own best fit, and theta of another's."""
+    own, dim = _start(rivals, key), rivals.prior.event_shape[0]
+    return np.stack([own, np.r_[_start(rivals, other)[:dim], own[dim:]]])
+
+
+def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
+    """Return a rival with some of its bounds moved."""
+    c = rival.coordinates
+    zero, width = -c.shift / c.scale, WIDER * (c.high - c.low)
+    low, high = c.low.copy(), c.high.copy()
+    for k in np.flatnonzero(side):
+        end, bound = (low, c.low[k]) if side[k] < 0 else (high, c.high[k])
+        end[k] = bound + side[k] * width[k]
+        is_signed = not c.is_log[k] and side[k] * (zero[k] - bound) > 0
+        if is_signed:
+            last = zero[k] + KEPT * (bound - zero[k])
+            end[k] = max(end[k], last) if side[k] < 0 else min(end[k], last)
+    c.low, c.high = low, high
+    return rival
+
+
+def _best(
+    rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Array
+) -> Array | None:
+    """Return the best fit of a rival, (d,); None where the simulator has none."""
+    if not rivals.is_smooth:
+        return starts[0]
+    try:
+        u, cost = descend(rival, starts, whiten, rivals.step, STEPS)
+    except (ArithmeticError, RuntimeError, ValueError):
+        return None  # a simulator may refuse what its prior excludes
+    return u[int(np.argmin(cost))]
+
+
+def _tail(
+    rivals: RivalSet, tracing: Tracing, rest: Array, whiten: Whitener, spare: int
+) -> float:
+    """Return the tail probability of a chi-square; NaN where errors have no size."""
+    misfit, noise = tracing.misfit, rivals.model.noise
+    if misfit is not None:
+        unit = misfit.sensor[rivals.measurements.channel]
+        return float(chi2.sf(((rest / unit) ** 2).sum(), spare))
+    if noise is None or noise.posterior is not None or len(rivals.noise.scales) > 1:
+        return float("nan")
+    return float(chi2.sf((whiten(rest) ** 2).sum(), spare))
+
+
+def _told(
+    rivals: RivalSet,
+    key: ModelKey,
+    side: NDArray[np.int64],
+    rival: Rival,
+    u: Array | None,
+) -> list[BoundParameter]:
+    """Return the parameters of a model at bounds, and where they are beyond them.
+
+    One that stays inside though its bound was moved is not held by it.
+    """
+    c = rivals.fits[key].rival.coordinates
+    z = np.full(c.dim, np.nan) if u is None else rival.coordinates.to_z(u[None])[0]
+    names = rivals.names_of(rival)
+    found = []
+    for k in np.flatnonzero(side).tolist():
+        ends = np.where(side[k] < 0, c.low, c.high)
+        bound = c.to_z(np.where(np.isfinite(ends), ends, 0.0)[None])[0, k]
+        # Without a derivative nothing was fitted again.
+        beyond = z[k] if rivals.is_smooth else np.nan
+        if side[k] * (beyond - bound) <= 0:
+            continue
+        found.append(
+            BoundParameter(
+                name=names[k],
+                model=str(ModelKey(key.effects)),
+                side="lower" if side[k] < 0 else "upper",
+                bound=float(bound),
+                beyond=float(beyond),
+            )
+        )
+    return found

@@ -1,0 +1,136 @@
+"""What a prior must be, so that a belief can begin from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from sbi.utils.sbiutils import within_support
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from sbi_active.seeding import forked_generators
+
+#: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
+FEWEST_STEPS = 64
+
+
+def require_support(prior: Distribution | None) -> Distribution:
+    """Return the prior, or raise where it has no support to keep a belief in.
+
+    Raises:
+        ValueError: If there is no prior, it is a batch of them, its ``support`` is not
+            implemented, or its parameters are discrete or tied to one another.
+    """
+    if prior is None:
+        raise ValueError(
+            "expected a prior, since a belief starts from it; got None; pass one "
+            "at construction, ASBI(prior)"
+        )
+    try:
+        support = prior.support
+    except (NotImplementedError, AttributeError):
+        support = None
+    if support is None:
+        raise ValueError(
+            "expected a prior with a support, which every belief keeps; got "
+            f"{type(prior).__name__} without one; use sbi.utils.BoxUniform, a torch "
+            "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
+        )
+    if any(map(is_discrete, parts_of(support))):
+        raise ValueError(
+            "expected a prior of continuous parameters; got a discrete one, "
+            f"{_shown_prior(prior)}; declare the choice as an Effect, which criticism "
+            "compares, or run a campaign for each value"
+        )
+    if _is_constrained(support):
+        raise ValueError(
+            "expected a prior whose parameters may vary one by one; got "
+            f"{_shown_prior(prior)}, which ties them to one another; use parameters "
+            "that are free, such as the logarithms of ratios"
+        )
+    if prior.batch_shape:
+        with forked_generators(0):
+            draws = prior.sample(torch.Size([2]))
+        if prior.log_prob(draws).shape != (2,):
+            name = type(prior).__name__
+            raise ValueError(
+                "expected a prior of one density a parameter set; got a batch of "
+                f"{tuple(prior.batch_shape)} densities, {name}; pass "
+                f"torch.distributions.Independent({name}(...), 1)"
+            )
+    return prior
+
+
+def parts_of(support: Any) -> list[Any]:
+    """Return the constraints that a support consists of."""
+    if hasattr(support, "cseq"):
+        return [part for each in support.cseq for part in parts_of(each)]
+    if hasattr(support, "base_constraint"):
+        return parts_of(support.base_constraint)
+    return [support]
+
+
+def is_discrete(part: Any) -> bool:
+    """Return whether a constraint without parts is one of discrete numbers."""
+    one_hot = type(constraints.one_hot)
+    return bool(getattr(part, "is_discrete", False)) or isinstance(part, one_hot)
+
+
+def _is_constrained(support: Any) -> bool:
+    """Return whether some part of a support has less dimensions than numbers."""
+    tied = (constraints.simplex, constraints.corr_cholesky)
+    return any(isinstance(part, tuple(map(type, tied))) for part in parts_of(support))
+
+
+def _shown_prior(prior: Distribution) -> str:
+    parts = getattr(prior, "dists", None) or [getattr(prior, "base_dist", prior)]
+    return ", ".join(type(part).__name__ for part in parts)
+
+
+def require_width(
+    prior: Distribution, names: Sequence[str] | None = None, *, seed: int
+) -> None:
+    """Raise where a prior is empty, or has no width that float32 can hold.
+
+    Args:
+        prior: Of the parameters.
+        names: Of the parameters, for the error.
+        seed: Of some draws.
+    """
+    with forked_generators(seed):
+        draws = prior.sample(torch.Size([256])).reshape(256, -1).float()
+    inside = within_support(prior, draws)
+    if not bool(inside.any()):
+        raise ValueError(
+            f"expected a prior with draws in its support; got {draws[0].tolist()} "
+            "outside; pass finite bounds, the lower one below the upper one"
+        )
+    draws = draws.double()
+    size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
+    steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
+    narrow = (steps < FEWEST_STEPS).nonzero()[:, 0].tolist()
+    if not narrow:
+        _require_no_atoms(draws, names)
+        return
+    k = narrow[0]
+    name = f"parameter {k}" if names is None else names[k]
+    raise ValueError(
+        f"expected a prior in which parameters vary; got {name} "
+        f"within [{draws[:, k].min():.9g}, {draws[:, k].max():.9g}], fewer than "
+        f"{FEWEST_STEPS} steps of float32 wide; fix the parameter in the simulator, or "
+        "shift it to deviations from its value"
+    )
+
+
+def _require_no_atoms(draws: Tensor, names: Sequence[str] | None) -> None:
+    """Raise where half of the draws of a parameter, shape (n, d), repeat others."""
+    few = [len(column.unique()) < len(draws) / 2 for column in draws.T]
+    if any(few):
+        k = few.index(True)
+        name = f"parameter {k}" if names is None else names[k]
+        raise ValueError(
+            f"expected a prior of continuous parameters; got {name}, of which draws "
+            "repeat; fix it in the simulator, or declare a choice as an Effect"
+        )

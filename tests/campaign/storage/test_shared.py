@@ -1,0 +1,256 @@
+"""Threads, processes and crafted folders: nothing that was told is lost."""
+
+import json
+import os
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from sbi_active import Campaign, GaussianNoise, SimulatorModel
+from sbi_active.campaign.storage import DamagedCampaignError
+from sbi_active.campaign.storage.codec import decode, encode
+from sbi_active.campaign.storage.damage import LogChangedError
+from sbi_active.simulation.bank.lock import LockedError
+from tests.campaign.storage.campaigns import (
+    MODEL,
+    facts,
+    go_on,
+    mean,
+    new,
+)
+
+LOG = "trials.jsonl"
+
+
+def told(folder, **options):
+    return [t.x.tolist() for t in Campaign.load(folder, **options).history]
+
+
+def number(k):
+    return [0.25 * k] * 4
+
+
+def test_eight_threads_lose_nothing(tmp_path):
+    c = new(tmp_path / "c")
+    threads = [
+        threading.Thread(target=lambda k=k: c.attach([1.0], number(k)))
+        for k in range(40)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    c.close()
+    assert sorted(told(tmp_path / "c")) == [number(k) for k in range(40)]
+
+
+def test_a_trial_told_while_another_thread_learns_is_kept(tmp_path):
+    c = go_on(new(tmp_path / "c"), 1)
+    learning = threading.Thread(target=c.ask)
+    learning.start()
+    c.attach([1.0], number(3))
+    learning.join()
+    c.close()
+    assert number(3) in told(tmp_path / "c")
+
+
+def test_two_writers_without_locks_refuse_before_they_write(tmp_path, monkeypatch):
+    folder = tmp_path / "c"
+    a = new(folder)
+    a.attach([1.0], number(1))
+    # As on a file system whose locks do nothing.
+    monkeypatch.setattr("filelock.FileLock.acquire", lambda self, **_: None)
+    b = Campaign.load(folder)
+    b.attach([1.0], number(2))
+    with pytest.raises(LogChangedError, match="another process told since"):
+        a.attach([2.0], number(3))
+    assert told(folder) == [number(1), number(2)]
+
+
+def test_a_lock_file_that_is_removed_cuts_nothing_off(tmp_path):
+    folder = tmp_path / "c"
+    a = new(folder)
+    a.attach([1.0], number(1))
+    os.remove(folder / "writer.lock")
+    b = Campaign.load(folder)
+    b.attach([1.0], number(2))
+    with pytest.raises(LogChangedError):
+        a.attach([2.0], number(3))
+    assert told(folder) == [number(1), number(2)]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes do not fork here")
+def test_a_forked_child_does_not_hold_the_lock(tmp_path):
+    folder = tmp_path / "c"
+    parent = new(folder)
+    parent.attach([1.0], number(1))
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        word = b"wrote"
+        try:
+            parent.attach([1.0], number(2))
+        except LockedError:
+            word = b"locked"
+        except BaseException as error:
+            word = type(error).__name__.encode()
+        os.write(write, word)
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(read, 100) == b"locked"
+    parent.attach([1.0], number(3))
+    with pytest.raises(LockedError):  # the child's end gave nothing back
+        Campaign.load(folder).attach([1.0], number(4))
+    parent.close()
+    assert told(folder) == [number(1), number(3)]
+
+
+@pytest.mark.parametrize("harm", ["removed", "cut", "nuls"])
+def test_a_log_that_is_harmed_meanwhile_is_not_written_to(tmp_path, harm):
+    folder = tmp_path / "c"
+    c = new(folder)
+    c.attach([1.0], number(1))
+    content = (folder / LOG).read_bytes()
+    left = {"removed": None, "cut": content[:50], "nuls": b"\0" * len(content)}[harm]
+    (folder / LOG).unlink()
+    if left is not None:
+        (folder / LOG).write_bytes(left)
+    with pytest.raises(DamagedCampaignError, match="nothing was written to it now"):
+        c.attach([2.0], number(2))
+    assert ((folder / LOG).read_bytes() if left is not None else None) == left
+    assert len(c.history) == 1  # and the second is not taken for recorded
+
+
+@pytest.mark.filterwarnings("ignore:restored", "ignore:given up", "ignore:the belief")
+@pytest.mark.parametrize("harm", ["empty", "nuls", "older"])
+def test_a_log_shorter_than_the_state_is_damage_and_is_repaired(tmp_path, harm):
+    folder = tmp_path / "c"
+    c = go_on(new(folder), 3)
+    c.close()
+    content = (folder / LOG).read_bytes()
+    older = content[: content.index(b"\n") + 1]
+    left = {"empty": b"", "nuls": b"\0" * 900, "older": older}[harm]
+    (folder / LOG).write_bytes(left)
+    with pytest.raises(DamagedCampaignError):
+        Campaign.load(folder)
+    with Campaign.load(folder, repair=True) as again:
+        assert [t.x.tolist() for t in again.history] == [
+            t.x.tolist() for t in c.history
+        ]
+        again.attach([1.0], number(1))
+    assert len(told(folder)) == 4
+
+
+def test_small_numbers_are_corrected(tmp_path):
+    scale = 1e-9
+    model = SimulatorModel(
+        lambda theta, action: scale * mean(theta, action),
+        noise=GaussianNoise(0.1 * scale),
+    )
+    c = new(tmp_path / "c", model)
+    c.attach([1.0], [0.8 * scale] * 4)
+    c.correct(0, [2.0 * scale] * 4, reason="typo")
+    assert c.history[0].x.tolist() == pytest.approx([2 * scale] * 4, rel=1e-6)
+    assert c.tell(c.history[0].x, trial=0) is c.history[0]  # the same, bit for bit
+    close = torch.nextafter(c.history[0].x, torch.ones(4))
+    assert torch.equal(c.tell(close, trial=0).x, close)
+
+
+def test_links_lead_nowhere(tmp_path):
+    mine = tmp_path / "mine.txt"
+    for name in ("writer.json", "writer.lock", LOG, "trials.damaged"):
+        mine.write_text("precious")
+        folder = tmp_path / f"c-{name}"
+        go_on(new(folder), 1).close()
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(mine)
+        try:
+            with Campaign.load(folder) as c:
+                c.attach([1.0], number(1))
+        except OSError:
+            pass
+        assert mine.read_text() == "precious", name
+
+
+def test_files_of_the_user_stay(tmp_path):
+    folder = tmp_path / "c"
+    c = new(folder)
+    (folder / "belief-mine.bin").write_text("precious")
+    go_on(c, 2).close()
+    assert (folder / "belief-mine.bin").read_text() == "precious"
+    assert len([*folder.glob("belief-*.bin")]) == 2
+
+
+def test_a_small_file_that_fills_memory_is_refused():
+    bomb = encode(torch.zeros(100_000_000 // 4), known={})
+    assert len(bomb) < 500_000
+    with pytest.raises(ValueError, match="expected what this library stores"):
+        decode(bomb, known={})
+
+
+SPOILS = [
+    None,
+    [],
+    {},
+    "",
+    -1,
+    1e300,
+    True,
+    10**9,
+    "\ud800",
+    [[]],
+    {"a": None},
+    [None] * 3,
+]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
+    """Whatever stands in the place of an entry: the same trials, or one error."""
+    from sbi_active.campaign.storage.log import _opened, _sealed
+    from sbi_active.campaign.storage.manifest import COPY, MANIFEST, _digest
+
+    folder = tmp_path / "c"
+    whole = go_on(new(folder, MODEL), 2)
+    whole.close()
+    files = {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+    manifest = json.loads(files[MANIFEST])
+    entries = [_opened(line) for line in files[LOG].splitlines()]
+    rng = np.random.default_rng(0)
+    crafted = []
+    for key in manifest:
+        for k in rng.choice(len(SPOILS), 2, replace=False):
+            spoiled = {**manifest, key: SPOILS[k]}
+            spoiled.pop("sha256", None)
+            try:
+                spoiled["sha256"] = _digest(spoiled)
+                text = json.dumps(spoiled).encode()
+            except (ValueError, UnicodeError):
+                continue
+            crafted.append({MANIFEST: text, COPY: text})
+    for entry in entries:
+        assert entry is not None
+        places = [(entry, key) for key in entry if key != "line"]
+        places += [(entry.get("trial", {}), key) for key in entry.get("trial", {})]
+        for owner, key in places:
+            before = owner[key]
+            owner[key] = SPOILS[rng.integers(len(SPOILS))]
+            crafted.append({LOG: b"".join(map(_sealed, entries))})
+            owner[key] = before
+    assert len(crafted) > 60
+    survived = 0
+    for own in crafted:
+        for name, content in {**files, **own}.items():
+            (folder / name).write_bytes(content)
+        try:
+            found = Campaign.load(folder)
+            found.history, found.health, str(found.belief)  # noqa: B018
+            survived += facts(found) == facts(whole)
+        except (DamagedCampaignError, LogChangedError):
+            survived += 1
+        except ValueError as error:  # what a reader has to give again
+            survived += str(error).startswith("expected")
+    # What describes and decides nothing may hold anything: a reason, a time.
+    assert survived >= 0.9 * len(crafted)

@@ -1,0 +1,172 @@
+"""Parameters at bounds of the prior, and effects that make up for a narrow one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import HalfNormal, Independent, Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.results import NONE, UNEXPLAINED
+from sbi_active.criticism.screening.wider_prior import beyond_bounds
+
+SENSOR = 0.005
+SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])
+TIMES = torch.linspace(0.1, 1.0, 10)
+GAIN = Effect.keyword("gain", prior=Independent(Normal(torch.zeros(1), 0.2), 1))
+DRAG = Effect.keyword("drag", prior=Independent(HalfNormal(torch.ones(1)), 1))
+
+
+def stop(theta, action, *, gain=0.0, drag=0.0):
+    """Return the way of a block that slides to rest; a gain is as good as friction."""
+    if (theta <= 0).any():
+        raise ValueError("expected positive friction")
+    speed = action * (1 + torch.as_tensor(gain)[..., None])
+    drag = torch.as_tensor(drag)[..., None].clamp(min=1e-6)
+    return torch.log1p(drag * speed**2 / (9.81 * theta)) / (2 * drag)
+
+
+def slide(theta, action, **effects):
+    """Return the share of the way that is covered at some times."""
+    return stop(theta, action, **effects) * (1 - torch.exp(-3 * TIMES))
+
+
+def criticism(
+    low, *, high=1.0, effect=GAIN, fn=stop, friction=0.4, drag=0.0, prior=None
+):
+    theta = torch.full((10, 1), friction)
+    x = fn(theta, SPEEDS[:, None], drag=torch.full((10,), drag))
+    x = x + SENSOR * torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+    times = TIMES if fn is slide else None
+    model = SimulatorModel(
+        fn,
+        noise=GaussianNoise(SENSOR),
+        parameter_names=["friction"],
+        sample_times=times,
+    )
+    prior = prior or BoxUniform(torch.tensor([low]), torch.tensor([high]))
+    role = ["fit"] * 6 + ["held out"] * 4
+    trials = Trials(SPEEDS, x, role=role, sample_times=times)
+    return Criticism(model, prior, trials, effects=[effect], seed=0)
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """A prior that begins at .5, where friction is .4."""
+    return criticism(0.5).report(plan=False)
+
+
+@pytest.mark.parametrize("fn", [stop, slide])
+def test_an_effect_that_a_wider_prior_makes_up_for_is_not_named(fn, narrow):
+    report = narrow if fn is stop else criticism(0.5, fn=fn).report(plan=False)
+    assert report.tracing.chosen == ()
+    assert report.verdict == UNEXPLAINED
+    assert report.tracing.instead_of == "gain"
+    bounds = report.tracing.bounds
+    found = bounds.parameters[0]
+    assert (found.name, found.model, found.side) == ("friction", NONE, "lower")
+    assert found.bound == pytest.approx(0.5)
+    assert found.beyond == pytest.approx(0.4, abs=0.005)
+    assert bounds.p_value > 0.01
+    line = str(report).splitlines()[0]
+    assert line.startswith(
+        "Verdict: unexplained, and not gain: friction lies at its prior's lower bound "
+        "0.5, and with a wider prior the model needs no effect"
+    )
+
+
+def test_the_report_says_the_bound_and_what_is_beyond(narrow):
+    first = " ".join(str(narrow).split("\n\n")[0].split())
+    said = "riction is at a bound of its prior in the bare model, the lower one (0.5); "
+    said += "with the bound moved the best fit has 0.40"
+    assert f"F{said}" in first
+    assert any(f"f{said}" in w and "prior-edge" in w for w in narrow.warnings)
+    assert not any("no declared effect explains" in w for w in narrow.warnings)
+    assert "No declared effect explains" not in first
+
+
+def test_errors_are_those_of_what_the_verdict_is(narrow):
+    assert narrow.evaluation.selected == (UNEXPLAINED,) * 4
+    assert "With a residual process, the RMSE on trials" in " ".join(
+        str(narrow).split()
+    )
+
+
+def test_of_a_model_that_misses_the_best_fit_is_printed(narrow):
+    row = narrow.parameters.set_index("parameter").loc["friction"]
+    assert row["before"] == pytest.approx(0.5, abs=0.002)
+    assert row["before_sd"] > 0.02  # as its draws know of the misfit
+    assert "the best fit stands here" in " ".join(str(narrow).split())
+
+
+def test_with_a_prior_that_holds_the_truth_nothing_is_said():
+    report = criticism(0.1).report(plan=False)
+    assert report.verdict == NONE
+    assert report.tracing.bounds.parameters == ()
+    assert "bound of its prior" not in str(report)
+
+
+def test_a_cause_that_no_bound_makes_up_for_stays_named():
+    report = criticism(0.1, high=0.42, effect=DRAG, drag=0.3).report(plan=False)
+    assert report.verdict == "drag"
+    assert report.tracing.bounds.replaces == ""
+    (found,) = report.tracing.bounds.parameters
+    assert (found.model, found.side) == (NONE, "upper")
+    assert found.beyond > 0.42
+    first = str(report).split("\n\n")[0]
+    assert "at a bound of its prior in the bare model" in " ".join(first.split())
+    assert "needs no effect" not in first
+
+
+def test_a_narrow_prior_without_bounds_names_nothing_either():
+    tight = Independent(Normal(torch.full((1,), 0.5), 0.01), 1)
+    report = criticism(0.1, prior=tight).report(plan=False)
+    assert report.tracing.chosen == ()
+    assert report.verdict in (NONE, UNEXPLAINED)
+    line = str(report).splitlines()[0]
+    assert "gain: no permitted action tells it from the bare model" in line
+
+
+def test_nothing_declared_and_a_narrow_prior_is_told_too():
+    report = criticism(0.5, effect=DRAG).report(plan=False)
+    assert report.tracing.chosen == ()
+    assert "with a wider prior the model needs no effect" in str(report).splitlines()[0]
+
+
+def test_a_bare_model_that_explains_at_its_bound_says_so():
+    report = criticism(0.403).report(plan=False)
+    assert report.verdict == NONE
+    assert "needs no effect" not in str(report)
+    assert "riction is at a bound of its prior" in str(report).replace("\n", " ")
+
+
+def test_a_bound_of_phi_is_told_and_its_null_is_none():
+    prior = BoxUniform(torch.zeros(1), torch.full((1,), 0.1))
+    strong = Effect.keyword("drag", prior=prior)
+    loop = criticism(0.1, effect=strong, drag=0.3)
+    tracing = beyond_bounds(loop.rivals, replace(loop.trace(), chosen=("drag",)))
+    assert loop.trace().chosen == ("drag",)
+    (found,) = [p for p in tracing.bounds.parameters if p.name == "drag"]
+    assert (found.model, found.side) == ("drag", "upper")
+    assert found.beyond > 0.15
+    weak = criticism(0.1, effect=Effect.keyword("drag", prior=prior))
+    told = beyond_bounds(weak.rivals, replace(weak.trace(), chosen=("drag",)))
+    assert told.bounds.parameters == ()
+
+
+def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
+    def refusing(theta, action, **effects):
+        if (theta < 0.5).any():
+            raise ValueError("expected friction of at least 0.5")
+        return stop(theta, action, **effects)
+
+    loop = criticism(0.5)
+    loop.trace()
+    loop.rivals.simulator.model.base.fn = refusing
+    found = beyond_bounds(loop.rivals, loop.trace())
+    (only,) = found.bounds.parameters
+    assert np.isnan(only.beyond)
+    assert np.isnan(found.bounds.p_value)

@@ -1,0 +1,181 @@
+"""Held-out trials far outside what a verdict's model predicts, and no others."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy.stats import norm
+from torch.distributions import HalfNormal, Independent
+
+from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.results import NONE
+from sbi_active.criticism.steps.detection import detect
+from sbi_active.criticism.steps.evaluation import evaluate_held_out
+from sbi_active.criticism.steps.influence import unless_refuted
+from sbi_active.criticism.steps.tracing import trace
+from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
+from tests.criticism.misfit.oscillator import trials as oscillations
+from tests.criticism.steps.linear_world import (
+    ACTION,
+    NOISE,
+    columns,
+    measured,
+    posterior,
+    rivals,
+)
+
+SENSOR = 0.005
+SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])
+ROLE = ["fit"] * 6 + ["held out"] * 4
+
+
+def stop(theta, action, *, drag=0.0):
+    """Return the way of a block that slides to rest, without one beyond 9 m/s."""
+    drag = torch.as_tensor(drag)[..., None].clamp(min=1e-6)
+    way = torch.log1p(drag * action**2 / (9.81 * theta)) / (2 * drag)
+    return torch.where(action > 9, torch.nan, way)
+
+
+def slid(*, drag=0.0, seed=0):
+    gen = torch.Generator().manual_seed(seed)
+    x = stop(torch.full((10, 1), 0.4), SPEEDS[:, None], drag=torch.full((10,), drag))
+    return x + SENSOR * torch.randn(10, 1, generator=gen)
+
+
+def report_of(x, *, action=SPEEDS, noise=SENSOR, seed=0, **changes):
+    return close_loop(
+        SimulatorModel(stop, noise=GaussianNoise(noise), parameter_names=["friction"]),
+        BoxUniform(torch.tensor([0.1]), torch.tensor([1.0])),
+        Trials(action, x, role=ROLE, **changes),
+        effects=[
+            Effect.keyword("drag", prior=Independent(HalfNormal(torch.ones(1)), 1))
+        ],
+        seed=seed,
+        plan=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    some = rivals(measured(curve=0.5))
+    return some, trace(some, detect(some), compare=False)
+
+
+@pytest.mark.parametrize("drag", [0.0, 0.3])
+def test_a_trial_in_another_unit_is_named_first(drag):
+    x = slid(drag=drag)
+    x[7] *= 100
+    report = report_of(x)
+    line, paragraph = str(report).split("\n\n")[0].split("\n", 1)
+    assert report.verdict == ("drag" if drag else NONE)
+    assert line.endswith("; held-out trial 7 is far outside it")
+    (missed,) = report.evaluation.missed
+    size = float((x[7] - x[7] / 100) / SENSOR)
+    assert missed.size == pytest.approx(size, rel=0.01)
+    assert missed.by_both
+    told = " ".join(paragraph.split())
+    assert "Held-out trial 7 is far outside what the verdict's model predicts" in told
+    assert f"missed by {missed.size:.0f} sensor deviations" in told
+    (warning,) = [w for w in report.warnings if "far outside" in w]
+    assert warning.startswith("held-out trial 7 is")
+    assert "held-out-missed" in warning
+    for page in (report.to_markdown(), report.to_html()):
+        assert page.count("held-out trial 7 is far outside") >= 2
+
+
+def test_trials_that_agree_are_not_named():
+    told = [
+        report_of(slid(drag=d, seed=s)).evaluation for d in (0, 0.3) for s in (1, 2)
+    ]
+    assert not any(evaluation.missed for evaluation in told)
+
+
+def test_a_trial_whose_mask_hides_most_is_judged_by_the_rest():
+    every = oscillations()
+    role = ["fit"] * 5 + ["held out"] * 3
+    for shift, names in ((0.0, []), (0.2, ["6"])):
+        x = every.x.clone()
+        x[6, 2:] = torch.nan
+        x[6, 1] += shift
+        trials = Trials(every.action, x, role=role, sample_times=every.sample_times)
+        report = close_loop(MODEL, PRIOR, trials, effects=EFFECTS[:1], plan=False)
+        assert [trial.name for trial in report.evaluation.missed] == names
+
+
+def test_the_tail_is_that_of_the_normal_predictive(fitted):
+    some, tracing = fitted
+    x = measured(curve=0.5, seed=1)
+    x[5] = x[5] + 0.8
+    (missed,) = evaluate_held_out(some, tracing, Trials(ACTION, x)).missed
+    mean, covariance = posterior(measured(curve=0.5), ("curve",))
+    design = columns(("curve",))[5]
+    sd = np.sqrt(design @ covariance @ design + NOISE**2)
+    z = abs(float(x[5]) - design @ mean) / sd
+    assert np.log(missed.p_value) == pytest.approx(np.log(2 * norm.sf(z)), rel=0.2)
+
+
+def test_the_level_is_that_of_all_held_out_trials(fitted):
+    some, tracing = fitted
+    trials = Trials(ACTION, measured(curve=0.5, seed=1))
+    named = evaluate_held_out(some, tracing, trials, level=12 * 0.9).missed
+    assert 6 <= len(named) <= 12
+    assert [*named] == sorted(named, key=lambda trial: -trial.size)
+
+
+def test_correlated_errors_are_no_contradiction():
+    times = torch.linspace(0.05, 2.0, 40)
+    noise = AutocorrelatedNoise(0.05, correlation_time=1.0)
+    model = SimulatorModel(
+        lambda theta, action: theta * action * torch.ones(40),
+        noise=noise,
+        sample_times=times,
+    )
+    rho, named = float(np.exp(-0.05)), 0
+    for seed in range(5):
+        gen = torch.Generator().manual_seed(seed)
+        e = torch.randn(10, 40, generator=gen)
+        for k in range(1, 40):
+            e[:, k] = rho * e[:, k - 1] + (1 - rho**2) ** 0.5 * e[:, k]
+        action = torch.linspace(-1, 1, 10)[:, None]
+        x = 0.5 * action + 0.05 * e
+        prior = BoxUniform(-torch.ones(1), torch.ones(1))
+        trials = Trials(action, x, role=ROLE, sample_times=times)
+        named += len(close_loop(model, prior, trials, plan=False).evaluation.missed)
+    assert named == 0
+
+
+def test_a_measurement_where_the_model_has_none_is_named():
+    x, action = slid(), SPEEDS.clone()
+    action[8] = 12.0
+    report = report_of(x, action=action)
+    (missed,) = report.evaluation.missed
+    assert (missed.name, missed.size) == ("8", math.inf)
+    assert "measured where the model is sure of no measurement" in report.warnings[0]
+
+
+def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
+    action = torch.linspace(0.5, 2.0, 12, dtype=torch.float64)[:, None]
+    every = oscillations(lag=0.06, hidden=0.1, action=action)
+    role = ["fit", "fit", "held out"] * 4
+    for factor, names in ((1.0, []), (100.0, ["5"])):
+        x = every.x.clone()
+        x[5] *= factor
+        trials = Trials(action, x, role=role, sample_times=every.sample_times)
+        report = close_loop(MODEL, PRIOR, trials, effects=EFFECTS, plan=False)
+        assert report.tracing.misfit is not None
+        assert [trial.name for trial in report.evaluation.missed] == names
+
+
+def test_what_no_model_predicts_refutes_none(fitted):
+    some, tracing = fitted
+    x = measured(curve=0.5, seed=1)
+    mean, _ = posterior(measured(curve=0.5), ("curve",))
+    x[0] += 1e4 if columns(("curve",))[0, 2] * mean[2] < 0 else -1e4  # nearer the bare
+    evaluation = evaluate_held_out(some, tracing, Trials(ACTION, x))
+    rmse = evaluation.table.set_index("metric").loc["rmse"]
+    assert rmse["after"] > rmse["before"]
+    assert [trial.position for trial in evaluation.missed if trial.by_both] == [0]
+    assert unless_refuted(tracing, evaluation).verdict == "curve"

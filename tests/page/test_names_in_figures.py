@@ -1,0 +1,39 @@
+"""Names that a user chose: money, control marks and halves of pairs."""
+
+import matplotlib
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.campaign.display.page import write_page
+from sbi_active.page import render
+
+matplotlib.use("Agg")
+NAMES = ["cost [$]", "$x_1", "bell \x07", "half \ud800", "a$b$c\\frac{"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_name_can_be_drawn_and_read(name, tmp_path):
+    model = SimulatorModel(
+        lambda theta, action: theta * action,
+        noise=GaussianNoise(0.1),
+        parameter_names=[name],
+        channel_names=[name],
+    )
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    actions = DiscreteActions([1.0, 2.0], names=[name], units=["$"])
+    sizes = {"num_simulations": 200, "num_samples": 50, "num_scored": 100}
+    c = Campaign(
+        model, prior, actions, seed=0, options={**sizes, "network": "on demand"}
+    )
+    c.tell([0.5], trial=c.ask())
+    c.update()
+    page = write_page(c, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "\x07" not in page
+    c.plot().savefig(tmp_path / "plot.svg")
+    c.history[0].design.plot().figure.savefig(tmp_path / "design.png")
+
+
+def test_a_page_holds_no_control_marks():
+    assert "a\ufffdb" in render("a\x00b", [])
