@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # as in "| head": nobody reads on
         status = FAILED
     except KeyboardInterrupt as error:
-        say(f"{error or 'interrupted'}; what was told before is kept", folder)
+        say(f"{str(error) or 'interrupted'}; what was told before is kept", folder)
         status = INTERRUPTED
     except (ValueError, OSError) as error:
         say(str(error), folder)

@@ -190,9 +190,8 @@ class SimulatorModel:
         """
         if self.noise is None:
             raise ValueError(
-                "expected a simulator with a noise model; got noise=None, so the "
-                "output of fn is already a random draw; build "
-                "SimulatorModel(fn, noise=GaussianNoise(sd)) around a noise-free fn"
+                "expected a simulator with a noise model; got noise=None, a random "
+                "draw; build SimulatorModel(fn, noise=GaussianNoise(sd))"
             )
         if not self.is_deterministic(theta, action, **effects):
             raise ValueError(
@@ -306,8 +305,7 @@ class SimulatorModel:
                 keywords["seeds"] = _copied(seeds)
             x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
-        self._square = square_of(x, self._square)
-        names = self.channel_names
+        self._square, names = square_of(x, self._square), self.channel_names
         # A trajectory of one channel has no axis of its own for it.
         sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
         if names is not None and len(names) not in sizes:

@@ -227,6 +227,8 @@ def folder(tmp_path_factory):
     small = partial(CampaignOptions, num_scored=500, refinement=REFINEMENT)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
+        patch.delitem(sys.modules, "sled", raising=False)
+        patch.setattr(sys, "path", [*sys.path])
         patch.setattr(commands, "CampaignOptions", small)
         words = ["--simulator", "sled.py:slide", "--noise", "0.02", "--method", "nsbi"]
         assert main(["init", "camp", *INIT[2:], *words, "--actions", "0.5:3"]) == 0
