@@ -37,7 +37,8 @@ def to_inference_data(
     and prior where the belief knows it. A campaign adds posterior_predictive,
     prior_predictive and observed_data (one outcome a trial), constant_data (actions)
     and log_likelihood (where the simulator's noise has a density); the predictive ones
-    and the likelihood where it was loaded with its simulator. A report has the
+    and the likelihood where it was loaded with its simulator, without which ``lp`` is
+    by kernels where it would be simulated. A report has the
     posterior of its verdict's model, or of ``model``. A benchmark run is a dict of
     variables, each of shape (draws,) or (draws, parameters): its rows as draws.
 
@@ -125,7 +126,10 @@ def _groups(
         if names is None:
             names = source.parameter_names
         pair = source.belief, source.prior
-        theta, before = _add_belief(made, *pair, names, num_samples, seed)
+        reads = source.simulator is None
+        theta, before = _add_belief(
+            made, *pair, names, num_samples, seed, is_smooth=reads
+        )
         assert before is not None
         _add_trials(made, source, theta, before, seed)
     else:
@@ -143,8 +147,13 @@ def _add_belief(
     names: Sequence[str] | None,
     num_samples: int,
     seed: int,
+    *,
+    is_smooth: bool = False,
 ) -> tuple[Tensor, Tensor | None]:
-    """Add posterior, its log density and the prior; return the draws of both."""
+    """Add posterior, its log density and the prior; return the draws of both.
+
+    Some densities are simulated; a smooth one is not.
+    """
     with forked_generators(seed, "posterior"):
         theta = belief.sample(torch.Size([num_samples]))
     names = names_of(belief, theta.shape[1]) if names is None else names
@@ -155,7 +164,10 @@ def _add_belief(
         )
     made.coords["parameter"] = [*names]
     made.add("posterior", "theta", theta, ["parameter"])
-    made.add("sample_stats", "lp", belief.log_prob(theta), [])
+    log_prob: Any = getattr(belief, "smooth_log_prob", belief.log_prob)
+    if not is_smooth:
+        log_prob = belief.log_prob
+    made.add("sample_stats", "lp", log_prob(theta), [])
     if prior is None:
         return theta, None
     with forked_generators(seed, "prior"):
