@@ -36,7 +36,9 @@ def to_inference_data(
     Groups of a belief: posterior, sample_stats (the log density ``lp`` of each draw),
     and prior where the belief knows it. A campaign adds posterior_predictive,
     prior_predictive and observed_data (one outcome a trial), constant_data (actions)
-    and log_likelihood (where the simulator's noise has a density). A report has the
+    and log_likelihood (where the simulator's noise has a density); the predictive ones
+    and the likelihood where it was loaded with its simulator, without which ``lp`` is
+    by kernels where it would be simulated. A report has the
     posterior of its verdict's model, or of ``model``. A benchmark run is a dict of
     variables, each of shape (draws,) or (draws, parameters): its rows as draws.
 
@@ -122,9 +124,12 @@ def _groups(
         _add_belief(made, source, prior, names, num_samples, seed)
     elif hasattr(source, "history"):
         if names is None:
-            names = getattr(source.simulator, "parameter_names", None)
+            names = source.parameter_names
         pair = source.belief, source.prior
-        theta, before = _add_belief(made, *pair, names, num_samples, seed)
+        reads = source.simulator is None
+        theta, before = _add_belief(
+            made, *pair, names, num_samples, seed, is_smooth=reads
+        )
         assert before is not None
         _add_trials(made, source, theta, before, seed)
     else:
@@ -142,8 +147,13 @@ def _add_belief(
     names: Sequence[str] | None,
     num_samples: int,
     seed: int,
+    *,
+    is_smooth: bool = False,
 ) -> tuple[Tensor, Tensor | None]:
-    """Add posterior, its log density and the prior; return the draws of both."""
+    """Add posterior, its log density and the prior; return the draws of both.
+
+    Some densities are simulated; a smooth one is not.
+    """
     with forked_generators(seed, "posterior"):
         theta = belief.sample(torch.Size([num_samples]))
     names = names_of(belief, theta.shape[1]) if names is None else names
@@ -154,7 +164,10 @@ def _add_belief(
         )
     made.coords["parameter"] = [*names]
     made.add("posterior", "theta", theta, ["parameter"])
-    made.add("sample_stats", "lp", belief.log_prob(theta), [])
+    log_prob: Any = getattr(belief, "smooth_log_prob", belief.log_prob)
+    if not is_smooth:
+        log_prob = belief.log_prob
+    made.add("sample_stats", "lp", log_prob(theta), [])
     if prior is None:
         return theta, None
     with forked_generators(seed, "prior"):
@@ -172,7 +185,7 @@ def _add_trials(
     action = torch.stack([t.action for t in trials])
     x = torch.stack([t.x for t in trials if t.x is not None])
     dims = [f"x_dim_{i}" for i in range(x.ndim - 1)]
-    channels = getattr(campaign.simulator, "channel_names", None)
+    channels = campaign.channel_names
     if channels is not None and x.ndim > 1 and len(channels) == x.shape[-1]:
         dims[-1] = "channel"
         made.coords["channel"] = [*channels]
@@ -180,7 +193,8 @@ def _add_trials(
     made.coords["action_entry"] = [*campaign.actions.names]
     shape = (len(theta), len(trials))
     # The same draws of the posterior stand behind predictive and likelihood.
-    for group, draws in (("posterior", theta), ("prior", before)):
+    predicted = () if campaign.simulator is None else ("posterior", "prior")
+    for group, draws in zip(predicted, (theta, before), strict=False):
         pairs = draws.repeat_interleave(len(trials), 0), action.repeat(len(draws), 1)
         key = "predictive" if group == "posterior" else "prior predictive"
         rows = simulate(campaign.simulator, *pairs, seed=derive_seed(seed, key))

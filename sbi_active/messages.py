@@ -30,6 +30,7 @@ ANCHORS = {
     "were told or corrected since": "belief-again",
     "is recorded and not in the belief": "budget-used-up",
     "given up, tell it again": "given-up",
+    "hold for this process": "options-of-a-load",
     "restored from": "given-up",
     "away from anything simulated": "unlike-simulated",
     "that no simulation from the prior has": "unlike-simulated",

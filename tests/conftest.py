@@ -3,9 +3,11 @@ import torch
 
 
 @pytest.fixture(autouse=True)
-def _seeded_and_clean(tmp_path, monkeypatch):
+def _seeded_and_clean(tmp_path, tmp_path_factory, monkeypatch):
     """Each test starts from the same generator and leaves no folder behind."""
     torch.manual_seed(0)
     monkeypatch.chdir(tmp_path)
+    state = tmp_path_factory.getbasetemp() / "state"  # not the home of who tests
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
     yield
     assert not (tmp_path / "sbi-logs").exists()

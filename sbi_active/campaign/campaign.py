@@ -182,8 +182,8 @@ class Campaign(CampaignTrials):
             cost: As given to the constructor.
             constraint: As given to the constructor.
             options: None takes the directory's; needed where an estimator is of your
-                own. Sizes may be others than before. A dict gives all that are not
-                default, as in the constructor.
+                own. Others than before hold for this process, with a warning. A dict
+                gives all that are not default, as in the constructor.
             on_trial: As in the constructor.
             on_update: As in the constructor.
             show_progress: As in the constructor.

@@ -6,18 +6,24 @@ library and prints. Nothing that a user of Python might want lives here.
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import ctypes
 import importlib
+import json
 import os
 import sys
-import traceback
 import warnings
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
+from sbi_active.cli.declared import in_campaign
 from sbi_active.cli.parser import make_parser
-from sbi_active.cli.words import answering, say
+from sbi_active.cli.words import as_json, place_of, say
 
 __all__ = ["main"]
+
+FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,32 +33,80 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; None takes those of the process.
 
     Returns:
-        The exit status: 0, 1 where something was found that is not right, 2 after an
-        error, 130 after an interrupt.
+        The exit status: 0, 1 where something failed, 2 where the call or a file has to
+        be changed, 130 after an interrupt.
     """
     arguments = make_parser().parse_args(argv)
-    module, function = arguments.command
-    command = getattr(importlib.import_module(f"sbi_active.cli.{module}"), function)
     folder = getattr(arguments, "folder", getattr(arguments, "trials", "DIR"))
-    is_json = getattr(arguments, "json", False)
     try:
-        with warnings.catch_warnings(), answering() if is_json else nullcontext():
+        with contextlib.suppress(AttributeError, ValueError):
+            # A terminal that has no such letter shows its number.
+            sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore
+        _leave_out_campaigns()
+        with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: say(f"note: {message}", folder)
-            return command(arguments)
-    except KeyboardInterrupt:
-        say("interrupted; what was told is on the disk, the rest is computed again", "")
-        return 130
-    except BrokenPipeError:  # of a reader that has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+            status = _run(arguments)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # as in "| head": nobody reads on
+        status = FAILED
+    except KeyboardInterrupt as error:
+        say(f"{str(error) or 'interrupted'}; what was told before is kept", folder)
+        status = INTERRUPTED
     except (ValueError, OSError) as error:
         say(str(error), folder)
-        return 2
-    except Exception as error:  # of a simulator, or of an option of another type
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        say(
-            f"{type(error).__name__}: {error} (in {place.name}, {place.filename}, line "
-            f"{place.lineno})",
-            folder,
-        )
-        return 2
+        status = MISUSED
+    except Exception as error:  # of a simulator, or a fault of this library
+        say(f"{type(error).__name__}: {error}{place_of(error)}", folder)
+        status = FAILED
+    _flush()
+    return status
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Run a command; the answer for programs has standard output for itself."""
+    module, function = arguments.command
+    is_json = getattr(arguments, "json", False)
+    with _output_to_errors() if is_json else contextlib.nullcontext():
+        command = getattr(importlib.import_module(f"sbi_active.cli.{module}"), function)
+        status = command(arguments)
+    if is_json:
+        print(json.dumps(as_json(arguments.answer), allow_nan=False))
+    return status
+
+
+@contextlib.contextmanager
+def _output_to_errors() -> Iterator[None]:
+    """Send to standard error what simulators print, in C and in workers too."""
+    with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as undo:
+        with contextlib.suppress(OSError):  # one of them is closed
+            kept = os.dup(1)
+            undo.callback(os.close, kept)
+            os.dup2(2, 1)
+            undo.callback(os.dup2, kept, 1)
+            undo.callback(_flush_c)
+        yield
+
+
+def _flush_c() -> None:
+    with contextlib.suppress(Exception):  # a platform without it
+        ctypes.CDLL(None).fflush(None)
+
+
+def _leave_out_campaigns() -> None:
+    """Import nothing from a campaign's folder because somebody stands in it."""
+    here = Path.cwd()
+    if in_campaign(here):
+        sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]
+
+
+def _flush() -> None:
+    """Write what is left, so that the end of the process has nothing to complain of."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except AttributeError:
+        pass  # closed from the start

@@ -14,8 +14,7 @@ from torch.distributions import Distribution
 from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
-from sbi_active.cli.loading import load_object
-from sbi_active.cli.options import make_task
+from sbi_active.cli.loading import load_object, make_task
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate

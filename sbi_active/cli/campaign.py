@@ -8,34 +8,30 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
+import io
 import math
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.check import actions_of, prior_of
-from sbi_active.cli.folder import (
-    DECLARED,
+from sbi_active.cli.check import actions_of, number_of, numbers_of, prior_of
+from sbi_active.cli.declared import (
     declared_by,
+    read_declared,
+    write_declared,
+)
+from sbi_active.cli.folder import (
     effects_of,
     library_of,
-    named_effects,
     open_campaign,
     read_config,
     simulator_of,
 )
 from sbi_active.cli.trials import asked, confirm, places, print_status, written
-from sbi_active.cli.words import answer
-from sbi_active.simulation.bank.segments import write_file
-
-#: Options of ``criticize`` that say of a table what a campaign knows.
-OF_TABLES = (
-    *("config", "columns", "units", "inputs", "task", "prior", "theta_low"),
-    *("theta_high", "noise", "actions"),
-)
-LARGEST = 3.4028234e38  # that single precision holds
 
 
 def init(arguments: argparse.Namespace) -> int:
@@ -49,17 +45,17 @@ def init(arguments: argparse.Namespace) -> int:
         if (value := getattr(arguments, name)) is not None
     }
     with Campaign(
-        simulator_of(declared),
+        simulator_of(arguments.simulator, arguments.noise),
         prior_of(arguments),
         _labeled(actions_of(arguments), arguments),
         method=arguments.method,
-        effects=effects_of(declared),
+        effects=effects_of(declared["effects"]),
         seed=arguments.seed,
         options=CampaignOptions(**options),
         directory=arguments.folder,
     ) as campaign:
         folder = Path(arguments.folder)
-        write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
+        write_declared(folder, declared)
         print(f"{folder}: a campaign of {campaign.actions}")
     print(f"next: sbi-active ask {arguments.folder}")
     return 0
@@ -69,12 +65,12 @@ def ask(arguments: argparse.Namespace) -> int:
     """Print the action of the next trial."""
     with open_campaign(arguments, simulates=True) as campaign:
         trial = campaign.ask(target=arguments.target)
-        known = asked(campaign, trial)
+        answer = asked(campaign, trial)
     if arguments.json:
-        answer(known)
+        arguments.answer = answer
         return 0
     print(f"trial {trial.index}: {written(campaign, trial)}")
-    gain = known["expected_information_gain"]
+    gain = answer["expected_information_gain"]
     if gain is not None:
         print(f"it is expected to tell {gain:.2f} nats about {trial.target}")
     print(f"then: sbi-active tell {arguments.folder} {places(campaign)}")
@@ -140,36 +136,33 @@ def status(arguments: argparse.Namespace) -> int:
 
 def criticize(arguments: argparse.Namespace) -> int:
     """Compare the campaign's simulator with its trials, and print the report."""
-    given = [n for n in OF_TABLES if getattr(arguments, n, None) is not None]
-    if given:
-        raise ValueError(
-            f"expected no --{given[0].replace('_', '-')} with a campaign's folder, "
-            f"which knows its own; got {getattr(arguments, given[0])}; leave it out"
-        )
-    own = named_effects(arguments)
     with open_campaign(arguments, simulates=True) as campaign:
-        usual, taken = library_of(campaign), {effect.name for effect in own}
-        report = campaign.criticize([*own, *(e for e in usual if e.name not in taken)])
+        own = [] if arguments.effects is None else effects_of([arguments.effects])
+        report = campaign.criticize(library_of(campaign, own))
     print(report)
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
     if report.tracing.chosen:
-        print(f"\nto go on with it: sbi-active adopt {arguments.folder}")
+        named = "" if arguments.effects is None else f" --effects {arguments.effects}"
+        print(f"\nto go on with it: sbi-active adopt {arguments.folder}{named}")
     return 0
 
 
 def adopt(arguments: argparse.Namespace) -> int:
     """Go on with the simulator that the verdict names."""
     with open_campaign(arguments, simulates=True) as campaign:
-        report = campaign.criticize(library_of(campaign), evaluate=False)
+        own = [] if arguments.effects is None else effects_of([arguments.effects])
+        report = campaign.criticize(library_of(campaign, own), evaluate=False)
         campaign.adopt(report)
+        if arguments.effects is not None:
+            _declare_effects(Path(arguments.folder), arguments.effects)
         print(f"adopted: {report.verdict}", file=sys.stderr)
         return print_status(arguments, campaign)
 
 
 def repair(arguments: argparse.Namespace) -> int:
     """Give up what is damaged, and name what has to be told again."""
-    with Campaign.load(arguments.folder, repair=True) as campaign:
+    with open_campaign(arguments, simulates=False, repair=True) as campaign:
         return print_status(arguments, campaign)
 
 
@@ -179,15 +172,21 @@ def report(arguments: argparse.Namespace) -> int:
 
     campaign = open_campaign(arguments, simulates=False)
     path = arguments.out or Path(arguments.folder) / "report.html"
-    print(f"saved: {write_page(campaign, Path(path))}")
-    return 0
+    return _saved(arguments, write_page(campaign, Path(path)))
 
 
 def export(arguments: argparse.Namespace) -> int:
     """Write the belief and the trials as ArviZ reads them."""
     from sbi_active.export import to_inference_data
 
-    campaign = open_campaign(arguments, simulates=True)
+    simulates = arguments.trust or arguments.simulator is not None
+    campaign = open_campaign(arguments, simulates=simulates)
+    if not simulates:
+        print(
+            "sbi-active: note: without predictions and likelihoods, for which the "
+            "simulator runs: add --simulator, or --trust",
+            file=sys.stderr,
+        )
     data = to_inference_data(campaign, seed=arguments.seed)
     try:
         data.to_netcdf(str(arguments.netcdf))
@@ -196,8 +195,25 @@ def export(arguments: argparse.Namespace) -> int:
             f"expected a library that writes netCDF; got none ({error}); install one: "
             "pip install h5netcdf"
         ) from error
-    print(f"saved: {arguments.netcdf}")
+    return _saved(arguments, arguments.netcdf)
+
+
+def _saved(arguments: argparse.Namespace, path: object) -> int:
+    if arguments.json:
+        arguments.answer = {"saved": str(path)}
+    else:
+        print(f"saved: {path}")
     return 0
+
+
+def _declare_effects(folder: Path, name: str) -> None:
+    """Let the commands to come find effects that the campaign was made without."""
+    declared = read_declared(folder)
+    module, colon, attribute = name.partition(":")
+    if module.endswith(".py"):
+        name = f"{Path(module).resolve()}{colon}{attribute}"
+    effects = [*(declared.get("effects") or ()), name]
+    write_declared(folder, {**declared, "effects": [*dict.fromkeys(effects)]})
 
 
 def _labeled(actions: Any, arguments: argparse.Namespace) -> Any:
@@ -217,13 +233,12 @@ def _labeled(actions: Any, arguments: argparse.Namespace) -> Any:
 
 
 def _action(arguments: argparse.Namespace) -> list[float] | None:
-    return None if arguments.action is None else _numbers(arguments.action.split(","))
+    return None if arguments.action is None else numbers_of(arguments.action)
 
 
 def _status(arguments: argparse.Namespace) -> Any:
-    given = [*arguments.x, *([arguments.file] if arguments.file else [])]
     flags = [name for name in ("invalid", "missing") if getattr(arguments, name)]
-    if len(flags) + bool(given) > 1:
+    if len(flags) + bool(arguments.x) + (arguments.file is not None) > 1:
         raise ValueError(
             "expected numbers, --file, --invalid or --missing; got several; write one"
         )
@@ -233,76 +248,49 @@ def _status(arguments: argparse.Namespace) -> Any:
 def _outcome(arguments: argparse.Namespace, campaign: Campaign) -> Any:
     """Return what was measured, in the shape of the simulator's x."""
     if arguments.file is not None:
-        numbers = _read_numbers(arguments.file)
+        numbers = _numbers_in(arguments.file)
     else:
-        if any(not cell.strip() for cell in arguments.x):
-            raise ValueError(
-                "expected numbers; got an empty one; write what was measured, nan for "
-                "one of several that was not, or --invalid"
-            )
-        numbers = _numbers(arguments.x)
+        numbers = [number_of(cell, is_outcome=True) for cell in arguments.x]
+        is_correction = getattr(arguments, "reason", None) is not None
+        if not numbers and is_correction and arguments.action is not None:
+            return None  # of the action alone
     shape = campaign.x_shape
-    if not numbers and arguments.action is not None and "reason" in arguments:
-        return None  # a correction of the action alone
     if len(numbers) != shape.numel():
         raise ValueError(
             f"expected {shape.numel()} numbers, as the simulator gives; got "
             f"{len(numbers)}; write nan for one that was not measured, --invalid where "
             "the trial gave none, or --missing where it failed"
         )
-    if all(math.isnan(number) for number in numbers):
+    if all(map(math.isnan, numbers)):
         raise ValueError(
             "expected a number that was measured; got none; write --invalid where the "
-            "trial ran and gave none, or --missing where a fault hit it"
+            "trial ran and gave none, which tells about the parameters, or --missing "
+            "where it failed"
         )
-    large = [n for n in numbers if abs(n) > LARGEST]
-    if large:
-        raise ValueError(
-            f"expected finite numbers that single precision holds; got {large[0]:g}; "
-            "correct it, or write nan where the sensor gave none"
-        )
-    import torch
-
-    return torch.tensor(numbers).reshape(shape)
+    return torch.tensor(numbers, dtype=torch.float64).reshape(shape)
 
 
-def _read_numbers(path: Path) -> list[float]:
-    """Return the numbers of a file, whose first row may be a header."""
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
-    if len(rows) > 1 and not _are_numbers(rows[0]):
-        rows = rows[1:]
-    cells = [cell for row in rows for cell in row]
-    if not any(cells):
-        raise ValueError(
-            f"expected numbers in {path}; got none; write one a line, or separate them "
-            "by commas"
-        )
-    wrong = [cell for cell in cells if not _are_numbers([cell])]
-    if wrong:
-        raise ValueError(
-            f"expected numbers in {path}; got {wrong[0]!r:.80}; separate them by "
-            "commas, and leave out units"
-        )
-    return _numbers(cells)
-
-
-def _are_numbers(cells: list[str]) -> bool:
+def _numbers_in(path: Path) -> list[float]:
+    """Return the numbers of a file; an empty cell of a row was not measured."""
     try:
-        _numbers(cells)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(cells: list[str]) -> list[float]:
-    try:
-        return [float(cell) if cell.strip() else math.nan for cell in cells]
-    except ValueError:
+        text = path.read_text(encoding="utf-8-sig")
+        rows = [*csv.reader(io.StringIO(text, newline=""), strict=True)]
+    except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(
-            f"expected numbers; got {' '.join(cells)!r:.80}; write them with a point, "
-            "as in 1.5 or 2e-3"
-        ) from None
+            f"expected a table of numbers, as text in UTF-8; got {path} ({error}); "
+            "save it so"
+        ) from error
+    # A heading has no cell that begins like a number: 0.84 m and 0,84;1 are none.
+    begins = re.compile(r"\s*(?:[-+]?\.?\d|[-+]?(?:nan|inf)\b|$)", re.IGNORECASE)
+    is_headed = bool(rows) and not any(map(begins.match, rows[0]))
+    return [
+        number_of(
+            cell.strip() or "nan", f" in row {i}, column {k} of {path}", is_outcome=True
+        )
+        for i, row in enumerate(rows, start=1)
+        if i > 1 or not is_headed
+        for k, cell in enumerate(row, start=1)
+    ]
 
 
 def _require_trial(campaign: Campaign, number: int) -> None:

@@ -36,16 +36,24 @@ def add_campaign_commands(commands: Any, methods: Sequence[str]) -> None:
     correct = _command(commands, "correct", "replace what was told of a trial")
     correct.add_argument("trial", type=int, metavar="TRIAL", help="its number")
     _add_outcome(correct)
-    correct.add_argument("--reason", default="", help="kept with the trial")
+    correct.add_argument("--reason", type=utf8, default="", help="kept with the trial")
     withdraw = _command(commands, "withdraw", "take a trial out of the belief")
     withdraw.add_argument("trial", type=int, metavar="TRIAL", help="its number")
-    withdraw.add_argument("--reason", default="", help="kept with the trial")
+    withdraw.add_argument("--reason", type=utf8, default="", help="kept with the trial")
     _command(commands, "status", "show the trials, the belief and the health")
     _command(commands, "repair", "give up what is damaged, and say what that is")
     update = _command(commands, "update", "bring the belief up to date")
     _add_simulator(update)
+    update.add_argument(
+        "--simulator-changed",
+        action="store_true",
+        help="take another simulator than before, and compute everything again",
+    )
     adopt = _command(commands, "adopt", "go on with the effects that a verdict names")
     _add_simulator(adopt)
+    adopt.add_argument(
+        "--effects", metavar="MODULE:NAME", help="that it may lack, as for criticize"
+    )
     report = _command(commands, "report", "write one page that shows the campaign")
     report.add_argument("--out", type=Path, metavar="PAGE.html", help="where to")
     export = _command(commands, "export", "write belief and trials for ArviZ")
@@ -59,12 +67,27 @@ def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     command.set_defaults(command=("campaign", name))
     command.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
     command.add_argument("--json", action="store_true", help="for programs")
+    add_trust(command)
+    return command
+
+
+def add_trust(command: argparse.ArgumentParser) -> None:
+    """Add the option that lets programs run which a folder names."""
     command.add_argument(
         "--trust",
         action="store_true",
-        help="run Python code that lies in the folder, or that the folder names",
+        help="import what the folder names, though it came from elsewhere",
     )
-    return command
+
+
+def utf8(given: str) -> str:
+    """Return a word of the command line as text, in UTF-8 whatever the locale."""
+    try:
+        return given.encode(errors="surrogateescape").decode()
+    except UnicodeError:
+        raise argparse.ArgumentTypeError(
+            f"expected text in UTF-8; got {given!a}"
+        ) from None
 
 
 def _add_init(commands: Any, methods: Sequence[str]) -> None:
@@ -76,7 +99,7 @@ def _add_init(commands: Any, methods: Sequence[str]) -> None:
             "their names without the dashes in front."
         ),
     )
-    init.set_defaults(command=("campaign", "init"))
+    init.set_defaults(command=("campaign", "init"), parser=init)
     init.add_argument("folder", type=Path, metavar="DIR", help="new or empty")
     init.add_argument("--config", type=Path, metavar="FILE.toml")
     init.add_argument("--simulator", metavar="MODULE:FUNCTION", help="or file.py:NAME")
@@ -84,8 +107,12 @@ def _add_init(commands: Any, methods: Sequence[str]) -> None:
     init.add_argument("--theta-low", metavar="A,B,...", help="one a parameter")
     init.add_argument("--theta-high", metavar="A,B,...", help="one a parameter")
     init.add_argument("--actions", nargs="+", metavar="SPEC", help=SPACE)
-    init.add_argument("--names", metavar="A,B,...", help="of the action's entries")
-    init.add_argument("--units", metavar="A,B,...", help="of the action's entries")
+    init.add_argument(
+        "--names", type=utf8, metavar="A,B,...", help="of the action's entries"
+    )
+    init.add_argument(
+        "--units", type=utf8, metavar="A,B,...", help="of the action's entries"
+    )
     init.add_argument(
         "--noise",
         metavar="SD[,SD...]",

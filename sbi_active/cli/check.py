@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import itertools
 import math
 import sys
 import time
@@ -23,6 +22,7 @@ from sbi_active.actions import (
     MixedActions,
 )
 from sbi_active.campaign import Campaign, CampaignOptions
+from sbi_active.cli.declared import names_object
 from sbi_active.cli.loading import load_object
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel, simulate
@@ -30,10 +30,13 @@ from sbi_active.simulation.check import check_simulator
 from sbi_active.tasks import get_task  # pyright: ignore
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
+#: Actions of one space. A choice: each is stored in the campaign's folder and takes
+#: part in each design; twice as many take twice the memory, and half are still more
+#: than any design tells apart.
+MOST_ACTIONS = 100_000
+#: What float32 holds with all its digits, beside 0.
+SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
 LONG = 20.0  # seconds of simulation a round, beside which learning counts little
-
-
-MOST_VALUES = 100_000  # listed actions: a design looks at each
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -119,13 +122,19 @@ def _source(arguments: argparse.Namespace) -> tuple[Any, Distribution, ActionSpa
 def prior_of(arguments: argparse.Namespace) -> Distribution:
     """Return the prior that --prior, or --theta-low and --theta-high, name."""
     if arguments.prior is not None:
-        return load_object(arguments.prior)
+        prior = load_object(arguments.prior)
+        if not isinstance(prior, Distribution):
+            raise ValueError(
+                "expected a torch distribution; got "
+                f"{type(prior).__name__} under {arguments.prior}; name a prior"
+            )
+        return prior
     if arguments.theta_low is None or arguments.theta_high is None:
         raise ValueError(
             "expected --theta-low and --theta-high, or --prior; got too few; give "
             "bounds as in --theta-low=0,-1 --theta-high=1,1"
         )
-    low, high = _numbers(arguments.theta_low), _numbers(arguments.theta_high)
+    low, high = numbers_of(arguments.theta_low), numbers_of(arguments.theta_high)
     if len(low) != len(high) or any(a >= b for a, b in zip(low, high, strict=True)):
         raise ValueError(
             f"expected as many bounds, low below high; got {low} and {high}; give "
@@ -142,8 +151,14 @@ def actions_of(arguments: argparse.Namespace) -> ActionSpace:
             "expected --actions; got none; write values as in --actions 0:5:11, one "
             "an entry of the action"
         )
-    if len(specs) == 1 and specs[0].count(":") == 1 and _range(specs[0]) is None:
-        return load_object(specs[0])
+    if names_object(specs):
+        space = load_object(specs[0])
+        if not isinstance(space, ActionSpace):
+            raise ValueError(
+                f"expected an action space; got {type(space).__name__} under "
+                f"{specs[0]}; name one of sbi_active.actions"
+            )
+        return space
     ranges = [_range(spec) for spec in specs]
     names = [f"action_{k}" for k in range(len(specs))] if len(specs) > 1 else ["action"]
     if None in ranges and ranges.count(None) < len(ranges):
@@ -158,46 +173,45 @@ def actions_of(arguments: argparse.Namespace) -> ActionSpace:
     if None not in ranges:
         low, high = zip(*[limits for limits in ranges if limits], strict=True)
         return BoxActions([*low], [*high])
-    axes = [_axis(spec) for spec in specs]
-    if math.prod(map(len, axes)) > MOST_VALUES:
-        raise ValueError(
-            f"expected at most {MOST_VALUES} actions; got "
-            f"{math.prod(map(len, axes))}; write LOW:HIGH for any number between"
-        )
-    return DiscreteActions(torch.tensor([*itertools.product(*axes)]))
+    axes = [torch.tensor(_axis(spec)) for spec in specs]
+    _require_few(math.prod(map(len, axes)))
+    return DiscreteActions(torch.cartesian_prod(*axes))
 
 
 def _range(spec: str) -> tuple[float, float] | None:
     """Return the limits that LOW:HIGH writes; None for anything else."""
-    try:
-        low, high = (float(part) for part in spec.split(":"))
-    except ValueError:
+    if spec.count(":") != 1:
         return None
+    low, high = (number_of(part) for part in spec.split(":"))
     return low, high
 
 
 def _axis(spec: str) -> list[float]:
     parts = spec.split(":")
     if len(parts) == 1:
-        return _numbers(spec)
-    if len(parts) != 3 or not parts[2].isdigit() or int(parts[2]) < 1:
+        return numbers_of(spec)
+    if len(parts) != 3 or not parts[2].isdecimal() or int(parts[2]) < 1:
         raise ValueError(
             f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; write, say, 0:5:11"
         )
-    if int(parts[2]) > MOST_VALUES:
-        raise ValueError(
-            f"expected at most {MOST_VALUES} values of an action; got {parts[2]} in "
-            f"{spec!r}; write LOW:HIGH for any number between"
-        )
-    low, high = (_numbers(part)[0] for part in parts[:2])
+    low, high = (number_of(part) for part in parts[:2])
+    _require_few(int(parts[2]))
     return torch.linspace(low, high, int(parts[2])).tolist()
+
+
+def _require_few(count: int) -> None:
+    if count > MOST_ACTIONS:
+        raise ValueError(
+            f"expected at most {MOST_ACTIONS} actions; got {count}; write LOW:HIGH for "
+            "any number between, or a smaller COUNT"
+        )
 
 
 def with_noise(simulator: Any, text: str | None) -> Any:
     """Return a simulator with the Gaussian noise that --noise gives; None for none."""
     if text is None:
         return simulator
-    sd = _numbers(text)
+    sd = numbers_of(text)
     if min(sd) <= 0:
         raise ValueError(
             f"expected --noise > 0; got {text}; give the standard deviation of a "
@@ -211,11 +225,31 @@ def with_noise(simulator: Any, text: str | None) -> Any:
     return noisy
 
 
-def _numbers(text: str) -> list[float]:
-    """Return numbers that are separated by commas."""
+def numbers_of(text: str) -> list[float]:
+    """Return finite numbers that are separated by commas."""
+    return [number_of(part) for part in text.split(",")]
+
+
+def number_of(cell: str, place: str = "", *, is_outcome: bool = False) -> float:
+    """Return a number as written, which float32 has to hold.
+
+    Args:
+        cell: The number; nan in an outcome.
+        place: Where it stands, for the error.
+        is_outcome: Whether it may be one that was not measured.
+
+    Raises:
+        ValueError: If it is anything else.
+    """
     try:
-        return [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise ValueError(
-            f"expected numbers separated by commas; got {text!r}; write, say, 0,1.5"
-        ) from error
+        value = math.nan if "_" in cell else float(cell)
+    except ValueError:
+        value = math.inf
+    if value == 0 or SMALLEST <= abs(value) <= LARGEST:
+        return value
+    if is_outcome and cell.strip().lower() == "nan":
+        return math.nan
+    raise ValueError(
+        f"expected finite numbers; got {cell!r:.80}{place}; write them with a point, "
+        "as in 1.5 or 2e-3, without a unit, and within the range of float32"
+    )

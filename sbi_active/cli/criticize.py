@@ -17,7 +17,7 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.campaign.storage.manifest import MANIFEST, has_manifest
 from sbi_active.cli import campaign
 from sbi_active.cli.check import actions_of, prior_of, with_noise
-from sbi_active.cli.folder import named_effects, read_config
+from sbi_active.cli.folder import effects_of, read_config
 from sbi_active.cli.loading import load_object
 from sbi_active.cli.problem import read_problem
 from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
@@ -32,8 +32,7 @@ def criticize(arguments: argparse.Namespace) -> int:
     """Compare a simulator with measured trials, and print the report."""
     if arguments.trials.is_dir():
         if has_manifest(arguments.trials):
-            arguments.folder, arguments.trust = arguments.trials, False
-            return campaign.criticize(arguments)
+            return _criticize_campaign(arguments)
         if not [*arguments.trials.glob("*.csv")]:
             raise ValueError(
                 f"expected a campaign or recordings in {arguments.trials}; got neither "
@@ -54,7 +53,7 @@ def criticize(arguments: argparse.Namespace) -> int:
     # Only scales are taken from these where the permitted actions are unknown.
     space = actions or DiscreteActions(trials.action.unique(dim=0).float())
     over_time = trials.inputs is not None
-    own = [*effects, *named_effects(arguments)]
+    own = [*effects, *effects_of(_named_effects(arguments))]
     taken = {effect.name for effect in own}
     generic = generic_effects(simulator, trials if over_time else space, prior=prior)
     report = close_loop(
@@ -74,6 +73,25 @@ def criticize(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         print(f"\nsaved: {report.save(arguments.out)}")
     return 0
+
+
+def _criticize_campaign(arguments: argparse.Namespace) -> int:
+    """Compare a campaign with its own trials; it brings most of what a table lacks."""
+    taken = ("trials", "simulator", "effects", "out", "trust", "command", "parser")
+    given = {k: v for k, v in vars(arguments).items() if k not in taken}
+    wrong = [k for k, v in given.items() if v != arguments.parser.get_default(k)]
+    if wrong:
+        raise ValueError(
+            f"expected --simulator, --effects, --out or --trust for a campaign; got "
+            f"--{wrong[0].replace('_', '-')}; leave it out, since the campaign in "
+            f"{arguments.trials} has its own"
+        )
+    arguments.folder = arguments.trials
+    return campaign.criticize(arguments)
+
+
+def _named_effects(arguments: argparse.Namespace) -> list[str]:
+    return [] if arguments.effects is None else [arguments.effects]
 
 
 def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:

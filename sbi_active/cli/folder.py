@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -13,21 +12,10 @@ from typing import Any
 from sbi_active.campaign import Campaign
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.check import with_noise
-from sbi_active.cli.loading import load_object
-from sbi_active.cli.options import make_task
+from sbi_active.cli.declared import named, read_declared, require_trust
+from sbi_active.cli.loading import load_object, make_task
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.simulation import SimulatorModel
-
-#: How the command line made the campaign: where its simulator is.
-DECLARED = "command.json"
-#: Of ``init``, which a file may change.
-DEFAULTS = {
-    "method": "asbi",
-    "seed": 0,
-    "order": "known",
-    "designed": False,
-    "no_thin": False,
-}
 
 
 def read_config(arguments: argparse.Namespace) -> None:
@@ -45,13 +33,15 @@ def read_config(arguments: argparse.Namespace) -> None:
         import tomli as tomllib
 
     try:
-        values = tomllib.loads(arguments.config.read_text())
-    except tomllib.TOMLDecodeError as error:
+        values = tomllib.loads(arguments.config.read_text(encoding="utf-8-sig"))
+    except ValueError as error:
         raise ValueError(
             f"expected TOML in {arguments.config}; got {error}; write options as in "
             'theta-low = "0,1"'
         ) from error
-    known = vars(arguments).keys() - {"folder", "trials", "config", "command"}
+    not_options = {"folder", "trials", "config", "command", "parser", "trust", "json"}
+    known = vars(arguments).keys() - not_options
+    words: list[str] = []
     for name, value in values.items():
         key = name.replace("-", "_")
         if key not in known:
@@ -59,196 +49,164 @@ def read_config(arguments: argparse.Namespace) -> None:
                 f"expected options among {', '.join(sorted(known))}; got {name!r} in "
                 f"{arguments.config}; remove it or write one of these"
             )
-        given = getattr(arguments, key)
-        if given is None or (key, given) in DEFAULTS.items():
-            setattr(arguments, key, _as_written(key, value))
+        words += _as_words(key, value)
+    parser: argparse.ArgumentParser = arguments.parser
+    written = parser.parse_args([os.devnull, *words])
+    for key in {name.replace("-", "_") for name in values}:
+        if getattr(arguments, key) == parser.get_default(key):
+            setattr(arguments, key, getattr(written, key))
 
 
-def _as_written(key: str, value: Any) -> Any:
-    """Return a value of TOML as the command line writes it."""
+def _as_words(key: str, value: Any) -> list[str]:
+    """Return an option of TOML as the command line writes it."""
+    option = f"--{key.replace('_', '-')}"
+    if isinstance(value, bool):
+        return [option] if value else []
     if isinstance(value, dict):  # as in columns = {trial = "ball", x = "height"}
         pairs = {k: v if isinstance(v, list) else [v] for k, v in value.items()}
-        return [f"{k}={','.join(map(str, v))}" for k, v in pairs.items()]
-    if key == "out":
-        return Path(value)
-    if key == "actions":
-        return [str(part) for part in (value if isinstance(value, list) else [value])]
+        return [option, *(f"{k}={','.join(map(str, v))}" for k, v in pairs.items())]
     if isinstance(value, list):
-        return ",".join(map(str, value))
-    numbers = ("theta_low", "theta_high", "noise", "names", "units")
-    return str(value) if key in numbers else value
+        parts = [str(part) for part in value]
+        if key == "actions" or parts and all("=" in part for part in parts):
+            return [option, *parts]
+        return [f"{option}={','.join(parts)}"]
+    return [f"{option}={value}"]
 
 
-def declared_by(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return where everything is that a program wrote, as other commands need it."""
-    if arguments.simulator is None:
-        raise ValueError(
-            "expected --simulator; got none; name it, as in --simulator my_robot.py:fn"
-        )
-    actions = arguments.actions or []
-    is_named = len(actions) == 1 and not actions[0].partition(":")[0][:1].isdigit()
-    return {
-        "simulator": arguments.simulator,
-        "effects": arguments.effects,
-        "noise": arguments.noise,
-        "prior": arguments.prior,
-        "actions": actions[0] if is_named and ":" in actions[0] else None,
-        "folder": os.getcwd(),
-    }
-
-
-def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
-    """Return the same for a campaign on a task.
+def simulator_of(name: str, noise: str | None, folder: str | None = None) -> Any:
+    """Return a simulator with the noise of --noise.
 
     Args:
-        name: Of the task.
-        options: Of the task, each NAME=VALUE.
-    """
-    return {"task": name, "options": [*options], "noise": None, "folder": os.getcwd()}
-
-
-def simulator_of(declared: Mapping[str, Any]) -> Any:
-    """Return the simulator that was declared, with the noise of --noise.
+        name: As :func:`.load_object` takes it.
+        noise: As written; None for the simulator's own.
+        folder: As there.
 
     Raises:
         ValueError: If it is not there, or no function.
     """
-    if "task" in declared:
-        return make_task(declared["task"], declared["options"]).simulator
-    found = load_object(_located(declared["simulator"], declared["folder"]))
+    found = load_object(name, folder)
     if not callable(found):
         raise ValueError(
             f"expected a function or SimulatorModel; got {type(found).__name__} under "
-            f"{declared['simulator']}; name what takes (theta, action)"
+            f"{name}; name what takes (theta, action)"
         )
-    return with_noise(found, declared["noise"])
+    return with_noise(found, noise)
 
 
-def effects_of(declared: Mapping[str, Any]) -> list[Effect]:
-    """Return the effects that were declared."""
-    if declared.get("effects") is None:
-        return []
-    found = load_object(_located(declared["effects"], declared["folder"]))
-    listed: Any = found() if callable(found) else found
-    return [*listed]
+def effects_of(names: Sequence[str], folder: str | None = None) -> list[Effect]:
+    """Return effects, each name that of a list or of a function that returns one.
+
+    Args:
+        names: As :func:`.load_object` takes them.
+        folder: As there.
+
+    Raises:
+        ValueError: If there are none under a name.
+    """
+    effects: list[Effect] = []
+    for name in names:
+        listed: Any = load_object(name, folder)
+        if callable(listed):
+            listed = listed()
+        try:
+            found = [*listed]
+        except TypeError:
+            found = [listed]
+        wrong = [e for e in found if not isinstance(e, Effect)]
+        if wrong:
+            raise ValueError(
+                f"expected a list of Effect under {name}; got "
+                f"{type(wrong[0]).__name__} in it; declare sbi_active.criticism.Effect"
+            )
+        effects += found
+    return effects
 
 
-def _not_described(declared: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the prior and the actions that the campaign's files do not describe."""
+def _given(
+    folder: Path, declared: Mapping[str, Any], *, trusts: bool
+) -> dict[str, Any]:
+    """Return the prior and the actions that no file describes, from their programs."""
     manifest = read_manifest(folder)
     lacking = [what for what in ("prior", "actions") if manifest[what] is None]
-    if "task" in declared and lacking:
-        task = make_task(declared["task"], declared["options"])
+    if lacking and declared.get("task") is not None:
+        task = _task_of(declared, folder, trusts=trusts)
         return {what: getattr(task, what) for what in lacking}
-    named = [what for what in lacking if declared.get(what)]
-    return {w: load_object(_located(declared[w], declared["folder"])) for w in named}
+    return {
+        what: load_object(name, declared.get("folder"))
+        for what in lacking
+        for name in named(declared, what, folder, trusts=trusts)
+    }
 
 
-def _located(name: str, folder: str) -> str:
-    """Return MODULE:NAME with a file's path from where the campaign was made."""
-    module, separator, attribute = name.partition(":")
-    if not module.endswith(".py"):
-        sys.path.insert(0, folder)
-        return name
-    return f"{Path(folder, module)}{separator}{attribute}"
+def _task_of(declared: Mapping[str, Any], folder: Path, *, trusts: bool) -> Any:
+    if declared["options"]:  # of which some name files
+        text = f"options {' '.join(declared['options'])} of a task"
+        require_trust(folder, text, None, trusts=trusts)
+    return make_task(declared["task"], declared["options"])
 
 
-def open_campaign(arguments: argparse.Namespace, *, simulates: bool) -> Campaign:
+def open_campaign(
+    arguments: argparse.Namespace, *, simulates: bool, repair: bool = False
+) -> Campaign:
     """Return the campaign of a folder.
 
     Args:
         arguments: With the folder.
-        simulates: Whether its simulator is needed.
+        simulates: Whether its simulator is needed; else nothing of the folder is
+            imported without --trust.
+        repair: Give up what is damaged.
 
     Raises:
-        ValueError: If there is no campaign, or nobody knows where its simulator is.
+        ValueError: If there is no campaign, or nobody knows where its simulator is, or
+            only the folder says so.
     """
-    folder, declared = Path(arguments.folder), _read_declared(Path(arguments.folder))
-    if getattr(arguments, "simulator", None) is not None:
-        declared |= {"simulator": arguments.simulator, "folder": os.getcwd()}
-        declared.pop("task", None)
-    if not arguments.trust:
-        _require_outside(folder, declared, arguments, simulates=simulates)
-    given = _not_described(declared, folder)
-    reader = Campaign.load(folder, **given)
+    folder, trusts = Path(arguments.folder), arguments.trust
+    declared = read_declared(folder)
+    given = {}
+    if simulates or trusts and declared:
+        given = _given(folder, declared, trusts=trusts)
+    reader = Campaign.load(folder, repair=repair, **given)
     if not simulates:
         return reader
-    if declared.keys().isdisjoint(("simulator", "task")):
+    simulator = _simulator_of(arguments, declared, folder)
+    names = named(declared, "effects", folder, trusts=trusts)
+    effects = effects_of(names, declared.get("folder"))
+    if reader.state.version.effects:
+        effects = _with_usual(effects, simulator, reader)
+    changed = getattr(arguments, "simulator_changed", False)
+    return Campaign.load(
+        folder, simulator=simulator, effects=effects, simulator_changed=changed, **given
+    )
+
+
+def _simulator_of(
+    arguments: argparse.Namespace, declared: Mapping[str, Any], folder: Path
+) -> Any:
+    if arguments.simulator is not None:
+        return simulator_of(arguments.simulator, declared.get("noise"))
+    if declared.get("task") is not None:
+        return _task_of(declared, folder, trusts=arguments.trust).simulator
+    names = named(declared, "simulator", folder, trusts=arguments.trust)
+    if not names:
         raise ValueError(
             f"expected --simulator, since the campaign in {folder} was made by a "
             "program; got none; name it, as in --simulator my_robot.py:fn"
         )
-    simulator, effects = simulator_of({"noise": None, **declared}), effects_of(declared)
-    if reader.state.version.effects:
-        effects = _with_usual(effects, simulator, reader)
-    return Campaign.load(folder, simulator=simulator, effects=effects, **given)
+    return simulator_of(names[0], declared.get("noise"), declared.get("folder"))
 
 
-def _read_declared(folder: Path) -> dict[str, Any]:
-    """Return how the command line made a campaign; nothing where it did not."""
-    path = folder / DECLARED
-    if not path.exists():
-        return {}
-    try:
-        declared = json.loads(path.read_bytes())
-        texts = (declared.get(n) for n in ("simulator", "prior", "actions", "effects"))
-        is_whole = all(text is None or isinstance(text, str) for text in texts)
-        is_whole &= isinstance(declared.get("folder", ""), str)
-    except (ValueError, AttributeError, RecursionError):
-        is_whole = False
-    if not is_whole:
-        raise ValueError(
-            f"expected {path} as sbi-active init wrote it; got something else; restore "
-            "it from a copy, or name the simulator by --simulator"
-        )
-    return declared
+def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:
+    """Return the effects to compare, once each.
 
-
-def _require_outside(
-    folder: Path,
-    declared: Mapping[str, Any],
-    arguments: argparse.Namespace,
-    *,
-    simulates: bool,
-) -> None:
-    """Raise where code would run that came with the folder.
-
-    What reads runs no code that the command line does not name. What simulates runs the
-    simulator that the folder names, unless that lies in the folder.
+    Args:
+        campaign: Whose own follow, and then those that are usual.
+        own: They come first.
     """
-    lacking = [w for w in ("prior", "actions") if read_manifest(folder)[w] is None]
-    named = [declared[what] for what in lacking if declared.get(what)]
-    if not simulates:
-        if "task" not in declared and named:
-            raise ValueError(
-                f"expected --trust, since the campaign's {lacking[0]} is Python code, "
-                f"{named[0]}; got none; look at it, and add --trust to run it"
-            )
-        return
-    if "task" in declared:
-        return
-    named += [declared[what] for what in ("simulator", "effects") if declared.get(what)]
-    inside = folder.resolve()
-    places = [Path.cwd(), Path(declared.get("folder", "."))]
-    for name in named:
-        module = name.partition(":")[0]
-        if module.endswith(".py"):
-            places.append(Path(declared.get("folder", "."), module))
-    for place in places:
-        place = place.resolve()
-        if place == inside or inside in place.parents:
-            raise ValueError(
-                f"expected --trust, since {', '.join(named)} would be imported from "
-                f"the campaign's own folder, {inside}; got none; look at the code "
-                "there, and add --trust to run it"
-            )
-
-
-def library_of(campaign: Campaign) -> list[Effect]:
-    """Return the effects to compare: the campaign's own, and those that are usual."""
+    taken = {effect.name for effect in own}
+    known = [effect for effect in campaign.effects if effect.name not in taken]
     # An adopted effect is declared for the simulator without it.
     base = getattr(campaign.simulator, "base", campaign.simulator)
-    return _with_usual([*campaign.effects], base, campaign)
+    return _with_usual([*own, *known], base, campaign)
 
 
 def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:
@@ -264,20 +222,3 @@ def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Eff
     taken = {effect.name for effect in own}
     generic = generic_effects(simulator, reader.actions, prior=reader.first_prior)
     return [*own, *(effect for effect in generic if effect.name not in taken)]
-
-
-def named_effects(arguments: argparse.Namespace) -> list[Effect]:
-    """Return the effects that --effects names."""
-    if arguments.effects is None:
-        return []
-    named: Any = load_object(arguments.effects)
-    if callable(named):
-        named = named()
-    found = [*named]
-    wrong = [e for e in found if not isinstance(e, Effect)]
-    if wrong:
-        raise ValueError(
-            f"expected a list of Effect under {arguments.effects}; got "
-            f"{type(wrong[0]).__name__} in it; declare sbi_active.criticism.Effect"
-        )
-    return found

@@ -11,11 +11,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sbi_active.cli.campaign_parser import add_campaign_commands
+from sbi_active.cli.campaign_parser import (
+    add_campaign_commands,
+    add_trust,
+    utf8,
+)
 
-_NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
-#: Numbers that begin with a minus, separated by commas or colons.
-NEGATIVE = re.compile(rf"^-{_NUMBER}([,:][-+]?{_NUMBER})*$")
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
     "numerical",
@@ -55,11 +56,12 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser to which -1e-3 and -.5e2,1 are numbers, and no options."""
+    """Takes for a value what begins like a negative number, as Python 3.14 does."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._negative_number_matcher = NEGATIVE
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # Before, -1e-3, -.5e2 and -5,-5 were options that nobody knows.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
 
 class _ShowVersion(argparse.Action):
@@ -97,9 +99,9 @@ def _add_run(commands: Any) -> None:
         default="default",
         help="faithful: the paper's network and chained beliefs",
     )
-    run.add_argument("--simulations", type=int, help="to train on, a round")
-    run.add_argument("--samples", type=int, help="for the gain, a candidate action")
-    run.add_argument("--iterations", type=int, help="training steps a round")
+    run.add_argument("--simulations", type=_count, help="to train on, a round")
+    run.add_argument("--samples", type=_count, help="for the gain, a candidate action")
+    run.add_argument("--iterations", type=_count, help="training steps a round")
 
 
 def _add_bank(commands: Any) -> None:
@@ -124,7 +126,7 @@ def _add_bank(commands: Any) -> None:
     )
     build.add_argument("--rows", type=_count, required=True, help="in the bank, in all")
     build.add_argument("--seed", type=int, default=0)
-    build.add_argument("--workers", type=int, default=1, help="processes (1)")
+    build.add_argument("--workers", type=_count, default=1, help="processes (1)")
     inspect = actions.add_parser(
         "inspect", help="show rows and outcomes, and compare checksums"
     )
@@ -184,10 +186,11 @@ def _add_criticize(commands: Any) -> None:
             "a sample, with columns trial and time besides, and with input_* in place "
             "of actions that vary in time. start_* is a measured start state. Units "
             "stand in brackets, as in x_height[m], and are those of the simulator. An "
-            "empty cell is what was not measured. "
+            "empty cell is what was not measured."
         ),
     )
-    criticize.set_defaults(command=("criticize", "criticize"))
+    criticize.set_defaults(command=("criticize", "criticize"), parser=criticize)
+    add_trust(criticize)
     criticize.add_argument(
         "trials",
         metavar="TRIALS.csv",
@@ -205,6 +208,7 @@ def _add_criticize(commands: Any) -> None:
     )
     criticize.add_argument(
         "--columns",
+        type=utf8,
         nargs="+",
         metavar="KEY=NAME[,NAME...]",
         help="columns that are trial, time, action, x, input, start, role, index or "
@@ -213,6 +217,7 @@ def _add_criticize(commands: Any) -> None:
     )
     criticize.add_argument(
         "--units",
+        type=utf8,
         nargs="+",
         metavar="NAME=UNIT",
         help="of columns without a unit in the header",

@@ -21,8 +21,8 @@ import torch
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
-from sbi_active.cli.folder import DECLARED, declared_of_task
-from sbi_active.cli.options import make_task
+from sbi_active.cli.declared import declared_of_task, write_declared
+from sbi_active.cli.loading import make_task
 from sbi_active.cli.progress import Progress
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             directory=(folder := _new_folder(arguments.out)),
         )
         declared = declared_of_task(arguments.task, arguments.option)
-        (folder / DECLARED).write_text(json.dumps(declared, indent=2) + "\n")
+        write_declared(folder, declared)
         beliefs.append(campaign.belief)
         for index in range(arguments.rounds):
             progress.step("looking up what is exact")
@@ -220,6 +220,8 @@ def _save(
             for r in rounds
         ],
     }
-    (arguments.out / "result.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (arguments.out / "result.json").write_text(
+        json.dumps(summary, indent=2) + "\n", encoding="utf-8"
+    )
     data = to_inference_data(campaign, seed=arguments.seed)
     data.to_netcdf(str(arguments.out / "inference_data.nc"))

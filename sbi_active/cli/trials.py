@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
 from torch import Tensor
 
 from sbi_active.campaign import Campaign, Trial
-from sbi_active.cli.words import answer, spoken
+from sbi_active.cli.words import spoken
 
 MANY = 5  # numbers, more than somebody types
 
@@ -17,7 +16,7 @@ MANY = 5  # numbers, more than somebody types
 def confirm(arguments: argparse.Namespace, campaign: Campaign, trial: Trial) -> int:
     """Print what was recorded, and what comes next."""
     if arguments.json:
-        answer(_described(campaign, trial))
+        arguments.answer = _described(campaign, trial)
         return 0
     x = "" if trial.x is None else f", x = {_short(trial.x)}"
     print(f"trial {trial.index}: {trial.status} at {written(campaign, trial)}{x}")
@@ -31,8 +30,8 @@ def print_status(arguments: argparse.Namespace, campaign: Campaign) -> int:
     waiting = [t.index for t in campaign.history if not campaign.contains(t)]
     belief = _believed(campaign)
     if arguments.json:
-        known = {"trials": told, "belief": belief, "health": campaign.health}
-        answer({**known, "not_in_belief": waiting})
+        answer = {"trials": told, "belief": belief, "health": campaign.health}
+        arguments.answer = {**answer, "not_in_belief": waiting}
         return 0
     print(f"{campaign!r}, health {campaign.health}")
     for trial in campaign.state.trials:
@@ -72,7 +71,7 @@ def asked(campaign: Campaign, trial: Trial) -> dict[str, Any]:
     if trial.design is not None:
         gains = trial.design.expected_information_gain[trial.design.index]
         errors = trial.design.standard_error[trial.design.index]
-        gain, error = _finite(gains), _finite(errors)
+        gain, error = float(gains), float(errors)
     return {
         **_described(campaign, trial),
         "target": trial.target,
@@ -82,8 +81,8 @@ def asked(campaign: Campaign, trial: Trial) -> dict[str, Any]:
 
 
 def _described(campaign: Campaign, trial: Trial) -> dict[str, Any]:
-    """Return a trial as JSON: NaN is null."""
-    x = None if trial.x is None else [_finite(v) for v in trial.x.flatten()]
+    """Return a trial as JSON, but for NaN."""
+    x = None if trial.x is None else trial.x.flatten().tolist()
     return {
         "trial": trial.index,
         "status": trial.status,
@@ -95,11 +94,6 @@ def _described(campaign: Campaign, trial: Trial) -> dict[str, Any]:
         "surprise": trial.surprise,
         "reason": trial.reason,
     }
-
-
-def _finite(value: Tensor) -> float | None:
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def written(campaign: Campaign, trial: Trial) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import sys
-from contextlib import redirect_stdout
-from typing import Any, TextIO
+import traceback
+from typing import Any
 
 #: What the library says to users of Python, and what that is on the command line.
 WORDS = (
@@ -19,6 +18,8 @@ WORDS = (
     (r"Campaign\.load\(directory, simulator=\.\.\.\)", "sbi-active ask DIR"),
     (r"ask\(\)", "sbi-active ask DIR"),
     (r"load the campaign with repair=True", "run sbi-active repair DIR"),
+    (r"load the campaign with prior=", "add --trust"),
+    (r"simulator_changed=True", "sbi-active update DIR --simulator-changed"),
 )
 
 
@@ -29,46 +30,41 @@ def spoken(text: str, folder: object) -> str:
         text: It names methods of Python.
         folder: Of the campaign.
     """
+    place = str(folder).replace("\\", r"\\")
     for of_python, of_command_line in WORDS:
-        command = of_command_line.replace("DIR", str(folder))
-        text = re.sub(of_python, command, text)
+        text = re.sub(of_python, of_command_line.replace("DIR", place), text)
     return text
 
 
 def say(text: str, folder: object) -> None:
     """Print a text of the library to standard error."""
-    print(f"sbi-active: {spoken(text, folder)}", file=sys.stderr)
+    if sys.stderr is not None:
+        print(f"sbi-active: {spoken(_briefly(text), folder)}", file=sys.stderr)
 
 
-_answers: list[TextIO] = []
+def _briefly(text: str) -> str:
+    """Return a text with the last line of each traceback in it, and its place."""
+
+    def last(found: re.Match[str]) -> str:
+        frames = re.findall(r'File "(.*)", line (\d+)', found[0])
+        return found[1] + (f" ({', line '.join(frames[-1])})" if frames else "")
+
+    return re.sub(r"Traceback \(most recent call last\):\n(?: .*\n)*(.*)", last, text)
 
 
-class answering(redirect_stdout):  # noqa: N801, a context manager as its base is
-    """Keep standard output for one answer: what else is printed goes to the errors."""
-
-    def __init__(self) -> None:
-        super().__init__(sys.stderr)
-
-    def __enter__(self) -> Any:
-        _answers.append(sys.stdout)
-        return super().__enter__()
-
-    def __exit__(self, *details: Any) -> None:
-        super().__exit__(*details)
-        _answers.pop()
+def place_of(error: BaseException) -> str:
+    """Return where an error was raised, to be added to its text."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, SyntaxError) or not frames:  # whose text has it
+        return ""
+    return f" ({frames[-1].filename}, line {frames[-1].lineno})"
 
 
-def answer(value: Any) -> None:
-    """Print an answer for programs, as JSON: what is no finite number is null."""
-    text = json.dumps(_plain(value), allow_nan=False)
-    print(text, file=_answers[-1] if _answers else sys.stdout)
-
-
-def _plain(value: Any) -> Any:
+def as_json(value: Any) -> Any:
+    """Return an answer as JSON has it: null for a number that is not finite."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {key: as_json(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [as_json(part) for part in value]
+    is_number = not isinstance(value, float) or math.isfinite(value)
+    return value if is_number else None

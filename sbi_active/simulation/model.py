@@ -33,6 +33,7 @@ from sbi_active.simulation.simulator import (
     outcome_array,
     outcome_tensor,
     require_rows,
+    square_of,
 )
 
 FEW = 8  # rows that show whether fn is random
@@ -142,6 +143,7 @@ class SimulatorModel:
             )
         self._token = uuid.uuid4().hex
         self._is_deterministic: bool | None = None
+        self._square: int | None = None
 
     def __call__(
         self,
@@ -188,9 +190,8 @@ class SimulatorModel:
         """
         if self.noise is None:
             raise ValueError(
-                "expected a simulator with a noise model; got noise=None, so the "
-                "output of fn is already a random draw; build "
-                "SimulatorModel(fn, noise=GaussianNoise(sd)) around a noise-free fn"
+                "expected a simulator with a noise model; got noise=None, a random "
+                "draw; build SimulatorModel(fn, noise=GaussianNoise(sd))"
             )
         if not self.is_deterministic(theta, action, **effects):
             raise ValueError(
@@ -304,7 +305,7 @@ class SimulatorModel:
                 keywords["seeds"] = _copied(seeds)
             x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
-        names = self.channel_names
+        self._square, names = square_of(x, self._square), self.channel_names
         # A trajectory of one channel has no axis of its own for it.
         sizes = (x.shape[-1], 1) if x.ndim == 2 else (x.shape[-1],)
         if names is not None and len(names) not in sizes:

@@ -107,6 +107,29 @@ def require_rows(theta: Tensor, action: Tensor) -> None:
             )
 
 
+def square_of(x: Tensor, before: int | None) -> int | None:
+    """Return the rows of the last x that was as wide as it was long.
+
+    Args:
+        x: Outcomes, shape (n, *x_shape).
+        before: What this returned for earlier ones; None for none.
+
+    Raises:
+        ValueError: If that was so for two numbers of rows: each outcome has a number
+            for each row.
+    """
+    num_rows = len(x)
+    if num_rows == 1 or x.shape != (num_rows, num_rows) or before == num_rows:
+        return before
+    if before is None:
+        return num_rows
+    raise ValueError(
+        f"expected x of one shape a row; got {tuple(x.shape)}, and {(before, before)} "
+        f"of {before} rows, as where theta[:, 0] of shape (n,) meets action of shape "
+        "(n, 1); index both alike, as in theta[:, :1]"
+    )
+
+
 def require_noise(x: Tensor, again: Tensor) -> None:
     """Raise where two seeds gave identical outcomes.
 

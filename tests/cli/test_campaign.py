@@ -178,3 +178,53 @@ def test_a_missing_effect_is_found_and_adopted(made, capsys, monkeypatch):
     assert "bias" in page
     assert "data:image/svg+xml;base64," in page
     assert "http" not in page.replace("http-equiv", "")
+
+
+EFFECTS = """
+from torch.distributions import Normal
+from sbi_active.criticism import Effect
+
+offset = Effect(
+    "tape slipped",
+    hook="observation",
+    prior=Normal(0.0, 1.0),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi,
+)
+own = [offset]
+"""
+
+
+def test_effects_of_the_command_line_for_a_campaign(
+    made, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(folder, "generic_effects", lambda *_, **__: [])
+    monkeypatch.delitem(sys.modules, "tape", raising=False)
+    (tmp_path / "tape.py").write_text(EFFECTS)
+    for index, speed in enumerate((0.5, 1.0, 1.5, 2.0, 2.5, 3.0)):
+        distance = speed**2 / (2 * 9.81 * 0.5) / (1 + 0.3 * speed)
+        x = f"{distance + 0.3 + 0.02 * (-1) ** index:.4f}"
+        assert main(["tell", "camp", x, "--action", str(speed)]) == 0
+    capsys.readouterr()
+    assert main(["criticize", "camp", "--effects", "tape.py:own"]) == 0
+    shown = capsys.readouterr().out
+    assert "Verdict: tape slipped" in shown
+    assert "sbi-active adopt camp --effects tape.py:own" in shown
+    assert main(["adopt", "camp", "--effects", "tape.py:own"]) == 0
+    monkeypatch.chdir(tmp_path.parent)  # where tape.py lies is remembered
+    assert main(["update", str(made)]) == 0
+    capsys.readouterr()
+    belief = answer(capsys, "status", str(made))["belief"]["parameters"]
+    assert belief["theta_3"]["mean"] == pytest.approx(0.3, abs=0.06)
+
+
+def test_another_simulator_is_taken_by_the_command_line(made, capsys, tmp_path):
+    main(["tell", "camp", "0.9", "--action", "3"])
+    assert main(["update", "camp"]) == 0
+    text = SIMULATOR.replace("2 * 9.81", "G").replace("\n\n\n", "\n\nG = 19.0\n\n", 1)
+    (tmp_path / "sled.py").write_text(text)
+    del sys.modules["sled"]
+    assert main(["update", "camp"]) == 2
+    assert "sbi-active update camp --simulator-changed" in capsys.readouterr().err
+    assert main(["update", "camp", "--simulator-changed"]) == 0
+    assert main(["update", "camp"]) == 0

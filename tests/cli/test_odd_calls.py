@@ -1,236 +1,364 @@
-"""Calls that somebody mistypes, or that a folder of a stranger leads to."""
+"""Odd calls: each is right or a clear error, and what a program reads is JSON."""
 
 import json
+import os
+import shutil
+import signal
 import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-
-from sbi_active import Campaign
-from sbi_active.cli import main
-
-SLED = (
-    "def slide(theta, action):\n    print('noise')\n    return theta[:, :1] * action\n"
-)
-
-
-@pytest.fixture
-def camp(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("sled", "torch_prior"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    Path("sled.py").write_text(SLED)
-    bounds = ["--theta-low", "0.2,-1", "--theta-high", "1,1"]
-    sizes = ["--num-simulations", "200", "--num-samples", "50", "--method", "nsbi"]
-    words = ["--simulator", "sled.py:slide", "--actions", "-2:2", "--noise", ".1"]
-    assert main(["init", "camp", *words, *bounds, *sizes]) == 0
-    return Path("camp")
-
-
-def history():
-    return [(t.status, t.action.tolist(), t.x) for t in Campaign.load("camp").history]
-
-
-@pytest.mark.parametrize("text", ["-1e-3", "-.5e2", "-2", "-3.", "-0.25"])
-def test_numbers_may_begin_with_a_minus(camp, text):
-    assert main(["tell", "camp", text, "--action", "-1e-1"]) == 0
-    ((status, action, x),) = history()
-    assert status == "ok"
-    assert action == pytest.approx([-0.1])
-    assert x.tolist() == pytest.approx([float(text)])
-
-
-@pytest.mark.parametrize("text", ["", " ", "inf", "1e39", "nan", "0.84 m", "O"])
-def test_what_is_no_number_becomes_no_outcome(camp, text, capsys):
-    assert main(["tell", "camp", text, "--action", "1"]) == 2
-    assert "expected" in capsys.readouterr().err
-    assert history() == []
-    assert main(["tell", "camp", "--invalid", "--action", "1"]) == 0
-    assert history()[0][0] == "invalid"
-
-
-@pytest.mark.parametrize(
-    ("content", "value"),
-    [
-        (b"\xef\xbb\xbf0.84\n", 0.84),
-        (b"x_height\n0.84\n", 0.84),
-        (b"0.84 m\n", None),
-        (b"0.84;1\n", None),
-        (b"0,84\n", None),
-        (b"", None),
-        (b"\n\n", None),
-        (b"height\n", None),
-    ],
-)
-def test_a_file_is_read_or_the_old_number_stays(camp, content, value):
-    assert main(["tell", "camp", "0.5", "--action", "1"]) == 0
-    Path("x.csv").write_bytes(content)
-    words = ["correct", "camp", "0", "--file", "x.csv", "--reason", "typo"]
-    assert main(words) == (2 if value is None else 0)
-    expected = 0.5 if value is None else value
-    assert float(history()[0][2]) == pytest.approx(expected)
-
-
-def test_a_correction_says_something(camp):
-    main(["tell", "camp", "0.5", "--action", "1"])
-    assert main(["correct", "camp", "0", "--reason", "typo"]) == 2
-    assert main(["correct", "camp", "0", "--action", "-1.5"]) == 0
-    assert history()[0][1] == [-1.5]
-
-
-def test_json_alone_is_printed_whatever_the_simulator_prints(camp, capsys):
-    def refuse(text):
-        raise AssertionError(text)
-
-    capsys.readouterr()
-    for words in (["ask"], ["tell", "0.5"], ["update"], ["status"]):
-        assert main([words[0], "camp", *words[1:], "--json"]) == 0
-        printed = capsys.readouterr()
-        json.loads(printed.out, parse_constant=refuse)
-        assert "noise" not in printed.out
-
-
-OWN_PRIOR = """
 import torch
-from torch.distributions import Independent, Uniform
+
+from sbi_active import Campaign, CampaignOptions
+from sbi_active.cli import campaign as commands
+from sbi_active.cli import main
+from tests.campaign.sizes import REFINEMENT
+from tests.cli.test_campaign import SIMULATOR
+
+ODD = """
+import ctypes, os, sys, torch
+print("imported")
+NOTHING, NUMBER = None, 3.0
+listed = [1, 2]
 
 
-class Mine(Independent):
-    pass
+def loud(theta, action):
+    print("simulating")
+    ctypes.CDLL(None).puts(b"in C")
+    os.write(1, b"past Python")
+    return theta[:, :1] * action
 
 
-prior = Mine(Uniform(torch.zeros(2) + 0.1, torch.ones(2)), 1)
+def broken(theta, action):
+    raise ZeroDivisionError("by zero")
+
+
+def stopped(theta, action):
+    raise KeyboardInterrupt
+
+
+def left(theta, action):
+    sys.exit(3)
+
+
+def short(theta, action):
+    return theta[:1, :1]
+
+
+def effects():
+    raise RuntimeError("no library")
 """
+BROKEN = {
+    "divides.py": "1 / 0",
+    "leaves.py": "raise SystemExit(3)",
+    "halves.py": "def f(:",
+    "lacks.py": "import no_such_module_at_all",
+}
+TABLES = {
+    "bom.csv": b"\xef\xbb\xbf0.84\n",
+    "unit.csv": b"0.84 m\n",
+    "semicolon.csv": b"0,84;1\n",
+    "empty.csv": b"",
+    "utf16.csv": "0.84\n".encode("utf-16"),
+    "nul.csv": b"0.8\x004\n",
+    "heading.csv": b"distance\n",
+    "hollow.csv": b"distance\n\n",
+    "quote.csv": b'"0.84\n',
+    "nan.csv": b"x\nnan\n",
+    "two.csv": b"0.1,0.2\n",
+}
+TOML = {
+    "seed.toml": 'seed = "x"',
+    "float.toml": "seed = 1.5",
+    "date.toml": "noise = 2026-01-01",
+    "table.toml": "[noise]\na = 1",
+    "nested.toml": "theta-low = [[0.1], [0]]",
+    "flag.toml": "noise = true",
+    "method.toml": 'method = "magic"',
+    "list.toml": "method = [1, 2]",
+    "number.toml": "simulator = 5",
+    "trust.toml": "trust = true",
+    "half.toml": "seed = ",
+    "bytes.toml": "",
+}
+BOX = ["--theta-low=0.2,0", "--theta-high=1,1"]
+INIT = ["init", "new", *BOX, "--num-simulations", "200"]
+OF = [*INIT, "--simulator"]
+SLED = [*OF, "sled.py:slide", "--noise", "0.02"]
+ASK = ["--actions", "1,2"]
+#: What is given beside these, so that theirs counts.
+GIVEN = {"number.toml": BOX, "nested.toml": ["--theta-high=1,1", *SLED[-4:]]}
+CHECK = ["check", "sled.py:slide", *BOX]
 
-
-def received(tmp_path, monkeypatch):
-    """A campaign whose prior is code in its own folder, which leaves a mark."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    Path("sled.py").write_text(SLED)
-    Path("evil.py").write_text("open('ran', 'w').write('yes')\n" + OWN_PRIOR)
-    monkeypatch.delitem(sys.modules, "evil", raising=False)
-    monkeypatch.delitem(sys.modules, "sled", raising=False)
-    words = ["--simulator", "sled.py:slide", "--actions", "1,2", "--noise", ".1"]
-    sizes = ["--num-simulations", "200", "--prior", "evil.py:prior"]
-    assert main(["init", "camp", *words, *sizes]) == 0
-    Path("evil.py").rename("camp/evil.py")
-    Path("sled.py").rename("camp/sled.py")
-    Path("ran").unlink()
-    declared = json.loads(Path("camp/command.json").read_text())
-    Path("camp/command.json").write_text(json.dumps({**declared, "folder": "camp"}))
-    for name in ("evil", "sled"):
-        sys.modules.pop(name, None)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["status", "camp"],
-        ["report", "camp"],
-        ["tell", "camp", "0.5", "--action", "1"],
-        ["ask", "camp"],
-        ["update", "camp"],
-        ["criticize", "camp"],
-    ],
-    ids=lambda words: words[0],
-)
-def test_a_received_folder_runs_no_code(tmp_path, monkeypatch, capsys, words):
-    received(tmp_path, monkeypatch)
-    assert main(words) == 2
-    assert "expected --trust" in capsys.readouterr().err
-    assert not Path("ran").exists()
-
-
-def test_it_runs_once_it_is_trusted(tmp_path, monkeypatch):
-    received(tmp_path, monkeypatch)
-    assert main(["status", "camp", "--trust"]) == 0
-    assert Path("ran").exists()
-
-
-def test_the_current_folder_may_be_the_received_one(tmp_path, monkeypatch):
-    received(tmp_path, monkeypatch)
-    monkeypatch.chdir("camp")
-    assert main(["ask", "."]) == 2
-    assert not Path("ran").exists()
-
-
-def test_options_of_tables_are_not_ignored_for_a_campaign(camp, capsys):
-    for words in (["--noise", "0.1"], ["--theta-low", "0"], ["--units", "x=m"]):
-        assert main(["criticize", "camp", *words]) == 2
-        assert "with a campaign's folder" in capsys.readouterr().err
-    assert main(["criticize", "camp", "--effects", "no_such_module:NAME"]) == 2
-    assert "no_such_module" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("spec", [["1:2:1000000000"], ["0:1:1000", "0:1:1000"]])
-def test_a_list_of_actions_is_bounded(camp, spec, capsys):
-    words = ["--theta-low", "0", "--theta-high", "1", "--actions", *spec]
-    assert main(["init", "other", "--simulator", "sled.py:slide", *words]) == 2
-    assert "expected at most 100000" in capsys.readouterr().err
-
-
-ODD = [
-    ["tell", "camp"],
-    ["tell", "camp", "1", "2"],
-    ["tell", "camp", "1", "--invalid"],
-    ["tell", "camp", "1", "--trial", "7"],
-    ["tell", "camp", "1", "--action", "x"],
-    ["tell", "camp", "1", "--action", ""],
-    ["tell", "camp", "1", "--action", "1,2"],
-    ["tell", "nowhere", "1"],
-    ["tell", "camp", "--file", "nowhere.csv"],
-    ["tell", "camp", "--file", "."],
-    ["correct", "camp", "-1", "2"],
-    ["correct", "camp", "99", "2"],
-    ["withdraw", "camp", "0"],
-    ["status", "sled.py"],
-    ["report", "camp", "--out", "nowhere/x/y.html"],
-    ["ask", "camp", "--target", "nothing"],
-    ["ask", "camp", "--simulator", "sled.py"],
-    ["ask", "camp", "--simulator", "sled.py:nothing"],
-    ["ask", "camp", "--simulator", "sled.py:__name__"],
-    ["init", "camp", "--simulator", "sled.py:slide"],
-    ["init", "new", "--config", "odd.toml"],
-    ["adopt", "camp"],
-    ["repair", "nowhere"],
-    ["export", "camp", "--netcdf", "nowhere/x.nc"],
+#: What has to be told apart by its exit status: 0, or else an error.
+CALLS = [
+    # Numbers.
+    (0, "tell camp -1e-3"),
+    (0, "tell camp -.5e2"),
+    (0, "tell camp 0.1 --action -1e-3"),
+    (0, "tell camp 0.1 --action=-.5e2"),
+    (0, "tell camp 1e-20 --json"),
+    (0, "correct camp 0 -2e-1 --json"),
+    (0, "correct camp 0 --action 2 --json"),
+    *(
+        (2, ["tell", "camp", x])
+        for x in ("", " ", "nan", "inf", "-inf", "1e39", "1e-50", "0,84", "1_000")
+    ),
+    *(
+        (2, ["tell", "camp", x])
+        for x in ("0.84 m", "0x10", "None", "1e", "١x", "\ud800")
+    ),
+    *(
+        (2, ["tell", "camp", "0.1", "--action", a])
+        for a in ("", "nan", "inf", "1,2", "x")
+    ),
+    (2, "tell camp"),
+    (2, "tell camp 1 2"),
+    (2, "tell camp 1 --file bom.csv"),
+    (2, "tell camp --invalid --missing"),
+    (2, "tell camp 1 --trial 99"),
+    (2, "tell camp 1 --trial -1"),
+    (2, "tell camp 1 --trial 1.5"),
+    (2, "tell camp 1 --trial 99999999999999999999999"),
+    (0, "tell camp --invalid --json"),
+    (0, "tell camp --missing --json"),
+    (2, "correct camp 0"),
+    (2, "correct camp 0 --reason typo"),
+    (2, ["correct", "camp", "0", ""]),
+    (2, "correct camp 7 0.1"),
+    (2, "correct camp x 0.1"),
+    (2, "withdraw camp -3"),
+    (0, ["withdraw", "camp", "0", "--reason", "\n\x1b[31m", "--json"]),
+    # Files.
+    (0, "tell camp --file bom.csv --json"),
+    (0, "correct camp 0 --file bom.csv --json"),
+    *((2, f"correct camp 0 --file {name}") for name in TABLES if name != "bom.csv"),
+    *((2, f"tell camp --file {name}") for name in ("nan.csv", "none.csv", ".")),
+    # Folders.
+    *((2, f"{name} nowhere --json") for name in ("status", "ask", "update", "repair")),
+    (2, "status sled.py"),
+    (2, ["status", ""]),
+    (2, ["status", "a\0b"]),
+    (2, ["status", "\\1"]),
+    (2, "report camp --out no/such/folder/page.html"),
+    (2, "export camp --netcdf no/such/folder/x.nc"),
+    (0, "report camp --json"),
+    (0, "repair camp --json"),
+    (0, "status camp --json"),
+    # A campaign has its own of these.
+    (2, "criticize camp --noise 0.1"),
+    (2, "criticize camp --effects no_such_module:effects"),
+    (2, "criticize camp --effects odd.py:effects"),
+    (2, "criticize camp --effects odd.py:listed"),
+    (2, "criticize camp --effects odd.py:NUMBER"),
+    (2, "criticize camp --task numerical"),
+    (2, "criticize ."),
+    # Spaces.
+    *(
+        (2, [*SLED, "--actions", spec])
+        for spec in (
+            *("1:2:1000000000", "1:2:0", "1:2:-1", "1:2:1.5", "1:2:²", "2:1"),
+            *("nan:1", "0:inf", "1:2:3:4", "", "x", "a:b", "odd.py:NUMBER", "1,,2"),
+        )
+    ),
+    (2, [*SLED, "--actions", "1:2:1000", "1:2:1000"]),
+    (0, [*SLED, "--actions", "-1:1"]),
+    (0, [*SLED, "--actions", "-5,-4"]),
+    *(
+        (2, [*SLED, *ASK, *words])
+        for words in (
+            *(["--noise", "nan"], ["--noise", "0"], ["--noise", "-1"], ["--noise", ""]),
+            *(["--noise", "1e39"], ["--names", "a,b"], ["--units", "m,s"]),
+            *(["--prior", "odd.py:NUMBER"], ["--prior", "odd.py:NOTHING"]),
+            *(
+                ["--theta-low", "nan,0"],
+                ["--theta-high", "inf,1"],
+                ["--theta-low", "1,1"],
+            ),
+            *(["--num-simulations", "0"], ["--num-simulations", "-5"]),
+            *(["--num-workers", "0"], ["--time-limit", "nan"], ["--time-limit", "-1"]),
+            *(["--effects", "odd.py:NUMBER"], ["--seed", "1.5"], ["--method", "x"]),
+            ["--names", "\udcff"],
+        )
+    ),
+    *((2, [*OF, "sled.py:slide", *ASK, "--config", n]) for n in TOML if n not in GIVEN),
+    *((2, ["init", "new", *GIVEN[n], *ASK, "--config", n]) for n in GIVEN),
+    # Programs.
+    *(
+        (2, [*OF, name, *ASK])
+        for name in (
+            *("sled", "sled.py", "sled.py:", ":slide", "sled.py:none", "none.py:fn"),
+            *("odd.py:NUMBER", "odd.py:NOTHING", "..:x", "json.decoder:scanstring "),
+            *(f"{name}:f" for name in BROKEN),
+        )
+    ),
+    *((1, [*OF, f"odd.py:{name}", *ASK]) for name in ("broken", "left")),
+    (130, [*OF, "odd.py:stopped", *ASK]),
+    (2, [*OF, "odd.py:short", *ASK]),
+    (1, "check odd.py:broken --theta-low 0 --theta-high 1 --actions 1,2"),
+    (2, [*CHECK, "--actions", "1:2:1000000000"]),
+    (2, [*CHECK, *ASK, "--noise", "nan"]),
+    (2, "bank inspect nowhere"),
+    (2, "bank build b --rows 3 --simulator odd.py:NUMBER --prior p:p --actions a:a"),
+    (2, "bank build b --rows 3 --task numerical --workers 0"),
+    (2, "run numerical --out o --simulations 0"),
+    (2, "run numerical --out o --option variant=none"),
 ]
 
 
-@pytest.mark.parametrize("words", ODD, ids=" ".join)
-def test_odd_calls_end_in_a_line_and_not_in_a_traceback(camp, words, capsys):
-    Path("odd.toml").write_text('simulator = 3\nseed = "x"\nactions = {a = 1}\n')
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A campaign with a trial and one to come, beside odd files; made once."""
+    place = tmp_path_factory.mktemp("odd")
+    (place / "sled.py").write_text(SIMULATOR)
+    (place / "odd.py").write_text(ODD)
+    for name, text in BROKEN.items():
+        (place / name).write_text(text)
+    for name, content in TABLES.items():
+        (place / name).write_bytes(content)
+    for name, text in TOML.items():
+        (place / name).write_text(text)
+    (place / "bytes.toml").write_bytes(b"\xff\xfe")
+    small = partial(CampaignOptions, num_scored=500, refinement=REFINEMENT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.delitem(sys.modules, "sled", raising=False)
+        patch.setattr(sys, "path", [*sys.path])
+        patch.setattr(commands, "CampaignOptions", small)
+        words = ["--simulator", "sled.py:slide", "--noise", "0.02", "--method", "nsbi"]
+        assert main(["init", "camp", *INIT[2:], *words, "--actions", "0.5:3"]) == 0
+        assert main(["tell", "camp", "0.3", "--action", "1"]) == 0
+        assert main(["ask", "camp"]) == 0
+    return place
+
+
+@pytest.fixture
+def camp(folder, tmp_path, monkeypatch, capfd):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("sled", "odd", *(Path(name).stem for name in BROKEN)):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    capfd.readouterr()
+
+
+def called(words):
+    """Return the exit status of a call, by an error of the parser too."""
     try:
-        code = main(words)
-    except SystemExit as error:  # of the parser
-        code = error.code
-    assert code in (0, 1, 2)
-    assert "Traceback" not in capsys.readouterr().err
+        return main(words.split() if isinstance(words, str) else words)
+    except SystemExit as ended:
+        return ended.code
 
 
-def test_an_interrupt_is_one_line(camp, monkeypatch, capsys):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("sbi_active.cli.campaign.open_campaign", interrupted)
-    assert main(["ask", "camp"]) == 130
-    assert "interrupted" in capsys.readouterr().err
+def refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")
 
 
-def test_a_reader_that_leaves_is_no_error(camp):
-    script = "import sys; from sbi_active.cli import main; sys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen(
-        [sys.executable, "-O", "-c", script, "status", "camp"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={"LC_ALL": "C", "PATH": ""},
+@pytest.mark.parametrize(("status", "words"), CALLS, ids=lambda w: str(w)[:60])
+def test_an_odd_call(camp, capfd, status, words):
+    assert called(words) == status
+    shown = capfd.readouterr()
+    if status:
+        assert "sbi-active" in shown.err
+        assert "Traceback" not in shown.err
+    elif "--json" in words:
+        json.loads(shown.out, parse_constant=refuse)
+
+
+def test_numbers_that_are_not_finite_are_null(camp, capfd, monkeypatch):
+    infinite = SimpleNamespace(
+        mean=torch.tensor([torch.nan, 1.0]), variance=torch.tensor([torch.inf, 4.0])
     )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    process.stdout.close()
-    text = process.stderr.read()
-    process.wait()
-    assert b"Traceback" not in text
+    monkeypatch.setattr(Campaign, "belief", infinite)
+    monkeypatch.setattr(Campaign, "parameter_names", ["a", "b"])
+    assert main(["status", "camp", "--json"]) == 0
+    answer = json.loads(capfd.readouterr().out, parse_constant=refuse)
+    assert answer["belief"]["parameters"] == {
+        "a": {"mean": None, "sd": None},
+        "b": {"mean": 1.0, "sd": 2.0},
+    }
+
+
+def run(words, **options):
+    """Return a call in a process of its own, as a shell makes it."""
+    code = "import sys; from sbi_active.cli import main; sys.exit(main())"
+    options["env"] = {**os.environ, "OMP_NUM_THREADS": "1", **options.pop("env", {})}
+    flags = options.pop("flags", [])
+    return subprocess.Popen(
+        [sys.executable, *flags, "-c", code, *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("workers", [[], ["--num-workers", "2"]])
+def test_standard_output_holds_the_answer_alone(camp, workers):
+    words = ["--noise", "0.02", "--num-simulations", "200", *workers]
+    box = ["--theta-low", "-1,0", "--theta-high", "1,1"]
+    assert main(["init", "loud", "--simulator", "odd.py:loud", *box, *ASK, *words]) == 0
+    process = run(["ask", "loud", "--json"], stdout=subprocess.PIPE)
+    shown, error = process.communicate()
+    assert json.loads(shown, parse_constant=refuse)["trial"] == 0
+    for text in ("imported", "simulating", "in C", "past Python"):
+        assert text in error
+
+
+@pytest.mark.parametrize("how", ["head", "full"])
+def test_nobody_reads_on(camp, how):
+    words = ["status", "camp"]
+    if how == "head":
+        ours, theirs = os.pipe()
+        os.close(ours)
+    else:
+        theirs = os.open("/dev/full", os.O_WRONLY)
+    process = run(words, stdout=theirs)
+    os.close(theirs)
+    _, error = process.communicate()
+    assert process.returncode == (1 if how == "head" else 2)
+    assert "Traceback" not in error
+    assert "Exception ignored" not in error
+    assert ("No space left" in error) == (how == "full")
+
+
+@pytest.mark.parametrize("flags", [[], ["-O"]])
+def test_a_locale_that_is_not_utf8(camp, flags):
+    env = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": ""}
+    Path("metre.toml").write_text('units = "µm"\nnames = "größe"', encoding="utf-8")
+    init = [*SLED, *ASK, "--config", "metre.toml"]
+    for words in (init, ["tell", "new", "0.3", "--action", "1"]):
+        process = run(words, stdout=subprocess.PIPE, env=env, flags=flags)
+        shown, error = process.communicate()
+        assert process.returncode == 0, error
+    assert "Traceback" not in error
+    words = ["correct", "new", "0", "0.4", "--reason", "µ", "--json"]
+    process = run(words, stdout=subprocess.PIPE, env=env, flags=flags)
+    shown, _ = process.communicate()
+    answer = json.loads(shown)
+    assert (answer["names"], answer["units"]) == (["größe"], ["µm"])
+    assert answer["reason"] == "µ"
+    process = run(["report", "new"], stdout=subprocess.PIPE, env=env, flags=flags)
+    assert process.wait() == 0
+    assert "µm" in Path("new/report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_while_it_simulates(camp, sent):
+    text = (
+        SIMULATOR + "\nimport time\n\n\ndef slow(theta, action):\n    open('on', 'w')\n"
+    )
+    Path("slow.py").write_text(text + "    time.sleep(60)\n")
+    words = ["check", "slow.py:slow", *BOX, *ASK]
+    process = run(words, stdout=subprocess.PIPE)
+    for _ in range(600):
+        if Path("on").exists():
+            break
+        time.sleep(0.1)
+    process.send_signal(sent)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == (130 if sent == signal.SIGINT else -signal.SIGTERM)
+    assert "Traceback" not in error

@@ -226,7 +226,7 @@ def test_tasks_are_ready(capsys):
         ),
         (
             ["math:sin", *SPACE[:2], "--actions", "fast"],
-            "expected numbers separated by commas; got 'fast'",
+            "expected finite numbers; got 'fast'",
         ),
     ],
 )

@@ -5,7 +5,13 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, simulate
+from sbi_active import (
+    Campaign,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+    simulate,
+)
 from sbi_active.campaign.telling import outcome_told
 from sbi_active.inference.rounds import outcome_rows
 from sbi_active.seeding import row_normals
@@ -183,3 +189,39 @@ def test_the_check_of_rows_without_a_measurement(lost, mixes):
 def test_a_number_a_row_is_a_column():
     assert outcome_tensor([1.0, 2.0], 2).shape == (2, 1)
     assert outcome_tensor(np.zeros((2, 3)), 2).dtype == torch.float64
+
+
+def pairs(theta, action):
+    """Return (n, n), where (n, 1) was meant: a number for each pair of rows."""
+    return theta[:, 0] * action + torch.randn(len(theta), len(theta))
+
+
+@pytest.mark.parametrize("wrap", [lambda fn: fn, SimulatorModel])
+def test_a_number_for_each_pair_of_rows_is_refused_at_once(wrap):
+    prior = BoxUniform(torch.zeros(2), torch.ones(2))
+    with pytest.raises(ValueError, match="index both alike"):
+        Campaign(wrap(pairs), prior, DiscreteActions([1.0, 2.0]))
+
+
+def test_x_may_be_as_wide_as_it_is_long():
+    def wide(theta, action):
+        return theta[:, :1] * action + torch.randn(len(theta), 16)
+
+    model = SimulatorModel(wide)
+    for num_rows in (16, 4, 16, 1, 300):
+        assert model(torch.ones(num_rows, 1), torch.ones(num_rows, 1)).shape[1] == 16
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    assert Campaign(wide, prior, DiscreteActions([1.0, 2.0])).x_shape == (16,)
+
+
+def test_one_number_a_row_needs_no_axis():
+    def flat(theta, action):
+        return theta[:, 0] * action[:, 0]
+
+    model = SimulatorModel(flat, noise=0.1)
+    for num_rows in (1, 2, 300):
+        ones = torch.ones(num_rows, 1)
+        assert model.mean(ones, ones).shape == (num_rows, 1)
+    assert Campaign(
+        model, BoxUniform(torch.zeros(1), torch.ones(1)), DiscreteActions([1.0])
+    ).x_shape == (1,)

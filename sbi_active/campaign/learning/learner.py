@@ -41,6 +41,7 @@ from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
+from sbi_active.simulation.simulator import square_of
 
 
 class Learner:
@@ -375,12 +376,10 @@ class Learner:
         with forked_generators(seed, "probe"):
             theta: Tensor = self.prior.sample(torch.Size([16]))
         action = self._actions.sample((16,), seed=derive_seed(seed, "probe"))
-        rows = simulate(
-            self.simulator,
-            theta,
-            action,
-            seed=derive_seed(seed, "probe", 1),
-            check_noise=True,
-            workers=self._state.options.workers,
-        )
-        return rows.x.shape[1:]
+        options: dict[str, Any] = {"seed": derive_seed(seed, "probe", 1)}
+        options["workers"] = self._state.options.workers
+        x = simulate(self.simulator, theta, action, check_noise=True, **options).x
+        if square_of(x, None) is not None:  # by chance, or is it one for each row?
+            fewer = simulate(self.simulator, theta[1:], action[1:], **options)
+            square_of(fewer.x, len(x))
+        return x.shape[1:]

@@ -22,10 +22,12 @@ from sbi_active.campaign.storage.codec import Absent
 from sbi_active.campaign.storage.damage import reading
 from sbi_active.campaign.storage.described import (
     actions_from,
+    describe_options,
     options_from,
     prior_from,
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
+from sbi_active.campaign.storage.drawn import drawn_from, stood_for
 from sbi_active.campaign.storage.manifest import MANIFEST, require_same_simulator
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
@@ -85,7 +87,7 @@ class StoredLearner:
         saved, self._saved = self._saved, None
         if saved is not None:
             try:
-                self._belief = saved()
+                self._belief = stood_for(saved(), self.first_prior, self._state)
             except ValueError as error:
                 warn(f"the belief has to be computed again: {error}", stacklevel=3)
                 self._state.is_stale = True
@@ -127,8 +129,15 @@ def load(
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest = disk.manifest
     settings: CampaignOptions = _given("options", options, disk, options_from)
-    space: ActionSpace = _given("actions", actions, disk, actions_from)
-    first_prior: Distribution = _given("prior", prior, disk, prior_from)
+    if options is not None and describe_options(options) != manifest.get("options"):
+        warn(
+            f"options= hold for this process: the campaign in {directory} keeps "
+            f"{manifest.get('options_text')}; pass them at each load",
+            stacklevel=4,
+        )
+    reads = simulator is None
+    space: ActionSpace = _given("actions", actions, disk, actions_from, reads=reads)
+    first_prior: Distribution = _given("prior", prior, disk, prior_from, reads=reads)
     with reading(disk.path / MANIFEST):
         state = CampaignState(
             manifest["method"],
@@ -185,13 +194,24 @@ def _belief(
 
 
 def _given(
-    what: str, given: Any, disk: CampaignDirectory, made: Callable[[Any], Any]
+    what: str,
+    given: Any,
+    disk: CampaignDirectory,
+    made: Callable[[Any], Any],
+    *,
+    reads: bool = False,
 ) -> Any:
-    """Return what was passed, or else what the manifest describes."""
+    """Return what was passed, or else what the manifest describes.
+
+    Readers get what stands for it where it is a class of its author's own.
+    """
     if given is not None:
         return given
     with reading(disk.path / MANIFEST):
         described, text = disk.manifest[what], disk.manifest[f"{what}_text"]
+        drawn = disk.manifest.get("drawn", {}).get(what)  # earlier files have none
+        if reads and drawn is not None:
+            return drawn_from(drawn)
     if described is None:
         raise ValueError(
             f"expected {what}=, which only its author can make again; got None; pass "

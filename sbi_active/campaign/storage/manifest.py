@@ -21,6 +21,7 @@ from sbi_active.campaign.storage.described import (
     describe_options,
     describe_prior,
 )
+from sbi_active.campaign.storage.drawn import draws_of
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
 from sbi_active.simulation.bank.segments import write_file
 
@@ -54,6 +55,7 @@ def new_manifest(
     """
     names = getattr(simulator, "parameter_names", None)
     channels = getattr(simulator, "channel_names", None)
+    described = {"prior": describe_prior(prior), "actions": describe_actions(actions)}
     return {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -65,12 +67,17 @@ def new_manifest(
         "parameter_names": None if names is None else [*names],
         "channel_names": None if channels is None else [*channels],
         "x_shape": [*x_shape],
-        "prior": describe_prior(prior),
+        "prior": described["prior"],
         "prior_text": repr(prior),
-        "actions": describe_actions(actions),
+        "actions": described["actions"],
         "actions_text": repr(actions),
         "options": describe_options(state.options),
         "options_text": repr(state.options),
+        "drawn": {
+            what: draws_of(thing, seed=state.seed)
+            for what, thing in (("prior", prior), ("actions", actions))
+            if described[what] is None
+        },
         "effects": [*effects],
         "has_cost": has_cost,
         "has_constraint": has_constraint,

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pickle
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -242,6 +243,18 @@ def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
         Campaign.load(tmp_path / "c", simulator=drawn, actions="fast")
 
 
+def test_options_of_a_load_are_said_to_hold_for_one_process(tmp_path):
+    new(tmp_path / "c").close()
+    own = Campaign.load(tmp_path / "c").state.options
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Campaign.load(tmp_path / "c", simulator=drawn, options=own)
+    other = replace(own, num_samples=own.num_samples + 1)
+    with pytest.warns(UserWarning, match="hold for this process"):
+        Campaign.load(tmp_path / "c", simulator=drawn, options=other)
+    assert Campaign.load(tmp_path / "c").state.options == own
+
+
 def price(action):
     return 1 + action[:, 0]
 
@@ -261,7 +274,14 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     )
     go_on(campaign, 1).close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
-        Campaign.load(tmp_path / "c")
+        Campaign.load(tmp_path / "c", simulator=drawn, cost=price)
+    reader = Campaign.load(tmp_path / "c")  # by the draws that are kept
+    scale = campaign.belief.variance.sqrt()
+    assert ((reader.belief.mean - campaign.belief.mean).abs() < 0.2 * scale).all()
+    assert reader.belief.diagnostics == campaign.belief.diagnostics
+    assert torch.equal(reader.prior.mean, prior.mean)
+    with pytest.raises(ValueError, match="load the campaign with prior="):
+        reader.belief.log_prob(torch.zeros(2))
     with pytest.raises(ValueError, match="expected cost= as declared; got none"):
         Campaign.load(tmp_path / "c", simulator=drawn, prior=prior)
     again = Campaign.load(tmp_path / "c", simulator=drawn, prior=prior, cost=price)

@@ -57,6 +57,7 @@ def made(scale):
 @pytest.fixture
 def sled(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "sled", raising=False)  # of another folder
     (tmp_path / "sled_constants.py").write_text("STIFFNESS = 4.0\n")
     (tmp_path / "sled.py").write_text(SLED)
     yield importlib.import_module("sled")

@@ -1,0 +1,174 @@
+"""Where a campaign's programs are, as its folder says, and who may believe it.
+
+A folder may have come from anybody. What its ``command.json`` names is imported where
+this account wrote that file, or was told once by ``--trust`` to follow it; both are
+remembered outside of the folder. Nothing here imports torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+#: How the command line made the campaign: where its simulator is.
+DECLARED = "command.json"
+#: What else makes a folder a campaign's, see :mod:`sbi_active.campaign.storage`.
+MANIFESTS = ("campaign.json", "campaign.json.copy")
+
+TEXTS = ("simulator", "noise", "prior", "actions", "folder", "task")
+LISTS = ("effects", "options")
+
+
+def in_campaign(path: Path) -> bool:
+    """Return whether a folder is a campaign's, or within one."""
+    places = (path.resolve(), *path.resolve().parents)
+    return any((place / name).exists() for place in places for name in MANIFESTS)
+
+
+def names_object(specs: Sequence[str]) -> bool:
+    """Return whether --actions is MODULE:NAME, and no numbers."""
+    is_number = any(re.match(r"[-+]?\.?\d", spec) for spec in specs)
+    return len(specs) == 1 and specs[0].count(":") == 1 and not is_number
+
+
+def declared_by(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return where everything is that a program wrote, as other commands need it."""
+    if arguments.simulator is None:
+        raise ValueError(
+            "expected --simulator; got none; name it, as in --simulator my_robot.py:fn"
+        )
+    actions = arguments.actions or []
+    return {
+        "simulator": arguments.simulator,
+        "effects": [] if arguments.effects is None else [arguments.effects],
+        "noise": arguments.noise,
+        "prior": arguments.prior,
+        "actions": actions[0] if names_object(actions) else None,
+        "folder": os.getcwd(),
+    }
+
+
+def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
+    """Return the same for a campaign on a task.
+
+    Args:
+        name: Of the task.
+        options: Of the task, each NAME=VALUE.
+    """
+    return {"task": name, "options": [*options], "noise": None, "folder": os.getcwd()}
+
+
+def read_declared(folder: Path) -> dict[str, Any]:
+    """Return what a campaign's folder says; nothing for a campaign of a program.
+
+    Raises:
+        ValueError: If the file does not hold what the command line writes.
+    """
+    path = folder / DECLARED
+    try:
+        found = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return {}
+    except (ValueError, RecursionError):
+        found = None
+    found = found if isinstance(found, dict) else None
+    if found is not None:
+        effects = found.get("effects")  # a single one in earlier files
+        found["effects"] = [effects] if isinstance(effects, str) else effects or []
+        found.setdefault("options", [])
+    if found is None or not (
+        all(isinstance(found.get(name), str | None) for name in TEXTS)
+        and all(_is_texts(found[name]) for name in LISTS)
+    ):
+        raise ValueError(
+            f"expected {path} as sbi-active writes it; got another content; remove the "
+            "file, and name the simulator by --simulator"
+        )
+    return found
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(part, str) for part in value)
+
+
+def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
+    """Write where everything is, and remember that it was written here."""
+    from sbi_active.simulation.bank.segments import write_file
+
+    write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
+    _remember(folder)
+
+
+def named(
+    declared: Mapping[str, Any], what: str, folder: Path, *, trusts: bool
+) -> list[str]:
+    """Return what a folder names under a key, each MODULE:NAME.
+
+    Args:
+        declared: Of the folder.
+        what: The key.
+        folder: Of the campaign.
+        trusts: Whether the command line says to follow it.
+
+    Raises:
+        ValueError: If it names something that may be anybody's program.
+    """
+    value = declared.get(what)
+    names = value if isinstance(value, list) else [value] if value else []
+    origin = Path(declared.get("folder") or "")
+    for name in names:
+        module = name.partition(":")[0]
+        place = origin / module if module.endswith(".py") else origin
+        require_trust(folder, f"{name} in {origin}", place, trusts=trusts)
+    return names
+
+
+def require_trust(folder: Path, what: str, place: Path | None, *, trusts: bool) -> None:
+    """Raise where nobody here said that what a folder names may be executed.
+
+    Args:
+        folder: Of the campaign.
+        what: It names, for the error.
+        place: Where that would be imported from; None for this library.
+        trusts: Whether the command line says so.
+
+    Raises:
+        ValueError: If it has to be looked at first.
+    """
+    # A relative place, or one within the folder, holds whatever somebody put there.
+    is_fixed = place is None or (place.is_absolute() and not _is_within(place, folder))
+    if trusts:
+        if is_fixed:
+            _remember(folder)
+    elif not (is_fixed and _record(folder).exists()):
+        raise ValueError(
+            f"expected programs that were named here; got {what}, which {DECLARED} in "
+            f"{folder} names and this account did not write or trust; look at it, then "
+            "add --trust to have it executed, or name your own by --simulator"
+        )
+
+
+def _is_within(place: Path, folder: Path) -> bool:
+    inner, outer = place.resolve(), folder.resolve()
+    return outer in (inner, *inner.parents) or in_campaign(inner)
+
+
+def _remember(folder: Path) -> None:
+    record = _record(folder)
+    with suppress(OSError):  # as in a home that is read only: --trust each time
+        record.parent.mkdir(parents=True, exist_ok=True)
+        record.touch()
+
+
+def _record(folder: Path) -> Path:
+    """Return the file, outside of the folder, that stands for its ``command.json``."""
+    home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    digest = hashlib.sha256((folder / DECLARED).read_bytes()).hexdigest()
+    return Path(home, "sbi-active", "trusted", digest)
