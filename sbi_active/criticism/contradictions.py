@@ -32,6 +32,23 @@ class MissedTrial:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OutlyingTrial:
+    """A fitted trial that errs far more than the others, where every model misses.
+
+    Attributes:
+        position: Place among the fitted trials.
+        name: What the trial is called.
+        times: Its error on the fit to the others, in medians of theirs.
+        size: The same, root mean square in sensor deviations.
+    """
+
+    position: int
+    name: str
+    times: float
+    size: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class BoundParameter:
     """A parameter that the trials press against a bound of its prior.
 

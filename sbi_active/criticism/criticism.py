@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from torch.distributions import Distribution
@@ -16,6 +17,7 @@ from sbi_active.criticism.checks import (
     require_warm_up,
     with_noise,
 )
+from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
@@ -26,7 +28,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.missed import beside_misfit
 from sbi_active.criticism.misfit.record import detected, traced
-from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
+from sbi_active.criticism.misfit.verdict import Misfit, find_misfit, without
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
@@ -152,25 +154,16 @@ class Criticism:
         self.num_summaries = summaries
         if summaries:
             short = summarize(
-                model,
-                prior,
-                trials,
-                self.effects,
+                *(model, prior, trials, self.effects),
                 num=summaries,
                 seed=derive_seed(seed, "summaries"),
             )
             self._parts = short.model, short.trials, short.effects
             self.num_summaries = len(short.weight)
-        own, measured, some = self._parts
-        with stage("a look at the simulator", show_progress=show_progress):
-            #: Effects that linear evidence set aside; None where all are fitted.
-            self.rivals, self.screening, self._few = worth_fitting(
-                RivalSet(own, prior, measured.fit, some, actions=actions, seed=seed)
-            )
-        self._fewer = {} if self._few is None else {"num_draws": FEW_DRAWS}
-        # Each model's held-out errors would take as much as the verdict.
-        self._scored = measured.held_out if self._few is None else None
-        self.rivals.warm_up = require_warm_up(warm_up, measured, some)
+        self._warm_up = require_warm_up(warm_up, *self._parts[1:])
+        #: Trials that every model misses by far more than the others.
+        self.set_aside: tuple[OutlyingTrial, ...] = ()
+        self._look()
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
         self._equivalent: tuple[frozenset[str], ...] | None = None
@@ -181,6 +174,20 @@ class Criticism:
         self._by_sensor: BySensor | None = None
         self._is_searched = False
 
+    def _look(self) -> None:
+        """Make the models of the trials that are there."""
+        model, trials, effects = self._parts
+        with stage("a look at the simulator", show_progress=self.show_progress):
+            #: Effects that linear evidence set aside; None where all are fitted.
+            parts = model, self.prior, trials.fit, effects
+            self.rivals, self.screening, self._few = worth_fitting(
+                RivalSet(*parts, actions=self.actions, seed=self.seed)
+            )
+        self._fewer = {} if self._few is None else {"num_draws": FEW_DRAWS}
+        # Each model's held-out errors would take as much as the verdict.
+        self._scored = trials.held_out if self._few is None else None
+        self.rivals.warm_up = self._warm_up
+
     def misfit(self) -> Misfit | None:
         """Return the models where none explains the trials to the sensor's error.
 
@@ -188,10 +195,17 @@ class Criticism:
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:
-            groups, few = self.equivalent(), self._few
-            self._misfit = find_misfit(self.rivals, groups, search=few)
-            if few is not None and self._misfit is None:
-                self._by_sensor = BySensor(few, self.rivals)
+            self._misfit = find_misfit(self.rivals, self.equivalent(), search=self._few)
+            if self._misfit is not None and not self.set_aside:
+                self.set_aside = found = self._misfit.outlying()
+                if found:  # they are not to decide what the others say
+                    model, trials, effects = self._parts
+                    self._parts = model, without(trials, found), effects
+                    self.trials, self._equivalent = without(self.trials, found), None
+                    self._look()
+                    return self.misfit()
+            if self._few is not None and self._misfit is None:
+                self._by_sensor = BySensor(self._few, self.rivals)
             self._is_searched = True
         return self._misfit
 
@@ -219,7 +233,7 @@ class Criticism:
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            groups, misfit = self.equivalent(), self.misfit()
+            misfit, groups = self.misfit(), self.equivalent()
             if self._by_sensor is not None:
                 self._detection = self._by_sensor.detected()
             elif misfit is None:
@@ -233,9 +247,11 @@ class Criticism:
     def trace(self) -> Tracing:
         """Return which effect the data point to."""
         misfit = self.misfit()
-        if self._tracing is None and misfit is not None:
-            self._tracing = traced(misfit, self._scored)
-        if self._tracing is None:
+        if self._tracing is not None:
+            return self._tracing
+        if misfit is not None:
+            tracing = traced(misfit, self._scored)
+        else:
             detection, groups = self.detect(), self.equivalent()
             if self._by_sensor is not None:
                 tracing = self._by_sensor.traced()
@@ -249,7 +265,7 @@ class Criticism:
             )
             if self._misfit is not None:
                 self._residuals = None
-            self._tracing = tracing
+        self._tracing = replace(tracing, set_aside=self.set_aside)
         return self._tracing
 
     def add(
@@ -307,8 +323,7 @@ class Criticism:
         it; None with fewer than four trials.
         """
         tracing, trials = self.trace(), self._parts[1]
-        held_out = trials.held_out
-        if held_out is not None:
+        if (held_out := trials.held_out) is not None:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None

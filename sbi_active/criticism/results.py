@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sbi_active.criticism.contradictions import Bounds, MissedTrial
+from sbi_active.criticism.contradictions import Bounds, MissedTrial, OutlyingTrial
 from sbi_active.criticism.under_misfit import Misfit
 
 Array = NDArray[Any]
@@ -277,6 +277,8 @@ class Tracing:
             parameters all taken as determined; NaN where nobody asked.
         log_process: Log Bayes factor of a residual process beside that model, nats.
         bounds: Parameters at bounds of the prior, and what a wider one would give.
+        set_aside: Trials that every model misses by far more than the others, and that
+            had no part in this.
     """
 
     verdict: str
@@ -303,6 +305,7 @@ class Tracing:
     p_value: float = float("nan")
     log_process: float = -float("inf")
     bounds: Bounds = Bounds()
+    set_aside: tuple[OutlyingTrial, ...] = ()
 
     @property
     def key(self) -> ModelKey:

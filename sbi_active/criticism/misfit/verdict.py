@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.contradictions import OutlyingTrial
+from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import FirstLook
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
@@ -35,6 +37,7 @@ from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.criticism.under_misfit import NAMED
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -153,6 +156,28 @@ class Misfit:
 
         return settled(self.search, score, self.equivalent).key
 
+    def outlying(self) -> tuple[OutlyingTrial, ...]:
+        """Return the trials that err far more than the others let expect.
+
+        By what the verdict's model leaves of each as it is fitted to the others, in
+        units of what they let expect: a trial that alone shows what an effect does is
+        not one of them.
+        """
+        errors, found = self.search.errors, self.search.found[self.choice.key]
+        if not errors.is_by_trial:
+            return ()
+        rows, names = np.unique(errors.measurements.trial), self.rivals.trials.names
+        square = np.nan_to_num(self.standard(found), nan=1.0)
+        return tuple(
+            OutlyingTrial(
+                position=int(rows[k]),
+                name=names[rows[k]],
+                times=times,
+                size=float(np.sqrt(found.left.square[k])),
+            )
+            for k, times in outlying_trials(square.tolist())
+        )
+
     def is_robust(self) -> bool:
         """Return whether effect priors of another scale leave what helps."""
         errors = self.search.errors
@@ -264,6 +289,13 @@ def find_misfit(
     sensor_alone = search.found[ModelKey()].posterior.log_sensor
     log_b = log_sum_exp(np.array(log_p)) - sensor_alone
     return Misfit(search, rivals, equivalent, choice, standard, float(log_b))
+
+
+def without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
+    """Return all trials but some of those that were fitted."""
+    fitted = [k for k, role in enumerate(trials.role) if role == "fit"]
+    gone = {fitted[trial.position] for trial in outlying}
+    return trials.select([k for k in range(len(trials)) if k not in gone])
 
 
 def settled(

@@ -18,6 +18,7 @@ from sbi_active.criticism.report.suspects import (
     of_bounds,
     of_missed,
     of_noise,
+    of_outlying,
     of_trials,
 )
 from sbi_active.criticism.results import (
@@ -86,6 +87,7 @@ def find_warnings(
         *_of_errors(residuals, residuals_after, tracing),
         *_of_evidence(tracing, detection),
         *of_noise(detection),
+        *of_outlying(tracing),
         *of_missed(evaluation),
         *of_bounds(tracing.bounds),
         *of_trials(tracing),

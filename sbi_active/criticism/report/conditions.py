@@ -10,7 +10,7 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import summary_sentence
 from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.report.section import named_entries, setting
-from sbi_active.criticism.report.suspects import of_bounds, of_missed
+from sbi_active.criticism.report.suspects import of_bounds, of_missed, of_outlying
 
 #: Parameters and entries of the action that a sentence names at most.
 MOST_NAMED = 3
@@ -18,7 +18,9 @@ MOST_NAMED = 3
 
 def first_paragraph(report: Contents) -> str:
     """Return what was found, and what a verdict that names effects does not know."""
-    against = [*of_missed(report.evaluation), *of_bounds(report.tracing.bounds)]
+    tracing = report.tracing
+    against = [*of_outlying(tracing), *of_missed(report.evaluation)]
+    against += of_bounds(tracing.bounds)
     said = [f"{text[0].upper()}{text[1:]}." for text in against]
     return " ".join([summary_sentence(report), *said, *conditions(report)])
 

@@ -20,10 +20,12 @@ from sbi_active.criticism.report.section import (
     named_entries,
 )
 from sbi_active.criticism.report.suspects import label
-from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
+from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, Residuals
 
 SHOWN = 0.01  # probability from which a set of several effects stands in the table
 SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
+#: Trials that are listed, the worst; of any number these are a few lines.
+MOST_TRIALS = 6
 
 
 def effects(report: Contents) -> Section:
@@ -183,6 +185,60 @@ def _beside_the_sensor(report: Contents) -> str:
 
 def _measure(value: float, unit: str) -> str:
     return f"{number(float(f'{value:.2g}'))} {unit}".rstrip()
+
+
+def by_trial(report: Contents) -> Section:
+    """Return the root mean square residual of the worst trials, and where it is."""
+    found = report.residuals_after or report.residuals
+    left = _by_channel(found.x - found.mean, found)
+    z = _by_channel(found.refitted, found)
+    if report.tracing.misfit is not None:  # what is predicted is as wide as the misfit
+        z = left / report.tracing.misfit.sensor
+    aside = [
+        (trial.name, "", number(trial.size), "set aside: on the fit to the others")
+        for trial in report.tracing.set_aside
+    ]
+    sizes = np.array([_rms(own) for own in z])
+    order = np.argsort(-np.nan_to_num(sizes, nan=-np.inf), kind="stable")
+    order = order[np.isfinite(sizes[order])].tolist()
+    worst = order[: max(MOST_TRIALS - len(aside), 0)]
+    rows = [_row(report, found, t, left[t], z[t]) for t in worst]
+    model = "the bare model" if report.residuals_after is None else added(report)
+    rest = len(order) - len(worst)
+    text = f"Root mean square with {model}, the worst first"
+    text += f"; {rest} more {'is' if rest == 1 else 'are'} no worse." if rest else "."
+    of = "the prediction" if report.tracing.misfit is None else "the sensor"
+    where = " where it is largest" if left.shape[2] > 1 else ""
+    header = ("trial", f"in units of x{where}", f"in deviations of {of}", "largest")
+    return Section("Residuals by trial", (text,), header=header, rows=(*aside, *rows))
+
+
+def _row(
+    report: Contents, found: Residuals, t: int, left: Array, z: Array
+) -> tuple[str, ...]:
+    """Return the line of one trial, of residuals in both units, shapes (k, c)."""
+    place, c = np.unravel_index(np.nanargmax(np.abs(z)), z.shape)
+    labels, where = report.channel_names or (), []
+    name, unit = f"channel {c}", ""
+    if len(labels) == z.shape[1]:
+        ((name, unit),) = named_entries([labels[c]])
+    if z.shape[1] > 1:
+        where.append(name)
+    if found.times is not None:
+        times = np.broadcast_to(found.times, found.x.shape[:2])
+        where.append(f"t = {number(float(times[t, place]))}")
+    size = f"{number(_rms(left[:, c]))} {unit}".rstrip()
+    return called(found.names, t), size, number(_rms(z)), ", ".join(where)
+
+
+def _by_channel(x: Array, found: Residuals) -> Array:
+    """Return trials, times and channels, (t, k, c); each number is one without time."""
+    return x.reshape(len(x), 1 if found.times is None else x.shape[1], -1)
+
+
+def _rms(x: Array) -> float:
+    seen = x[np.isfinite(x)]
+    return float(np.sqrt((seen**2).mean())) if seen.size else np.nan
 
 
 def leave_one_out(report: Contents) -> Section:

@@ -11,6 +11,7 @@ from sbi_active.criticism.report.suspects import (
     label,
     missed_clause,
     narrow_prior,
+    set_aside_clause,
     verdict_clause,
 )
 from sbi_active.criticism.report.under_misfit import misfit_line, misfit_sentences
@@ -59,7 +60,7 @@ def verdict_line(report: Contents) -> str:
     same = sorted(frozenset().union(*groups) - named)
     if same:
         line += f"; no permitted action tells it from {', '.join(same)}"
-    return line + missed_clause(report.evaluation)
+    return line + set_aside_clause(tracing) + missed_clause(report.evaluation)
 
 
 def _withdrawn_for(tracing: Tracing) -> str:

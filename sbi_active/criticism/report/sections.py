@@ -19,6 +19,7 @@ def sections(report: Contents) -> Iterator[Section]:
     yield findings.effects(report)
     yield findings.equivalences(report)
     yield findings.residuals(report)
+    yield findings.by_trial(report)
     yield outlook.errors(report)
     if report.leave_one_out:
         yield findings.leave_one_out(report)

@@ -124,6 +124,29 @@ def of_bounds(bounds: Bounds) -> Iterator[str]:
         )
 
 
+def of_outlying(tracing: Tracing) -> Iterator[str]:
+    """Yield a sentence on each trial that was set aside where every model misses."""
+    for trial in tracing.set_aside:
+        yield (
+            f"trial {trial.name} is far outside what the other trials show: its error "
+            f"on the fit to them is {trial.times:.3g} times theirs; it is set aside, "
+            "and had no part in the verdict: check its record, its unit and its "
+            "set-up, then correct, withdraw or repeat it"
+        )
+
+
+def set_aside_clause(tracing: Tracing) -> str:
+    """Return which trials were set aside, "" for none."""
+    which = tracing.set_aside
+    if not which:
+        return ""
+    if len(which) > MOST_NAMED:
+        return f"; {len(which)} trials are set aside"
+    names = " and ".join(trial.name for trial in which)
+    verb = "is" if len(which) == 1 else "are"
+    return f"; trial{'s' * (len(which) > 1)} {names} {verb} set aside"
+
+
 def of_missed(evaluation: Evaluation | None) -> Iterator[str]:
     """Yield a sentence on each held-out trial far outside what is predicted."""
     for trial in () if evaluation is None else evaluation.missed:

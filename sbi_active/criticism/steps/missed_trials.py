@@ -45,6 +45,10 @@ Array = NDArray[Any]
 LEVEL = 0.01
 #: Trials below which their errors do not show how errors differ.
 FEWEST_TRIALS = 5
+#: Deviation that logarithms of their mean squared errors have at least, so that none of
+#: ten is called outlying that errs by less than three times the others, the smallest
+#: gross error; half and twice make it two and ten times.
+LEAST_SPREAD = 0.5
 
 
 def missed_trials(
@@ -117,18 +121,19 @@ def outlying_trials(
     By Student's t of the logarithms, each trial against the others.
 
     Args:
-        squares: Mean squared error of each trial on the fit to the others, shape (t,).
+        squares: Mean squared error of each trial on the fit to the others, in sensor
+            variances, shape (t,). Less than one is no better than one.
         level: Probability that any of ordinary trials is called so (Bonferroni).
 
     Returns:
         Positions and how many times the median of the others the error is, largest
         first.
     """
-    logs, found = np.log(np.maximum(squares, 1e-300)), []
+    logs, found = np.log(np.maximum(squares, 1.0)), []
     for k in range(len(logs) if len(logs) >= FEWEST_TRIALS else 0):
         others = np.delete(logs, k)
         n = len(others)
-        spread = others.std(ddof=1) * np.sqrt(1 + 1 / n)
+        spread = max(others.std(ddof=1), LEAST_SPREAD) * np.sqrt(1 + 1 / n)
         if student.sf((logs[k] - others.mean()) / spread, n - 1) < level / len(logs):
             found.append((k, float(np.exp(0.5 * (logs[k] - np.median(others))))))
     return sorted(found, key=lambda each: -each[1])
