@@ -62,6 +62,7 @@ def campaign(
     actions: Any = ACTIONS,
     effects: Any = (),
     seed: int = 0,
+    directory: str | None = None,
     **changes: Any,
 ) -> Campaign:
     """Return a small campaign."""
@@ -76,6 +77,7 @@ def campaign(
         method=method,
         effects=effects,
         seed=seed,
+        directory=directory,
         options=replace(options, **changes),
     )
 

@@ -27,6 +27,13 @@ AREAS = (
     "criticism",
     "effects_and_reports",
     "parameters",
+    "threads_and_locks",
+    "crafted_files",
+    "command_line",
+    "tables",
+    "mujoco_robots",
+    "priors",
+    "process_state",
 )
 RESULTS = Path(__file__).parent / "results"
 COLUMNS = ["attack", "case", "survived", "answer", "cpu_seconds"]
