@@ -1,4 +1,4 @@
-"""Attacks on the command line in processes of its own: words, pipes, signals, locales."""
+"""Attacks on the command line in its own processes: words, pipes, signals, locales."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ ATTACKS = Attacks()
 SLED = (
     "def slide(theta, action):\n    print('noise')\n    return theta[:, :1] * action\n"
 )
-INIT = (
-    "init camp --simulator sled.py:slide --actions=-2:2 --noise .1 --theta-low 0.2,-1 "
-    "--theta-high 1,1 --num-simulations 200 --num-samples 50 --method nsbi"
-).split()
+INIT = [
+    *("init", "camp", "--simulator", "sled.py:slide", "--actions=-2:2"),
+    *("--noise", ".1", "--theta-low", "0.2,-1", "--theta-high", "1,1"),
+    *("--num-simulations", "200", "--num-samples", "50", "--method", "nsbi"),
+]
 
 
 def call(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -94,7 +94,8 @@ STATES = {
     "another seed": "import torch; torch.manual_seed(99)",
     "numpy's seed": "import numpy; numpy.random.seed(3)",
     "errors of numpy": "import numpy; numpy.seterr(all='raise')",
-    "warnings are errors": "import warnings; warnings.simplefilter('error', UserWarning)",
+    "warnings are errors": "import warnings; "
+    "warnings.simplefilter('error', UserWarning)",
     "values are not validated": "import torch; "
     "torch.distributions.Distribution.set_default_validate_args(False)",
     "values are validated": "import torch; "
@@ -171,7 +172,7 @@ for k in range(num_trials):
     c.attach(action[0], x)
 belief = c.update()
 theta = belief.sample((2_000,)).double()
-a = torch.linspace(0.5, 2.0, num_trials).double() if num_trials > 1 else torch.tensor([0.5]).double()
+a = torch.linspace(0.5, 2.0, num_trials).double()
 precision = mix.double() @ mix.double().T * (a**2).sum() / 0.01
 _, directions = torch.linalg.eigh(precision)
 best = directions[:, -1]  # what the data tell most
