@@ -180,7 +180,6 @@ BAD: dict[str, dict[str, Any]] = {
     "times empty": {"times": []},
     "threads 0": {"threads": 0},
     "threads -1": {"threads": -1},
-    "noise 0": {"noise": 0.0},
     "noise negative": {"noise": -1.0},
     "noise NaN": {"noise": float("nan")},
     "no such sensor": {"sensors": ["gyro"]},

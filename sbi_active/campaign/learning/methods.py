@@ -97,7 +97,7 @@ def find_method(name: str) -> Method:
     Raises:
         ValueError: If the name is unknown; it lists the valid ones.
     """
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise ValueError(
             f"expected method to be one of {', '.join(map(repr, METHODS))}; got "
             f"{name!r}; choose one of these"

@@ -156,7 +156,9 @@ def mend_log(path: Path) -> list[str]:
 
 
 def keep_aside(path: Path) -> None:
-    """Keep a copy of a damaged file, beside those of earlier repairs."""
+    """Keep a copy of a damaged file, if any, beside those of earlier repairs."""
+    if not path.exists():
+        return
     number, copy = 1, path.with_suffix(".damaged")
     while copy.exists():
         number += 1

@@ -123,7 +123,8 @@ class Rows:
                 f"{text.iloc[i]!r} in {self.source}; "
                 + (_remedy(column, text.iloc[i]) or leave)
             )
-        for i in np.flatnonzero(np.isinf(values) if empty else ~np.isfinite(values)):
+        too_large = np.abs(values) > np.finfo(np.float32).max  # simulators' numbers
+        for i in np.flatnonzero(too_large if empty else too_large | np.isnan(values)):
             raise ValueError(
                 f"expected a finite number in column {column}, {self.place(i)}; got "
                 f"{text.iloc[i] or 'an empty cell'} in {self.source}; "
