@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,7 +19,13 @@ from torch.distributions.transforms import (
 
 from benchmarks.robustness.attacks import Attacks
 from benchmarks.robustness.campaign_problem import OPTIONS
-from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
+from sbi_active import (
+    BoxActions,
+    Campaign,
+    GaussianNoise,
+    RefinementOptions,
+    SimulatorModel,
+)
 from sbi_active.seeding import forked_generators
 
 ATTACKS = Attacks()
@@ -110,8 +117,14 @@ def begun(prior: Any, method: str = "asbi") -> Campaign:
     model = SimulatorModel(
         lambda theta, action: theta * action, noise=GaussianNoise(SD)
     )
+    # The moments are asked for at .25 deviations: 300 histories are off by .2.
+    refinement = RefinementOptions(num_histories=2_000, num_particles=2_000)
     return Campaign(
-        model, prior, BoxActions([0.5], [2.0]), method=method, options=OPTIONS
+        model,
+        prior,
+        BoxActions([0.5], [2.0]),
+        method=method,
+        options=replace(OPTIONS, refinement=refinement),
     )
 
 

@@ -18,7 +18,7 @@ def used_up(state: CampaignState) -> str | None:
         return None
     return (
         f"the simulations are used up: {meter.spent} of max_simulations = {meter.limit}"
-        " were run; the last belief stands"
+        f" were run, and a round needs {FEWEST} or more; the last belief stands"
     )
 
 
