@@ -22,8 +22,10 @@ def require_support(prior: Distribution | None) -> Distribution:
 
     Raises:
         ValueError: If there is no prior, it is a batch of them, its ``support`` is not
-            implemented, or its parameters are discrete or tied to one another.
+            implemented, or its parameters are discrete or tied to one another; if
+            torch's defaults are such that no belief can be computed.
     """
+    _require_defaults()
     if prior is None:
         raise ValueError(
             "expected a prior, since a belief starts from it; got None; pass one "
@@ -72,6 +74,17 @@ def require_support(prior: Distribution | None) -> Distribution:
                 f"torch.distributions.Independent({name}(...), 1)"
             )
     return prior
+
+
+def _require_defaults() -> None:
+    """Raise where torch makes tensors that no belief can be computed with."""
+    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    if dtype not in (torch.float32, torch.float64) or device.type == "meta":
+        raise ValueError(
+            "expected torch to make tensors of float32 or float64 that hold numbers; "
+            f"got default dtype {dtype} and device {device}; call "
+            "torch.set_default_dtype(torch.float32) and torch.set_default_device('cpu')"
+        )
 
 
 def parts_of(support: Any) -> list[Any]:

@@ -59,6 +59,24 @@ def test_what_is_discrete_or_tied_is_refused(prior, message):
         campaign(prior)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_default_dtype_of_few_bits_is_refused(dtype):
+    prior = BoxUniform(0 * TWO, TWO)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        with pytest.raises(ValueError, match="float32 or float64 that hold numbers"):
+            require_support(prior)
+    finally:
+        torch.set_default_dtype(before)
+
+
+def test_a_default_device_without_numbers_is_refused():
+    prior = BoxUniform(0 * TWO, TWO)
+    with torch.device("meta"), pytest.raises(ValueError, match="device meta; call"):
+        require_support(prior)
+
+
 def test_draws_that_repeat_are_refused():
     class Rounded(Normal):
         def sample(self, sample_shape=torch.Size()):  # noqa: B008
