@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
+import mujoco as _mujoco
 import numpy as np
 import torch
 
@@ -14,6 +14,7 @@ from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
 
 ATTACKS = Attacks()
+mujoco: Any = _mujoco  # its names are made at run time
 
 HELD = """<mujoco><option timestep=".002" integrator="{integrator}"/>
   <worldbody>

@@ -34,6 +34,12 @@ def read(content: str | bytes) -> Trials:
     return Trials.from_csv("t.csv")
 
 
+def times_of(trials: Trials) -> list[float]:
+    """Return the times of two trials, one after the other."""
+    assert trials.sample_times is not None
+    return trials.sample_times.expand(2, -1).flatten().tolist()
+
+
 def numbers(trials: Trials) -> list[float]:
     """Return the outcomes in the order of the table."""
     return [round(v, 6) for v in trials.x.flatten().tolist()]
@@ -104,7 +110,7 @@ def stamps(case: tuple[str, str | None, int]) -> None:
     if zone:
         column = column.dt.tz_localize("UTC").dt.tz_convert(zone)
     trials = Trials.from_dataframe(long(time=column))
-    times = trials.sample_times.expand(2, -1).flatten().tolist()
+    times = times_of(trials)
     assert np.allclose(times, [0.0, step / 1e3] * 2), times
 
 
@@ -128,7 +134,7 @@ def units(case: tuple[str, float]) -> None:
     name, factor = case
     times = [0.0, 0.5 * factor, 0.0, 0.5 * factor]
     trials = Trials.from_dataframe(long(time=times).rename(columns={"time": name}))
-    found = trials.sample_times.expand(2, -1).flatten().tolist()
+    found = times_of(trials)
     assert np.allclose(found, [0, 0.5, 0, 0.5]), found
 
 

@@ -32,9 +32,14 @@ def begun(**changes: Any) -> Campaign:
     return campaign(directory=FOLDER, **changes)
 
 
+def numbers(c: Campaign) -> list[float]:
+    """Return the outcomes of a campaign."""
+    return [float(t.x[0]) for t in c.history if t.x is not None]
+
+
 def told() -> list[float]:
     """Return all numbers that the folder holds, in order."""
-    return sorted(float(t.x[0]) for t in Campaign.load(FOLDER).history)
+    return sorted(numbers(Campaign.load(FOLDER)))
 
 
 def require_told(numbers: list[float]) -> None:
@@ -115,11 +120,11 @@ def processes(num: int) -> None:
     for process in made:
         process.start()
     gate.set()
-    numbers = [k for _ in made for k in out.get(timeout=200)]
+    kept = [k for _ in made for k in out.get(timeout=200)]
     for process in made:
         process.join()
-    require_told([0.01 * k for k in numbers])
-    assert numbers
+    require_told([0.01 * k for k in kept])
+    assert kept
 
 
 @ATTACKS.add(
@@ -273,7 +278,7 @@ def killed(case: tuple[str, int]) -> None:
         child.wait()
     num = after + len(rest)
     with Campaign.load(FOLDER) as c:
-        numbers = [round(float(t.x) / 0.001) for t in c.history]
-        assert numbers in ([*range(num)], [*range(num + 1)]), (num, numbers)
+        found = [round(x / 0.001) for x in numbers(c)]
+        assert found in ([*range(num)], [*range(num + 1)]), (num, found)
         c.attach([1.0], 0.5)
-    assert len(told()) == len(numbers) + 1
+    assert len(told()) == len(found) + 1
