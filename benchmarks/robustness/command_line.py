@@ -16,6 +16,7 @@ from sbi_active import Campaign
 from sbi_active.cli import main
 
 ATTACKS = Attacks()
+PROGRAM = str(Path(sys.executable).with_name("sbi-active"))
 SLED = (
     "def slide(theta, action):\n    print('noise')\n    return theta[:, :1] * action\n"
 )
@@ -28,7 +29,7 @@ INIT = [
 
 def call(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process, with no traceback whatever comes."""
-    command = [sys.executable, "-m", "sbi_active", *words]
+    command = [PROGRAM, *words]
     options = {"capture_output": True, "encoding": "utf-8", "timeout": 110, **options}
     done = subprocess.run(command, check=False, **options)
     assert "Traceback" not in (done.stderr or ""), done.stderr[-400:]
@@ -144,7 +145,7 @@ def as_json(command: str) -> None:
 )
 def pipe(words: str) -> None:
     begun()
-    command = [sys.executable, "-u", "-m", "sbi_active", *words.split()]
+    command = [PROGRAM, *words.split()]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
@@ -169,7 +170,7 @@ def interrupted(case: tuple[str, str]) -> None:
     assert main(["tell", "camp", "0.5", "--action", "1"]) == 0
     words = [command, "camp", *(["0.7", "--action", "1"] if command == "tell" else [])]
     with subprocess.Popen(
-        [sys.executable, "-m", "sbi_active", *words],
+        [PROGRAM, *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
