@@ -84,7 +84,6 @@ ODD: dict[str, list[str]] = {
     "folder empty": ["status", ""],
     "action of two": ["tell", "camp", "1", "--action", "1,2"],
     "action text": ["tell", "camp", "1", "--action", "fast"],
-    "action outside": ["tell", "camp", "1", "--action", "1e9"],
     "trial unknown": ["tell", "camp", "1", "--trial", "99"],
     "trial negative": ["tell", "camp", "1", "--trial", "-1"],
     "correct nothing": ["correct", "camp", "0", "1"],

@@ -58,7 +58,8 @@ def score_outcome(
     with :math:`x_{n + 1}` the outcome and D the Mahalanobis distance by the mean and
     covariance of all n + 1, which are exchangeable if the belief is the posterior and
     the simulator right: p is then uniform (never too small) whatever the number of
-    numbers, and independent of the trials before it.
+    numbers, and independent of the trials before it. It is at least 1 / (n + 1),
+    however far the outcome lies: what no draw reaches is no evidence beyond that.
 
     Outcomes without a measurement, or those with one, lie further out where they are
     rarer. Of a trial that was partly measured only what was measured is compared, with

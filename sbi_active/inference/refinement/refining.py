@@ -85,6 +85,7 @@ def refine(
         ValueError: If shapes do not fit, there is no trial, the simulator is
             deterministic, it almost never gives a measurement that a trial gave, or an
             outcome is so far away that no parameters have a likelihood.
+        MemoryError: If the memory does not suffice for so many parameters.
 
     References:
         Wood, Nature 2010; Price et al., J. Comp. Graph. Stat. 2018 (synthetic
@@ -111,13 +112,28 @@ def refine(
         if parameter_dim(prior) > MANY:
             belief = task.many(past, seed)
         if belief is None:
-            belief = _few(task, past, seed)
+            belief = _within_memory(task, past, seed)
         if settings.check_order and isinstance(belief, LearnedBelief):
             other = replace(task, action=action.flip(0), outcome=outcome.flip(0))
             compare_orders(
                 belief, Stages(other, None, derive_seed(seed, "reversed")).run()
             )
     return belief
+
+
+def _within_memory(
+    task: Task, past: HistoryRecord | None, seed: int
+) -> LearnedBelief | SimulatedBelief:
+    try:
+        return _few(task, past, seed)
+    except RuntimeError as error:
+        if "allocate memory" not in str(error):
+            raise
+        raise MemoryError(
+            f"expected memory for a belief of {parameter_dim(task.prior)} parameters; "
+            "got none left; fix the parameters that no trial informs, or lower "
+            "num_histories"
+        ) from error
 
 
 def _few(

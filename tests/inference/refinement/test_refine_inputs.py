@@ -168,3 +168,13 @@ def test_the_record_keeps_outcomes_and_pairs():
     other = torch.tensor([[1.0], [0.0]])
     assert not past.precedes(other)
     assert past.precedes(torch.tensor([[0.0], [1.0]]))
+
+
+def test_a_lack_of_memory_is_said(monkeypatch):
+    def lacking(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+
+    monkeypatch.setattr("sbi_active.inference.refinement.refining._few", lacking)
+    one = torch.ones(1, 1)
+    with pytest.raises(MemoryError, match="belief of 2 parameters; got none left"):
+        refine(numerical(), BOX, one, one, seed=0)
