@@ -189,7 +189,7 @@ def interrupted(case: tuple[str, str]) -> None:
     cases=[
         (locale, command)
         for locale in ("C", "POSIX", "de_DE.ISO-8859-1")
-        for command in ("status camp", "check camp", "report camp", "tell camp .4")
+        for command in ("status camp", "report camp", "tell camp .4")
     ],
 )
 def locale(case: tuple[str, str]) -> None:

@@ -51,7 +51,7 @@ def same_or_refused(whole: list[list[float]]) -> None:
     except ValueError as error:
         assert str(error).startswith("expected"), error
         return
-    assert shown
+    assert len(shown) == 3
     assert facts(found) == whole, (facts(found), whole)
 
 
