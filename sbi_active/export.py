@@ -164,9 +164,8 @@ def _add_belief(
         )
     made.coords["parameter"] = [*names]
     made.add("posterior", "theta", theta, ["parameter"])
-    log_prob: Any = getattr(belief, "smooth_log_prob", belief.log_prob)
-    if not is_smooth:
-        log_prob = belief.log_prob
+    name = "smooth_log_prob" if is_smooth else "log_prob"
+    log_prob = getattr(belief, name, belief.log_prob)
     made.add("sample_stats", "lp", log_prob(theta), [])
     if prior is None:
         return theta, None

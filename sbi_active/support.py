@@ -89,13 +89,13 @@ def _number(support: Any) -> Any:
     return support
 
 
-def _leaves(support: Any) -> Iterator[Any]:
-    """Yield the constraints that others are made of."""
+def parts_of(support: Any) -> Iterator[Any]:
+    """Yield the constraints that a support consists of."""
     if hasattr(support, "base_constraint"):
-        yield from _leaves(support.base_constraint)
+        yield from parts_of(support.base_constraint)
     elif hasattr(support, "cseq"):
         for part in support.cseq:
-            yield from _leaves(part)
+            yield from parts_of(part)
     else:
         yield support
 
@@ -131,7 +131,7 @@ def _bounds_of_components(mixture: MixtureSameFamily) -> tuple[Tensor, Tensor] |
     shape = parts.batch_shape + parts.event_shape
     if mixture.batch_shape or any(
         isinstance(leaf, type(constraints.simplex)) or leaf.is_discrete
-        for leaf in _leaves(parts.support)
+        for leaf in parts_of(parts.support)
     ):
         return None
     support = support_of(parts)

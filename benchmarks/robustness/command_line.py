@@ -68,8 +68,8 @@ NOT_NUMBERS = ("", " ", "inf", "1e39", "nan", "0.84 m", "O", "1,2", "1;2", "0x1"
 def not_told(text: str) -> None:
     begun()
     done = call("tell", "camp", text, "--action", "1")
-    if text == "١":  # a digit that Python reads
-        assert done.returncode in (0, 2)
+    if text == "١" and done.returncode == 0:  # a digit that Python reads as 1
+        assert history() == [("ok", 1.0)], history()
         return
     assert done.returncode == 2, done.stdout
     assert "expected" in done.stderr, done.stderr
@@ -123,13 +123,11 @@ def odd(name: str) -> None:
     assert history() == []
 
 
-@ATTACKS.add("JSON alone on the output", cases=("ask", "status", "update", "check"))
+@ATTACKS.add("JSON alone on the output", cases=("ask", "status", "update"))
 def as_json(command: str) -> None:
     begun()
     assert main(["tell", "camp", "0.5", "--action", "1"]) == 0
     done = call(command, "camp", "--json")
-    if done.returncode == 2 and "unrecognized arguments: --json" in done.stderr:
-        return
     assert done.returncode == 0, done.stderr
 
     def refuse(text: str) -> None:

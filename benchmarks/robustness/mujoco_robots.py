@@ -30,7 +30,7 @@ HELD = """<mujoco><option timestep=".002" integrator="{integrator}"/>
 GAINS = {"position": 'kp="50"', "velocity": 'kv="2"', "motor": 'gear="3"'}
 
 
-def held(name: str, kind: str, integrator: str = "Euler") -> str:
+def held_arm(name: str, kind: str = "position", integrator: str = "Euler") -> str:
     """Return an arm that an equality holds, with an actuator of a name and kind."""
     return HELD.format(name=name, kind=kind, gain=GAINS[kind], integrator=integrator)
 
@@ -82,7 +82,7 @@ def arm(xml: str, damping: float = 0.1) -> Any:
     ],
 )
 def keyframe(case: tuple[str, str]) -> None:
-    xml = held("servo", *case)
+    xml = held_arm("servo", *case)
     x = mean(xml, [0.1], [0.2], parameters=DAMPING, start="home")
     assert np.allclose(x, by_hand(arm(xml), TIMES, key=True), atol=1e-12), x
 
@@ -99,7 +99,7 @@ def keyframe(case: tuple[str, str]) -> None:
 def action(case: tuple[str, str, str]) -> None:
     name, called, kind = case
     called = called.format(name)
-    xml = held(name, kind)
+    xml = held_arm(name, kind)
     field = {"hinge position": "qpos", "hinge velocity": "qvel"}.get(called, "ctrl")
     x = mean(
         xml,
@@ -116,7 +116,7 @@ def action(case: tuple[str, str, str]) -> None:
 
 @ATTACKS.add("a damping beside the MJCF's own", cases=(0.0, 1e-6, 0.3, 2.0))
 def damping(value: float) -> None:
-    xml = held("servo", "position")
+    xml = held_arm("servo", "position")
     x = mean(xml, [value], [0.2], parameters={"hinge.damping": (0.0, 3.0)})
     assert np.allclose(x, by_hand(arm(xml, value), TIMES), atol=1e-12), x
 
@@ -148,7 +148,7 @@ def mass(value: float) -> None:
 
 @ATTACKS.add("rows do not depend on threads or batches", cases=(1, 2, 7))
 def threads(num: int) -> None:
-    xml = held("servo", "position")
+    xml = held_arm("servo", "position")
     theta = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None]
     action = torch.linspace(-0.5, 0.5, 20, dtype=torch.float64)[:, None]
     found = [
@@ -193,7 +193,7 @@ BAD: dict[str, dict[str, Any]] = {
 def bad(name: str) -> None:
     given = {"parameters": DAMPING, "times": TIMES, "noise": 0.01, **BAD[name]}
     try:
-        from_mjcf(held("servo", "position"), **given)
+        from_mjcf(held_arm("servo", "position"), **given)
     except (ValueError, TypeError) as error:
         assert "expected" in str(error), error
     else:

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.priors import is_discrete, parts_of
+from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
-from sbi_active.support import support_of
+from sbi_active.support import parts_of, support_of
 
 Hook = Literal["action", "input", "parameter", "dynamics", "observation", "noise"]
 

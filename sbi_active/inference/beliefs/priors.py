@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution, MixtureSameFamily, constraints
 
 from sbi_active.seeding import forked_generators
-from sbi_active.support import within_support
+from sbi_active.support import parts_of, within_support
 
 #: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
 FEWEST_STEPS = 64
@@ -85,15 +85,6 @@ def _require_defaults() -> None:
             f"got default dtype {dtype} and device {device}; call "
             "torch.set_default_dtype(torch.float32) and torch.set_default_device('cpu')"
         )
-
-
-def parts_of(support: Any) -> list[Any]:
-    """Return the constraints that a support consists of."""
-    if hasattr(support, "cseq"):
-        return [part for each in support.cseq for part in parts_of(each)]
-    if hasattr(support, "base_constraint"):
-        return parts_of(support.base_constraint)
-    return [support]
 
 
 def is_discrete(part: Any) -> bool:

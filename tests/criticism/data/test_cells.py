@@ -4,19 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.robustness.tables import long
 from sbi_active.criticism import Trials
 
 LONG = "time,action_v,x_h,trial\n"
-
-
-def long_frame(**changes):
-    columns = {
-        "trial": ["a"] * 2 + ["b"] * 2,
-        "time": [0.0, 1.0, 0.0, 1.0],
-        "action_v": 1.0,
-        "x_h": [0.1, 0.2, 0.3, 0.4],
-    }
-    return pd.DataFrame({**columns, **changes})
 
 
 def test_a_number_sign_within_a_cell_is_data(tmp_path):
@@ -36,7 +27,7 @@ def test_a_number_sign_within_a_cell_is_data(tmp_path):
     ],
 )
 def test_numbers_that_name_trials_keep_their_digits(ids, names):
-    trials = Trials.from_dataframe(long_frame(trial=np.repeat(ids, 2)))
+    trials = Trials.from_dataframe(long(trial=np.repeat(ids, 2)))
     assert trials.names == names
 
 
@@ -46,21 +37,21 @@ def test_dates_are_seconds_from_the_start_of_each_trial(unit, zone):
     day = np.datetime64("2026-11-26")
     stamps = day + np.array([0, 20, 5_000, 5_020]).astype("timedelta64[ms]")
     time = pd.Series(stamps.astype(f"datetime64[{unit}]")).dt.tz_localize(zone)
-    trials = Trials.from_dataframe(long_frame(time=time))
+    trials = Trials.from_dataframe(long(time=time))
     times = trials.sample_times.expand(2, -1)
     assert times.flatten().tolist() == pytest.approx([0.0, 0.02, 0.0, 0.02])
 
 
 @pytest.mark.parametrize("name", ["time_ns", "time[ns]", "time [ns]"])
 def test_nanoseconds_are_a_unit(name):
-    frame = long_frame(time=[0, 20_000_000, 0, 20_000_000])
+    frame = long(time=[0, 20_000_000, 0, 20_000_000])
     trials = Trials.from_dataframe(frame.rename(columns={"time": name}))
     assert trials.sample_times.flatten()[:2].tolist() == pytest.approx([0.0, 0.02])
 
 
 def test_complex_numbers_are_refused():
     with pytest.raises(ValueError, match="real numbers in column x_h; got complex"):
-        Trials.from_dataframe(long_frame(x_h=[1 + 1j, 2, 3, 4]))
+        Trials.from_dataframe(long(x_h=[1 + 1j, 2, 3, 4]))
 
 
 def test_files_of_attributes_are_no_recordings(tmp_path):
@@ -75,6 +66,6 @@ def test_files_of_attributes_are_no_recordings(tmp_path):
 @pytest.mark.filterwarnings("error")
 def test_sensors_of_other_rates_are_no_lack():
     nan = float("nan")
-    frame = long_frame(x_h=[0.1, nan, 0.3, nan], x_w=[nan, 0.2, nan, 0.4])
+    frame = long(x_h=[0.1, nan, 0.3, nan], x_w=[nan, 0.2, nan, 0.4])
     trials = Trials.from_dataframe(frame)
     assert int(trials.mask.sum()) == 4

@@ -185,3 +185,7 @@ def report(**changes):
         "leave_one_out": (left_out("none", density=-20), left_out("drag", density=2)),
     }
     return build_report(**(parts | changes))
+
+
+def first_paragraph(made):
+    return " ".join(str(made).split("\n\n")[0].split())

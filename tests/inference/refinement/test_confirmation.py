@@ -47,21 +47,21 @@ class Stages:
 
 
 @pytest.mark.parametrize(
-    ("mean", "sd", "kl", "holds"),
+    ("mean", "sd", "kl", "rel", "holds"),
     [
-        ([0.0, 0.0], [1.0, 1.0], 0.0, True),
-        ([0.1, 0.0], [1.0, 1.0], 0.005, True),
-        ([0.6, 0.0], [1.0, 1.0], 0.18, False),
-        ([0.0, 0.0], [0.5, 0.5], 0.636, False),
-        ([0.5, 0.5], [0.8, 0.8], 0.336, False),
+        ([0.0, 0.0], [1.0, 1.0], 0.0, 0.15, True),
+        ([0.1, 0.0], [1.0, 1.0], 0.005, 0.15, True),
+        ([0.6, 0.0], [1.0, 1.0], 0.18, 0.15, False),
+        ([0.0, 0.0], [0.5, 0.5], 0.636, 0.6, False),
+        ([0.5, 0.5], [0.8, 0.8], 0.336, 0.15, False),
     ],
 )
-def test_divergence_of_normal_beliefs_is_the_exact_one(mean, sd, kl, holds):
+def test_divergence_of_normal_beliefs_is_the_exact_one(mean, sd, kl, rel, holds):
     found = by_likelihoods(
         Stages(), Normal(mean, sd), Likelihood(), np.random.default_rng(0)
     )
-    # The divergence is underrated where no draw of a narrow belief shows the tails.
-    assert found.divergence == pytest.approx(kl, rel=0.6, abs=0.02)
+    # Of 1,000 draws; the weights of a belief that is half as wide have no variance.
+    assert found.divergence == pytest.approx(kl, rel=rel, abs=0.005)
     assert found.holds is holds
     assert found.num_simulations == 7
 

@@ -1,0 +1,153 @@
+"""Logs of a robot: what they become, and what is refused."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from benchmarks.robots.models import SPRING_MASS
+from benchmarks.robustness.mujoco_robots import held_arm
+from sbi_active.mujoco import from_mjcf
+
+
+def logs(num=2):
+    t = np.arange(0, 1, 0.01)
+    return [
+        pd.DataFrame(
+            {"time": t, "push": np.sin(5 * t + k), "position": 0 * t, "speed": 0 * t}
+        )
+        for k in range(num)
+    ]
+
+
+def test_logs_become_trials():
+    frames = logs()
+    frames[1].loc[3:5, "position"] = np.nan
+    frames[1]["start slide"] = frames[0]["start slide"] = 0.1
+    robot = from_mjcf(
+        SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames, noise=0.01
+    )
+    assert robot.trials is not None
+    assert robot.trials.x.shape == (2, 100, 2)
+    assert robot.trials.x.isnan().sum() == 3
+    assert robot.trials.start["slide"].tolist() == [0.1, 0.1]
+    x = robot.simulator.mean(
+        torch.ones(2, 1),
+        robot.trials.action,
+        inputs=robot.trials.inputs,
+        input_times=robot.trials.input_times,
+        start=robot.trials.start,
+    )
+    assert x[:, 0, 0].tolist() == pytest.approx([0.1, 0.1])
+
+
+def test_a_log_has_a_column_each_for_a_sensor_and_an_input_of_one_name():
+    time = np.arange(0, 0.2, 0.01)
+    log = {"time": time, "hinge": 0 * time, "hinge control": 0.3 + 0 * time}
+    arm = held_arm("hinge"), {"hinge.damping": (0.0, 1.0)}
+    given = {"sensors": ["hinge"], "noise": 0.01}
+    robot = from_mjcf(*arm, **given, recordings=[log])
+    assert robot.trials.inputs["hinge"].unique().item() == pytest.approx(0.3)
+    del log["hinge control"]
+    with pytest.raises(ValueError, match="column 'hinge control' in recording 0"):
+        from_mjcf(*arm, **given, recordings=[log])
+
+
+def out_of_range(frame):
+    frame["push"] *= 6
+
+
+def nan_input(frame):
+    frame.loc[7, "push"] = np.nan
+
+
+def renamed(frame):
+    frame.rename(columns={"push": "pusher"}, inplace=True)
+
+
+def backwards(frame):
+    frame.loc[7, "time"] = 0.01
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (out_of_range, "within its ctrlrange, -5 to 5"),
+        (nan_input, "finite 'push' in recording 1; got NaN or inf in row 7"),
+        (renamed, "column 'push' in recording 1; .* rename 'pusher'"),
+        (backwards, "time that increases in recording 1"),
+    ],
+)
+def test_logs_that_do_not_fit_are_said(spoil, message):
+    frames = logs()
+    spoil(frames[1])
+    with pytest.raises(ValueError, match=message):
+        from_mjcf(SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames)
+
+
+def encoder_log(**changes):
+    time = np.arange(0.0, 1.0, 0.02)
+    log = {"time": time, "angle": 0.3 * np.sin(3 * time), "servo": 0 * time}
+    return {**log, **changes}
+
+
+def read_logs(*logs, xml=None):
+    return from_mjcf(
+        xml or held_arm("servo"),
+        {"hinge.damping": (0.0, 1.0)},
+        noise=0.01,
+        recordings=[*logs],
+    ).trials
+
+
+def test_dates_are_seconds_since_the_first():
+    for unit in ("ms", "us", "ns"):
+        stamps = np.datetime64("2026-01-01") + (20 * np.arange(50)).astype(
+            "timedelta64[ms]"
+        ).astype(f"timedelta64[{unit}]")
+        dates = pd.Series(stamps).dt.tz_localize("UTC")
+        for time in (stamps, dates):
+            trials = read_logs(encoder_log(time=time))
+            assert trials.sample_times.tolist() == pytest.approx(
+                (0.02 * np.arange(50)).tolist()
+            )
+
+
+def test_a_log_of_milliseconds_is_said_before_anything_runs():
+    with pytest.warns(UserWarning, match="10,000 time steps of 0.002 s.*in ms"):
+        read_logs(encoder_log(time=1_000 * encoder_log()["time"]))
+
+
+def test_angles_that_wrap_or_are_degrees_are_said():
+    turning = np.linspace(0, 15, 50)
+    with pytest.warns(UserWarning, match=r"jumps by about 2 pi in 2 places"):
+        read_logs(encoder_log(angle=np.remainder(turning, 2 * np.pi)))
+    limits = 'axis="0 1 0" limited="true" range="-90 90"'
+    limited = held_arm("servo").replace('axis="0 1 0"', limits)
+    limited = limited.replace('name="angle"', 'name="hinge"')
+    log = encoder_log(hinge=np.linspace(0, 60, 50))
+    del log["angle"]
+    with pytest.warns(UserWarning, match="range ends at 1.57.* rad: are these degrees"):
+        read_logs(log, xml=limited)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"time": encoder_log()["time"] + 1.7e9}, "subtract the time at which"),
+        ({"time": encoder_log()["time"] - 1}, "subtract the time at which"),
+        ({"angle": encoder_log()["angle"] + 1j}, "real numbers in column angle"),
+        ({"angle": ["0.1 rad"] * 50}, "numbers in column 'angle'.*'0.1 rad' in row 0"),
+    ],
+)
+def test_a_log_that_is_no_log_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_logs(encoder_log(**changes))
+
+
+def test_a_file_of_a_log_keeps_its_cells(tmp_path):
+    frame = pd.DataFrame(encoder_log())
+    path = tmp_path / "log.csv"
+    path.write_text("# a comment\n" + frame.to_csv(index=False), encoding="utf-8-sig")
+    trials = read_logs(path)
+    assert trials.x[0].tolist() == pytest.approx(frame["angle"].tolist())

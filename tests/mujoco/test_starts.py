@@ -1,0 +1,91 @@
+"""What a motion starts from: keyframes, and what a name sets."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.robustness.mujoco_robots import held_arm
+from sbi_active import BoxActions
+from sbi_active.actions.signals import SignalActions
+from sbi_active.actions.waveforms import step
+from sbi_active.mujoco import from_mjcf
+
+
+def held(name: str, **options) -> list[float]:
+    robot = from_mjcf(
+        held_arm(name),
+        {"hinge.damping": (0.0, 1.0)},
+        **{"times": [0.0, 0.5], "noise": 0.01, **options},
+    )
+    value = torch.tensor([[0.2]], dtype=torch.float64)
+    return robot.simulator.mean(torch.tensor([[0.1]]).double(), value)[0].tolist()
+
+
+def by_hand(*, key: bool, **start: float) -> list[float]:
+    model = mujoco.MjModel.from_xml_string(held_arm("servo"))
+    model.dof_damping[0] = 0.1
+    data = mujoco.MjData(model)
+    if key:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    for field, value in start.items():
+        getattr(data, field)[0] = value
+    for _ in range(251):
+        mujoco.mj_step(model, data)
+        if data.time == model.opt.timestep:
+            first = float(data.sensordata[0])
+    return [first, float(data.sensordata[0])]
+
+
+def test_a_keyframe_gives_controls_and_mocap_poses_too():
+    x = held("servo", start="home")
+    assert x == pytest.approx(by_hand(key=True), abs=1e-12)
+    assert held("servo") == pytest.approx(by_hand(key=False), abs=1e-12)
+    start = {"hinge": 0.7, "hinge velocity": -1.0, "servo control": 0.6}
+    start |= {"hand mocap[0]": 0.3, "hand mocap[2]": 0.2}
+    assert held("servo", start=start) == pytest.approx(x, abs=1e-12)
+
+
+def test_a_keyframe_holds_beside_forces_that_are_stepped():
+    robot = from_mjcf(
+        held_arm("servo"),
+        {"hinge.damping": (0.0, 1.0)},
+        **{"times": [0.0, 0.5], "noise": 0.01, "start": "home"},
+    )
+
+    def push(q, v, t, phi):
+        return phi
+
+    x = robot.simulator.mean(
+        torch.tensor([[0.1]]).double(),
+        torch.zeros(1, 1).double(),
+        force={push: torch.zeros(1, 1).double()},
+    )
+    assert x[0].tolist() == pytest.approx(by_hand(key=True), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["servo", "hinge"])
+def test_an_action_sets_one_thing_where_joint_and_actuator_share_a_name(name):
+    control = by_hand(key=True, ctrl=0.2)
+    for called in (name, f"{name} control"):
+        actions = BoxActions([0.1], [0.3], names=[called])
+        x = held(name, start="home", actions=actions)
+        assert x == pytest.approx(control, abs=1e-12)
+    actions = BoxActions([0.1], [0.3], names=["hinge position"])
+    x = held(name, start="home", actions=actions)
+    assert x == pytest.approx(by_hand(key=True, qpos=0.2), abs=1e-12)
+
+
+def test_a_name_that_a_signal_drives_is_no_start_of_its_joint():
+    grid = np.arange(0, 1, 0.02)
+    signal = step("hinge", length=1.0)
+    played = SignalActions(signal, [-1.0, 0.1], [1.0, 0.5], input_times=grid)
+    for name, message in (("hinge", "'hinge position'"), ("hinge position", None)):
+        actions = BoxActions([0.1], [0.3], names=[name])
+        given = {"inputs": played, "actions": actions, "noise": 0.01}
+        arm = held_arm("hinge"), {"hinge.damping": (0.0, 1.0)}
+        if message:
+            with pytest.raises(ValueError, match=message):
+                from_mjcf(*arm, **given)
+        else:
+            assert from_mjcf(*arm, **given).actions.names[-1] == name
