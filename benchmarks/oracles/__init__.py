@@ -1,0 +1,1 @@
+"""Every way on every problem with a known answer, and their calibration."""

@@ -1,0 +1,90 @@
+"""Every way to a belief or an evidence on every problem with a known answer.
+
+Problems, ways and limits are those of ``tests/oracles``; nothing may be tuned on them.
+Resumable: a problem and way that stand in ``rows.csv`` are not run again.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+import warnings
+from pathlib import Path
+
+import torch
+
+from benchmarks import rows
+from benchmarks.oracles import table
+from tests.oracles.judging import judged
+from tests.oracles.problems import PROBLEMS
+from tests.oracles.reference import answers
+from tests.oracles.ways import WAYS
+
+ROWS = Path(__file__).with_name("rows.csv")
+COLUMNS = (
+    *("problem", "way", "seed", "kl", "shift", "narrowest", "widest", "region"),
+    *("evidence", "rows", "cpu_seconds", "trustworthy", "faults", "error"),
+)
+
+
+def row_of(problem: str, way: str, seed: int) -> dict[str, object]:
+    """Return the error of one way on one problem, its cost and what it says.
+
+    Args:
+        problem: Name of a problem.
+        way: Name of a way.
+        seed: Seed of the way.
+    """
+    (own, num_rows), used = PROBLEMS[problem]().counted(), WAYS[way]
+    simulator = own.simulator(is_declared=used.is_declared)
+    row: dict[str, object] = {"problem": problem, "way": way, "seed": seed}
+    start = time.process_time()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            torch.manual_seed(seed)
+            found = used.run(own, simulator, seed)
+    except Exception as error:  # a row of the table as well
+        where = traceback.extract_tb(error.__traceback__)[-1].name
+        row |= {"error": f"{type(error).__name__} in {where}: {str(error)[:120]}"}
+    else:
+        row |= {"trustworthy": found.trustworthy}
+        result = judged(own, answers()[problem], found)
+        row |= {**vars(result), "faults": " ".join(result.faults())}
+    cpu = time.process_time() - start
+    return {**row, "rows": sum(num_rows), "cpu_seconds": round(cpu, 2)}
+
+
+def main(
+    *,
+    summary: bool = False,
+    problems: list[str] | None = None,
+    ways: list[str] | None = None,
+    seed: int = 0,
+    path: Path = ROWS,
+) -> None:
+    """Run what is not there yet, and print the table.
+
+    Args:
+        summary: Whether to run nothing.
+        problems: Names of problems; all by default.
+        ways: Names of ways; all by default.
+        seed: Seed of all ways.
+        path: File of the rows.
+    """
+    torch.set_num_threads(1)
+    done = {(r["problem"], r["way"], r["seed"]) for r in rows.read(path)}
+    for problem in [] if summary else problems or PROBLEMS:
+        for way in ways or WAYS:
+            claims = WAYS[way].claims(PROBLEMS[problem]())
+            if not claims or (problem, way, str(seed)) in done:
+                continue
+            row = row_of(problem, way, seed)
+            rows.append(path, COLUMNS, [row])
+            shown = {k: rows.short(v) for k, v in row.items()}
+            print(", ".join(f"{k} {v}" for k, v in shown.items()), flush=True)
+    print(table.text(rows.read(path)))
+
+
+if __name__ == "__main__":
+    main()
