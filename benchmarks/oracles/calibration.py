@@ -94,7 +94,3 @@ def main(*, summary: bool = False, path: Path = ROWS) -> None:
                 if (name, way, str(draw)) not in done:
                     rows.append(path, COLUMNS, [row_of(name, way, draw)])
     print(text(rows.read(path)))
-
-
-if __name__ == "__main__":
-    main()

@@ -84,7 +84,3 @@ def main(
             shown = {k: rows.short(v) for k, v in row.items()}
             print(", ".join(f"{k} {v}" for k, v in shown.items()), flush=True)
     print(table.text(rows.read(path)))
-
-
-if __name__ == "__main__":
-    main()

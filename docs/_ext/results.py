@@ -106,6 +106,10 @@ TABLES = {
         "benchmarks.chain.run --campaign --summary",
     ),
     "Bad networks and beliefs flagged": ("benchmarks.calibration.run --summary",),
+    "Every way to a belief, where the answer is known": (
+        "benchmarks oracles --summary",
+        "benchmarks oracles.calibration --summary",
+    ),
     "Dear simulators": ("benchmarks.dear.run --table",),
     "The cost of a round": (
         "benchmarks.table cost/result.json",
@@ -138,6 +142,9 @@ def printed(command: str) -> str:
     ):
         try:
             runpy.run_module(module, run_name="__main__")
+        except SystemExit as done:  # the one command for all benchmarks
+            if done.code:
+                raise
         except FileNotFoundError:  # rows that are being made again
             return "No rows are committed now."
     if not text.getvalue().strip():
