@@ -39,7 +39,8 @@ def test_options_are_arguments():
         "first_seed": 3,
         "path": ROOT,
     }
-    given = parse("--summary --seeds 1 2 --path a --first-seed 4".split())
+    options = "--summary --seeds 1 2 --path a --first-seed 4"
+    given = parse(options.split())
     assert vars(given) == {
         "summary": True,
         "seeds": [1, 2],

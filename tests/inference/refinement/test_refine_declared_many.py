@@ -162,3 +162,17 @@ def test_searches_that_agree_on_a_wrong_place_go_on(seed):
     assert found is not None
     best, truth = likelihood(c.to_theta(found.modes[:1])), task.theta_true[None]
     assert float(best[0]) > float(likelihood(truth)[0]) - 3
+
+
+def test_many_numbers_of_a_trial_are_not_regressed():
+    """A covariance of 3,000 numbers would take minutes."""
+    model, action, x, exact = linear(2, 3_000)
+    prior = MultivariateNormal(torch.zeros(2), torch.eye(2))
+    belief = refine(model, prior, action, x, seed=0)
+    assert isinstance(belief, BridgedBelief)
+    assert belief.diagnostics.trustworthy
+    sd = exact.covariance_matrix.diagonal().sqrt()
+    torch.manual_seed(0)
+    theta = belief.sample((4_000,)).double()
+    assert bool(((theta.mean(0) - exact.mean).abs() < 0.1 * sd).all())
+    assert bool(((theta.std(0) / sd - 1).abs() < 0.1).all())
