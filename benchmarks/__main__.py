@@ -15,6 +15,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 HERE = Path(__file__).parent
 
 
+@lru_cache
 def benchmarks() -> dict[str, str]:
     """Return the first line of each benchmark's docstring by its name.
 

@@ -1,9 +1,10 @@
 """Results of today's cases, and what a later tree changes of them.
 
-Resumable: results go to a file of lines as they come. ``--against`` runs the cases anew
-and prints old and new side by side, with what differs by more than its Monte Carlo
-error. Every fifth case is run with another seed of the engine as well: ``--summary``
-says how often that alone makes a difference.
+Resumable: results go to a file of lines as they come, which goes when all that was
+asked for is there; remove it where the tree changed in between. ``--against`` runs the
+cases anew and prints old and new side by side, with what differs by more than its Monte
+Carlo error. Every fifth case is run with another seed of the engine as well:
+``--summary`` says how often that alone makes a difference.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from benchmarks.record.cases import cases, run
 from benchmarks.record.comparison import Kept, compared
 
 FILE = Path(__file__).with_name("record.jsonl.gz")
+#: Lines of a run that goes on; not committed.
+WORK = FILE.with_name("running.jsonl")
 TWICE = 5
 
 
@@ -43,7 +46,7 @@ def main(
     summary: bool = False,
     against: bool = False,
     only: str = "",
-    work: Path = Path("record.jsonl"),
+    work: Path = WORK,
 ) -> None:
     """Record the cases, or compare with the record.
 
@@ -65,12 +68,11 @@ def main(
                 row = {"case": label, **asdict(run(case, seed))}
                 with work.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
-        if not against:
-            write(read(work), FILE)
-    old = read(FILE)
-    if against:
-        new = read(work)
-    else:
+    old, new = read(FILE), {} if summary else read(work)
+    if not (summary or against):
+        old |= new
+        write(old, FILE)
+    if not against:
         new = {
             name.removeprefix("again "): row
             for name, row in old.items()
@@ -78,3 +80,5 @@ def main(
         }
         print(f"{len(old) - len(new)} cases; those with another seed of the engine:")
     print("\n".join(compared(old, new)))
+    if not summary:
+        work.unlink(missing_ok=True)

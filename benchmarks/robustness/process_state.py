@@ -13,12 +13,10 @@ import io
 import os
 import subprocess
 import sys
-from pathlib import Path
 
-from benchmarks.robustness.attacks import Attacks
+from benchmarks.robustness.attacks import ROOT, Attacks
 
 ATTACKS = Attacks()
-ROOT = str(Path(__file__).parents[2])
 PLAIN = """
 import torch
 from benchmarks.robustness.campaign_problem import campaign, draws
@@ -41,19 +39,35 @@ def plain(method: str) -> str:
     return printed.getvalue().strip().splitlines()[-1]
 
 
-def result(
-    before: str = "", method: str = "nsbi", *options: str, **environment: str
-) -> str:
+def finished(
+    code: str, environment: dict[str, str], *, seconds: float = 110.0
+) -> subprocess.CompletedProcess[str]:
+    """Return a process of its own that has run some code.
+
+    Args:
+        code: What it runs.
+        environment: Variables besides those of this process.
+        seconds: Wall time that it may take.
+
+    Raises:
+        AssertionError: If it does not end in time.
+    """
+    try:
+        return subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONPATH": ROOT, **environment},
+            capture_output=True,
+            text=True,
+            timeout=seconds,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise AssertionError(f"no end within {seconds:g} s") from None
+
+
+def result(before: str = "", method: str = "nsbi", **environment: str) -> str:
     """Return what a process prints of its campaign, or its error."""
-    code = before + PLAIN.format(method=method)
-    done = subprocess.run(
-        [sys.executable, *options, "-c", code],
-        env={**os.environ, "PYTHONPATH": ROOT, **environment},
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
-    )
+    done = finished(before + PLAIN.format(method=method), environment)
     lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT")]
     if done.returncode == 0 and lines:
         return lines[-1]
@@ -158,14 +172,7 @@ def state_after(name: str) -> None:
         "torch.get_num_threads())\nassert before == after, (before, after)\n"
         "print('KEPT')\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code + PLAIN.format(method="nsbi") + after],
-        env={**os.environ, "PYTHONPATH": ROOT},
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
-    )
+    done = finished(code + PLAIN.format(method="nsbi") + after, {})
     words = done.stderr.strip().splitlines() or [""]
     assert "KEPT" in done.stdout or "expected" in words[-1], words[-1]
 
@@ -217,14 +224,7 @@ print("RESULT", error / sd, float(shown.std()) / sd, belief.diagnostics.trustwor
     seconds=400.0,
 )
 def sizes(size: tuple[int, int, int]) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SIZES.format(size=size)],
-        env={**os.environ, "PYTHONPATH": ROOT},
-        capture_output=True,
-        text=True,
-        timeout=390,
-        check=False,
-    )
+    done = finished(SIZES.format(size=size), {}, seconds=390.0)
     lines = [row for row in done.stdout.splitlines() if row.startswith("RESULT")]
     if not lines:
         last = done.stderr.strip().splitlines()[-1]

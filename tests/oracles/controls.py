@@ -39,7 +39,7 @@ def of_another_noise(own: Problem, answer: Answer, rng: np.random.Generator) -> 
 
 def _scaled(own: Problem, factor: float) -> Any:
     error: Any = own.error
-    return replace(error, sd=factor * error.sd)
+    return replace(error, scale=factor * error.scale)
 
 
 def without_a_mode(own: Problem, answer: Answer, rng: np.random.Generator) -> Found:

@@ -23,12 +23,14 @@ class Found:
         log_evidence: log Z, nats; None where the way gives none.
         error: Its own standard error, nats.
         trustworthy: What it says of itself; None where it says nothing.
+        kind: Class of the belief, which tells the engine behind it.
     """
 
     theta: Array
     log_evidence: float | None = None
     error: float = 0.0
     trustworthy: bool | None = None
+    kind: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,14 @@ Array = NDArray[Any]
 
 
 class Error(Protocol):
-    """The distribution of one number of x less its mean."""
+    """The distribution of one number of x less its mean.
+
+    Attributes:
+        scale: What it is proportional to: a deviation, or the half width.
+    """
+
+    @property
+    def scale(self) -> float: ...
 
     def log_prob(self, e: Array) -> Array:
         """Return log densities, of the shape of e."""
@@ -34,47 +41,47 @@ class Error(Protocol):
 class Normal:
     """Normal errors of a standard deviation."""
 
-    sd: float
+    scale: float
 
     def log_prob(self, e: Array) -> Array:
-        return norm.logpdf(e, scale=self.sd)
+        return norm.logpdf(e, scale=self.scale)
 
     def sample(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        return self.sd * rng.standard_normal(shape)
+        return self.scale * rng.standard_normal(shape)
 
     def declared(self) -> Any:
-        return GaussianNoise(self.sd)
+        return GaussianNoise(self.scale)
 
 
 @dataclass(frozen=True)
 class Student:
     """Student t errors of a scale and degrees of freedom."""
 
-    sd: float
+    scale: float
     df: float
 
     def log_prob(self, e: Array) -> Array:
-        return t.logpdf(e, self.df, scale=self.sd)
+        return t.logpdf(e, self.df, scale=self.scale)
 
     def sample(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        return self.sd * rng.standard_t(self.df, shape)
+        return self.scale * rng.standard_t(self.df, shape)
 
     def declared(self) -> Any:
         # The library declares the standard deviation, and not the scale.
-        return StudentTNoise(self.sd * (self.df / (self.df - 2)) ** 0.5, self.df)
+        return StudentTNoise(self.scale * (self.df / (self.df - 2)) ** 0.5, self.df)
 
 
 @dataclass(frozen=True)
 class Uniform:
     """Errors anywhere within a width of zero, and nowhere else."""
 
-    sd: float
+    scale: float
 
     def log_prob(self, e: Array) -> Array:
-        return np.where(np.abs(e) <= self.sd, -np.log(2 * self.sd), -np.inf)
+        return np.where(np.abs(e) <= self.scale, -np.log(2 * self.scale), -np.inf)
 
     def sample(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-        return rng.uniform(-self.sd, self.sd, shape)
+        return rng.uniform(-self.scale, self.scale, shape)
 
     def declared(self) -> Any:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,6 +19,17 @@ from sbi_active import SimulatorModel
 from tests.oracles.noise import Array, Error
 
 Mean = Callable[[Array, Array], Array]
+
+
+class Space(Protocol):
+    """A prior, with coordinates that are standard normal under it."""
+
+    @property
+    def prior(self) -> Distribution: ...
+
+    def __call__(self, u: Array) -> Array:
+        """Return parameters (n, d) of coordinates (n, d)."""
+        ...
 
 
 def one_region(theta: Array) -> Array:
@@ -37,14 +48,14 @@ class Problem:
 
     Attributes:
         hard: What makes it hard, in one line.
-        prior: Of theta, as a user gives it.
-        to_theta: From coordinates (n, d) to parameters (n, d).
+        space: The prior of theta, and its coordinates.
         mean: Noise-free outcomes (n, q) of parameters (n, d) and actions (n, k); a row
             of NaN is no outcome.
         error: Of a number of x.
         action: Executed actions, shape (t, k).
         truth: Parameters behind the trials, shape (d,).
         seed: Seed of the errors of the trials.
+        given: Observed outcomes, shape (t, q); None draws them.
         lost: Positions (trial, number) of x that were not observed.
         times: Times of the numbers of a trial; None where x is no trajectory.
         region: Label of each of some parameters (n, d), shape (n,): a mode, a side.
@@ -55,13 +66,13 @@ class Problem:
     """
 
     hard: str
-    prior: Distribution
-    to_theta: Callable[[Array], Array]
+    space: Space
     mean: Mean
     error: Error
     action: Array
     truth: Array
     seed: int = 0
+    given: Array | None = None
     lost: tuple[tuple[int, int], ...] = ()
     times: Array | None = None
     region: Callable[[Array], Array] = one_region
@@ -74,9 +85,20 @@ class Problem:
         """Number of parameters."""
         return len(self.truth)
 
+    @property
+    def prior(self) -> Distribution:
+        """The prior of theta, as a user gives it."""
+        return self.space.prior
+
+    def to_theta(self, u: Array) -> Array:
+        """Return parameters (n, d) of coordinates (n, d)."""
+        return self.space(u)
+
     @cached_property
     def x(self) -> Array:
         """Observed outcomes, shape (t, q)."""
+        if self.given is not None:
+            return self.given
         rows = np.repeat(self.truth[None], len(self.action), 0)
         x = self.mean(rows, self.action)
         x = x + self.error.sample(x.shape, np.random.default_rng(self.seed))
@@ -139,15 +161,11 @@ class Problem:
             num.append(len(theta))
             return self.mean(theta, action)
 
-        other = replace(self, mean=mean)
-        vars(other)["x"] = self.x
-        return other, num
+        return replace(self, mean=mean, given=self.x), num
 
     def with_error(self, error: Error) -> Problem:
         """Return the posterior of the same trials under another error."""
-        other = replace(self, error=error)
-        vars(other)["x"] = self.x
-        return other
+        return replace(self, error=error, given=self.x)
 
 
 @dataclass(frozen=True)

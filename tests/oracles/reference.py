@@ -221,21 +221,34 @@ def found_proposal(own: Problem, num: int, rng: np.random.Generator) -> Students
     return best[1]
 
 
-def _around_least_squares(own: Problem, num: int, rng: np.random.Generator) -> Array:
-    sd, best = getattr(own.error, "sd", 1.0), None
-    fixed = np.isfinite(own.x).reshape(-1)
+def searched(own: Problem, num: int, rng: np.random.Generator) -> list[Any]:
+    """Return least-squares fits of the coordinates, best first.
+
+    Args:
+        own: A problem whose mean can be differentiated.
+        num: Searches, each from a draw of the prior.
+        rng: Of these draws.
+    """
+    seen = np.isfinite(own.x)
 
     def residual(u: Array) -> Array:
-        e = (own.x - own.means(own.to_theta(u[None]))[0]).reshape(-1)[fixed]
-        return np.concatenate([e / sd, u])
+        e = (own.x - own.means(own.to_theta(u[None]))[0]) / own.error.scale
+        # No outcome where there was one is as far as ten deviations off.
+        return np.concatenate([np.where(np.isfinite(e), e, 10.0)[seen], u])
 
-    for _ in range(24):
-        start = rng.standard_normal(own.dim)
-        fit: Any = least_squares(residual, start, max_nfev=100)
-        best = fit if best is None or fit.cost < best.cost else best
-    assert best is not None
-    cov = np.linalg.inv(best.jac.T @ best.jac)
-    normal = rng.multivariate_normal(best.x, 1.5 * cov, num)
+    starts = rng.standard_normal((num, own.dim))
+    fits: list[Any] = [least_squares(residual, u, max_nfev=100) for u in starts]
+    return sorted(fits, key=lambda fit: fit.cost)
+
+
+def covariance(fit: Any) -> Array:
+    """Return the covariance of a least-squares fit, shape (d, d)."""
+    return np.linalg.inv(fit.jac.T @ fit.jac)
+
+
+def _around_least_squares(own: Problem, num: int, rng: np.random.Generator) -> Array:
+    best, *_ = searched(own, 24, rng)
+    normal = rng.multivariate_normal(best.x, 1.5 * covariance(best), num)
     return np.concatenate([normal, 3 * (normal[: num // 4] - best.x) + best.x])
 
 

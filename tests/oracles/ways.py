@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import least_squares
 from torch import Tensor
 
 from sbi_active import (
@@ -28,9 +27,9 @@ from sbi_active import (
 from sbi_active.criticism import Criticism, Trials, identify
 from sbi_active.inference import refine
 from tests.oracles.judging import Found
-from tests.oracles.noise import Array, Normal, Student
+from tests.oracles.noise import Normal, Student
 from tests.oracles.problem import Problem
-from tests.oracles.reference import Students, Weighted
+from tests.oracles.reference import Students, Weighted, covariance, searched
 
 #: Draws of each belief.
 NUM_DRAWS = 5_000
@@ -88,7 +87,8 @@ def found(belief: Any) -> Found:
     """Return draws of a belief and what it says of itself."""
     theta = belief.sample(torch.Size([NUM_DRAWS])).double().numpy()
     says = belief.diagnostics.trustworthy
-    return Found(theta=theta, trustworthy=None if says is None else bool(says))
+    says = None if says is None else bool(says)
+    return Found(theta=theta, trustworthy=says, kind=type(belief).__name__)
 
 
 # --------------------------------------------------------------- beliefs of trials
@@ -206,35 +206,19 @@ WAYS["identify"] = Way(
 # ------------------------------------------------------------------------- experts
 
 
-def residual_of(own: Problem) -> Callable[[Array], Array]:
-    """Return residuals of x and of the prior's coordinates, in deviations."""
-    seen = np.isfinite(own.x)
-    sd = own.error.sd  # type: ignore[attr-defined]
-
-    def residual(u: Array) -> Array:
-        e = own.x - own.means(own.to_theta(u[None]))[0]
-        e = np.where(np.isfinite(e), e, 10 * sd)[seen] / sd
-        return np.concatenate([e, u])
-
-    return residual
-
-
 def by_least_squares(own: Problem, simulator: SimulatorModel, seed: int) -> Found:
     """Return what an expert writes in an afternoon.
 
     Least squares from eight places, a Student t at each mode that is near the best,
     importance sampling from it, and twice from a mixture fitted to what it gave.
     """
-    rng, residual = np.random.default_rng(seed), residual_of(own)
-    starts = rng.standard_normal((8, own.dim))
-    fits: list[Any] = [least_squares(residual, u, max_nfev=60) for u in starts]
-    best = min(fit.cost for fit in fits)
-    near = [fit for fit in fits if fit.cost < best + 10]
-    cov = [np.linalg.inv(fit.jac.T @ fit.jac) for fit in near]
+    rng = np.random.default_rng(seed)
+    best, *others = searched(own, 8, rng)
+    near = [best, *(fit for fit in others if fit.cost < best.cost + 10)]
     proposal = Students(
         np.full(len(near), 1 / len(near)),
         np.array([fit.x for fit in near]),
-        np.linalg.cholesky(1.5 * np.array(cov)),
+        np.linalg.cholesky(1.5 * np.array([covariance(fit) for fit in near])),
     )
     for _ in range(2):
         u = Weighted.drawn(own, proposal, 2_000, rng).draws(2_000, rng)
@@ -255,17 +239,14 @@ def by_emcee(own: Problem, simulator: SimulatorModel, seed: int) -> Found:
     """
     import emcee
 
-    rng, residual = np.random.default_rng(seed), residual_of(own)
-    starts = rng.standard_normal((8, own.dim))
-    fits: list[Any] = [least_squares(residual, u, max_nfev=60) for u in starts]
-    best = min(fits, key=lambda fit: fit.cost)
-    cov, num = np.linalg.inv(best.jac.T @ best.jac), max(32, 2 * own.dim + 8)
+    rng, num = np.random.default_rng(seed), max(32, 2 * own.dim + 8)
+    best, *_ = searched(own, 8, rng)
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(
         num, own.dim, own.log_density, vectorize=True, moves=moves
     )
     sampler.random_state = np.random.RandomState(seed).get_state()
-    state: Any = rng.multivariate_normal(best.x, cov, num)
+    state: Any = rng.multivariate_normal(best.x, covariance(best), num)
     for _ in range(10):
         state = sampler.run_mcmc(state, 400)
         half = sampler.iteration // 2

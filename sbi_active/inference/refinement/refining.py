@@ -34,11 +34,6 @@ from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.threads import single_thread
 
-#: Numbers of an outcome beyond which a declared noise is used at once: a regression's
-#: covariance costs their cube. Two parameters and three trials took 1.9 and 1.4 CPU s
-#: (by regression and without) at half, 3.2 and 2.4 here, 8.7 and 5.2 at twice as many.
-MANY_NUMBERS = 500
-
 
 def refine(
     simulator: Callable[..., Any],
@@ -114,7 +109,7 @@ def refine(
     task = Task(simulator, prior, action, outcome, [*hints], settings)
     with single_thread():
         belief, many = None, parameter_dim(prior) > MANY
-        if many or outcome[0].numel() > MANY_NUMBERS:
+        if many or outcome[0].numel() > settings.max_regressed:
             belief = task.many(past, seed, weighted=not many)
         if belief is None:
             belief = _within_memory(task, past, seed)
