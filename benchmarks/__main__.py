@@ -1,8 +1,10 @@
 """Run a benchmark by its name: ``python -m benchmarks NAME [--summary] [options]``.
 
 A name is a module below ``benchmarks/``, with dots; that of a folder stands for its
-``run``. Options are the keyword arguments of the module's ``main``, with their types
-and defaults. Without a name, all are listed.
+``run``. Options are the arguments of the module's ``main``, with their types, defaults
+and descriptions; where functions share them, those of a dataclass, ``main``'s only
+argument. ``Literal`` and ``Annotated[str, NAMES]`` are one of the names. Without a
+name, all are listed.
 """
 
 from __future__ import annotations
@@ -11,16 +13,19 @@ import argparse
 import ast
 import difflib
 import inspect
+import re
 import sys
 import types
 import typing
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 HERE = Path(__file__).parent
+ARGUMENT = r"^ {4}(\w+): (.+(?:\n {8}.+)*)"  # its name and lines in a docstring
 
 
 @lru_cache
@@ -58,35 +63,65 @@ def module_of(name: str) -> str:
     return f"benchmarks.{name}" + (".run" if path.is_dir() else "")
 
 
+def options_of(main: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what has a benchmark's options as arguments: its main, or a dataclass."""
+    kinds = [*typing.get_type_hints(main).items()]
+    first = kinds[0][1] if kinds and kinds[0][0] != "return" else None
+    return first if is_dataclass(first) and isinstance(first, type) else main
+
+
 def parser_of(main: Callable[..., Any], name: str) -> argparse.ArgumentParser:
-    """Return a parser of the keyword arguments of a function.
+    """Return a parser of the arguments of a benchmark's main.
+
+    An argument with a default, or by keyword alone, is an option; another is given by
+    its place.
 
     Args:
-        main: The function. Its arguments are flags, numbers, texts, paths, lists of
-            these, or None; its docstring says what they are for.
+        main: The function. Its arguments, or those of the dataclass that it takes, are
+            flags, numbers, texts, paths, sequences of these, or None.
         name: Name of the benchmark.
     """
-    text = inspect.getdoc(main) or ""
-    described = dict(
-        line.strip().split(": ", 1) for line in text.split("\n") if ": " in line
-    )
+    owner = options_of(main)
+    described: dict[str, str] = {}
+    for each in (*reversed(getattr(owner, "__mro__", ())), owner):
+        lines = re.findall(
+            r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(each) or "", re.M
+        )
+        described |= {key: " ".join(text.split()) for key, text in lines}
     parser = argparse.ArgumentParser(
-        prog=f"python -m benchmarks {name}", description=text.split("\n")[0]
+        prog=f"python -m benchmarks {name}",
+        description=(inspect.getdoc(main) or "").split("\n")[0],
     )
-    hints = typing.get_type_hints(main)
-    for argument, given in inspect.signature(main).parameters.items():
-        kind = hints[argument]
-        if isinstance(kind, types.UnionType):  # or None
+    hints = typing.get_type_hints(owner, include_extras=True)
+    for argument, given in inspect.signature(owner).parameters.items():
+        kind, choices = hints[argument], None
+        if typing.get_origin(kind) is typing.Annotated:
+            kind, choices = typing.get_args(kind)
+        if typing.get_origin(kind) in (types.UnionType, typing.Union):  # or None
             kind = next(k for k in typing.get_args(kind) if k is not type(None))
-        options: dict[str, Any] = {"default": given.default}
-        options["help"] = described.get(argument)
+        if typing.get_origin(kind) is Literal:
+            choices = typing.get_args(kind)
+            kind = type(choices[0])
+        options: dict[str, Any] = {"help": described.get(argument)}
+        parts = typing.get_args(kind)
         if kind is bool:
             options["action"] = "store_true"
-        elif typing.get_origin(kind) is list:
-            options |= {"nargs": "+", "type": typing.get_args(kind)[0]}
+        elif parts:  # a sequence, or a tuple of so many
+            num = len(parts) if typing.get_origin(kind) is tuple else "+"
+            options |= {"nargs": num, "type": parts[0]}
         else:
             options["type"] = kind
-        parser.add_argument("--" + argument.replace("_", "-"), **options)
+        if choices:
+            options["choices"] = [*choices]
+        flag = "--" + argument.replace("_", "-")
+        is_required = given.default is given.empty
+        if is_required and given.kind is not given.KEYWORD_ONLY:
+            flag = argument
+        elif is_required:
+            options["required"] = True
+        else:
+            options["default"] = given.default
+        parser.add_argument(flag, **options)
     return parser
 
 
@@ -108,16 +143,9 @@ def main(argv: list[str]) -> int:
         print(error, file=sys.stderr)
         return 2
     run = import_module(module).main
-    if inspect.signature(run).parameters:
-        run(**vars(parser_of(run, name).parse_args(options)))
-        return 0
-    before = sys.argv
-    sys.argv = [name, *options]  # it reads the command line by itself
-    try:
-        run()
-    finally:
-        sys.argv = before
-    return 0
+    given = vars(parser_of(run, name).parse_args(options))
+    owner = options_of(run)
+    return (run(**given) if owner is run else run(owner(**given))) or 0
 
 
 if __name__ == "__main__":

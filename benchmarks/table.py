@@ -1,19 +1,23 @@
 """Print a committed CSV or JSON file as a table.
 
-    python -m benchmarks.table information_gain/peers.csv
-    python -m benchmarks.table cost/doors.json --only "cpu_s*"
+    python -m benchmarks table information_gain/peers.csv
+    python -m benchmarks table cost/doors.json --only "cpu_s*"
+    python -m benchmarks table readme    # README's; exits 1 where it misses a value
 
 A file of rows keeps its columns, or those named by ``--columns``. Of nested values each
 number is a row, called by its path; ``--only`` keeps paths that match a pattern.
 """
 
-import argparse
 import csv
 import json
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
+
+from benchmarks import readme
 
 HERE = Path(__file__).parent
 LONGEST = 30  # characters of a text that calls a row; a longer one is a note
@@ -43,13 +47,28 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
         yield ", ".join(path), shown
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        file: Path of the file below benchmarks/; ``readme`` is README's own table.
+        only: Patterns of paths; all by default.
+        columns: Names of columns of a CSV file; all by default.
+    """
+
+    file: str
+    only: Sequence[str] = ("*",)
+    columns: Sequence[str] | None = None
+
+
+def main(arguments: Settings) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("file", help="below benchmarks/")
-    parser.add_argument("--only", nargs="*", default=["*"], help="patterns of paths")
-    parser.add_argument("--columns", nargs="*", help="of a CSV file")
-    arguments = parser.parse_args()
+    if arguments.file == "readme":
+        lines, misses = readme.table()
+        print(*lines, sep="\n")
+        print(*misses, sep="\n", file=sys.stderr)
+        return 1 if misses else 0
     path = HERE / arguments.file
     if path.suffix == ".csv":
         with path.open(newline="") as file:
@@ -65,7 +84,4 @@ def main() -> None:
         ]
     for row in (header, ["---"] * len(header), *cells):
         print("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |")
-
-
-if __name__ == "__main__":
-    main()
+    return 0

@@ -1,7 +1,7 @@
 """Whether the library computes what it computed, to the last bit.
 
-    python -m benchmarks.bits.run            # compares with figures.json
-    python -m benchmarks.bits.run --write    # writes it anew
+    python -m benchmarks bits            # compares with figures.json
+    python -m benchmarks bits --write    # writes it anew
 
 Some thirty short runs over all parts: campaigns of each method, the gain by each
 estimator, refinement of smooth and of rough responses, verdicts of the closed loop, a
@@ -15,11 +15,9 @@ stand in the file: on another machine, write it anew before a change.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import platform
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -327,22 +325,27 @@ def environment() -> dict[str, str]:
     return found | {"python": platform.python_version(), "machine": platform.machine()}
 
 
-def main() -> int:
-    """Run all and compare, or write."""
-    parser = argparse.ArgumentParser(description="Compare results to the last bit.")
-    parser.add_argument("--write", action="store_true", help="write figures.json anew")
-    parser.add_argument("--only", default="", help="runs whose name contains this")
-    arguments = parser.parse_args()
+def main(
+    *,
+    write: bool = False,
+    only: str = "",
+) -> int:
+    """Run all and compare, or write.
+
+    Args:
+        write: Whether to write the figures anew.
+        only: Names, or parts of names, that are run; all by default.
+    """
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {"runs": {}}
     made, different = dict(known["runs"]), []
     for name, run in runs():
-        if arguments.only not in name:
+        if only not in name:
             continue
         start = time.process_time()
         made[name] = figures(run())
-        for _ in range(0 if arguments.write else NUM_REPEATS):
+        for _ in range(0 if write else NUM_REPEATS):
             if known["runs"].get(name) == made[name]:
                 break
             made[name] = figures(run())
@@ -350,7 +353,7 @@ def main() -> int:
         different += [] if same else [name]
         seconds = time.process_time() - start
         print(f"{name}: {'same' if same else 'DIFFERS'}, {seconds:.1f} CPU s")
-    if arguments.write:
+    if write:
         ordered = {name: made[name] for name, _ in runs()}
         text = {"environment": environment(), "runs": ordered}
         FIGURES.write_text(json.dumps(text, indent=1) + "\n")
@@ -359,7 +362,3 @@ def main() -> int:
         print(f"written with {known.get('environment')}; got {environment()}")
     print(f"{len(different)} of {len(made)} runs differ")
     return 1 if different else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,11 +1,11 @@
 """The paper's box collision: log p(truth), reproduction error, speeds, time a round.
 
-    python -m benchmarks.box_collision.run                  # both targets, 10 trials
-    python -m benchmarks.box_collision.run --trials 50      # the paper's number
-    python -m benchmarks.box_collision.run --target 1 --setting paper --methods asbi
-    python -m benchmarks.box_collision.run --table coverage --rounds 3 --reference none
-    python -m benchmarks.box_collision.run --table references --particles 30
-    python -m benchmarks.box_collision.run --summary --figures FOLDER
+    python -m benchmarks box_collision                  # both targets, 10 trials
+    python -m benchmarks box_collision --trials 50      # the paper's number
+    python -m benchmarks box_collision --target 1 --setting paper --methods asbi
+    python -m benchmarks box_collision --table coverage --rounds 3 --reference none
+    python -m benchmarks box_collision --table references --particles 30
+    python -m benchmarks box_collision --summary --figures FOLDER
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method, target and setting, in ``benchmarks/box_collision/results``. The tables are
@@ -21,13 +21,13 @@ posterior density.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
 import warnings
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -107,8 +107,69 @@ class Resampled:
         return self._posterior.sample(shape[0], seed=seed)
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        table: Name of the table.
+        target: Target of the paper; both by default.
+        methods: Names of methods; asbi and nsbi by default, asbi for the coverage.
+        setting: Name of the settings.
+        trials: Number of trials; 10 by default, 40 for the coverage.
+        first: Number of the first trial.
+        rounds: Number of rounds.
+        noise: Standard deviation of the noise, in m, > 0.
+        workers: Number of workers.
+        reference: Rounds after which importance sampling is run.
+        particles: Number of effective draws of the reference.
+        bank: Folder to keep first rounds' simulations in; for one worker, and the time
+            of a first round is then not that of a campaign alone.
+        results: Folder of the results.
+        figures: Folder for the figures.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    table: Annotated[str, TABLES] = "paper"
+    target: Literal["1", "2"] | None = None
+    methods: Annotated[Sequence[str] | None, METHODS] = None
+    setting: Annotated[str, SETTINGS] = "default"
+    trials: int | None = None
+    first: int = 0
+    rounds: int = 6
+    noise: float = 0.005
+    workers: int = 1
+    reference: Literal["last", "all", "none"] = "last"
+    particles: int = 100
+    bank: Path | None = None
+    results: Path = RESULTS
+    figures: Path | None = None
+    summary: bool = False
+
+    def __post_init__(self) -> None:
+        if self.noise <= 0:
+            raise SystemExit(
+                f"expected --noise > 0; got {self.noise}; use 0.005: without noise "
+                "there is no posterior density, and nothing to estimate"
+            )
+        if self.bank and self.workers > 1:
+            raise SystemExit(
+                f"expected --workers 1 beside --bank; got {self.workers}; drop one"
+            )
+
+    @property
+    def is_coverage(self) -> bool:
+        """Whether truths are drawn from the prior."""
+        return self.table == "coverage"
+
+    @property
+    def num_trials(self) -> int:
+        """Number of trials."""
+        return self.trials or (40 if self.is_coverage else 10)
+
+
 def run_trial(
-    task: Any, method: str, seed: int, arguments: argparse.Namespace
+    task: Any, method: str, seed: int, arguments: Settings
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
     options = options_of(method, arguments.setting)
@@ -213,7 +274,7 @@ def reference_row(
     }
 
 
-def make_task(target: str, arguments: argparse.Namespace, seed: int) -> Any:
+def make_task(target: str, arguments: Settings, seed: int) -> Any:
     """Return a target of the paper, or a truth drawn from the prior."""
     options: dict[str, Any] = {
         "noise": arguments.noise,
@@ -226,7 +287,7 @@ def make_task(target: str, arguments: argparse.Namespace, seed: int) -> Any:
         return task.with_truth(task.prior.sample(torch.Size([1]))[0])
 
 
-def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
+def path_of(method: str, target: str, arguments: Settings) -> Path:
     """Return the file of a method, target and setting."""
     name = f"{arguments.setting}_target_{target}_{method}"
     if arguments.noise != 0.005:
@@ -236,13 +297,13 @@ def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
     return arguments.results / f"{name}.csv"
 
 
-def add_references(method: str, target: str, arguments: argparse.Namespace) -> None:
+def add_references(method: str, target: str, arguments: Settings) -> None:
     """Add importance sampling to the last rounds in the file that have none."""
     path = path_of(method, target, arguments)
     rows = read(path)
     for last in rows:
         seed, number = int(last["seed"]), int(last["round"])
-        wanted = arguments.first <= seed < arguments.trials
+        wanted = arguments.first <= seed < arguments.num_trials
         if not wanted or number != arguments.rounds or last["log_p_exact"]:
             continue
         start = time.process_time()
@@ -275,12 +336,12 @@ def recorded(row: dict[str, str]) -> Trial:
     return Trial(int(row["round"]) - 1, torch.tensor([float(row["speed"])]), x, status)
 
 
-def run_missing(method: str, target: str, arguments: argparse.Namespace) -> None:
+def run_missing(method: str, target: str, arguments: Settings) -> None:
     """Run the trials that are not in the file yet."""
     path = path_of(method, target, arguments)
     path.parent.mkdir(parents=True, exist_ok=True)
     done = {int(row["seed"]) for row in read(path)}
-    for seed in range(arguments.first, arguments.trials):
+    for seed in range(arguments.first, arguments.num_trials):
         if seed in done:
             continue
         start = time.process_time()
@@ -291,74 +352,25 @@ def run_missing(method: str, target: str, arguments: argparse.Namespace) -> None
         print(f"{path.stem} trial {seed}: {spent:.0f} CPU s", flush=True)
 
 
-def parse() -> argparse.Namespace:
-    """Return the arguments."""
-    parser = argparse.ArgumentParser(description="The paper's box collision.")
-    parser.add_argument("--table", choices=TABLES, default="paper")
-    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
-    parser.add_argument("--methods", nargs="*", choices=[*METHODS], help="(asbi nsbi)")
-    parser.add_argument("--setting", choices=[*SETTINGS], default="default")
-    parser.add_argument("--trials", type=int, help="(10; 40 for the coverage)")
-    parser.add_argument("--first", type=int, default=0, help="trial to begin with")
-    parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--noise", type=float, default=0.005, help="m; > 0 (0.005)")
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument(
-        "--reference",
-        choices=["last", "all", "none"],
-        default="last",
-        help="rounds after which to run importance sampling",
-    )
-    parser.add_argument("--particles", type=int, default=100, help="effective ones")
-    parser.add_argument(
-        "--bank",
-        type=Path,
-        help="folder to keep first rounds' simulations in; one worker only, and the "
-        "time of a first round is then not that of a campaign alone",
-    )
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--figures", type=Path, help="folder to draw figures into")
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
-    if arguments.noise <= 0:
-        parser.error(
-            f"expected --noise > 0; got {arguments.noise}; use 0.005: without noise "
-            "there is no posterior density, and nothing to estimate"
-        )
-    if arguments.bank and arguments.workers > 1:
-        parser.error(
-            f"expected --workers 1 beside --bank; got {arguments.workers}; drop one"
-        )
-    is_coverage = arguments.table == "coverage"
-    if arguments.methods is None:
-        arguments.methods = ["asbi"] if is_coverage else ["asbi", "nsbi"]
-    if arguments.trials is None:
-        arguments.trials = 40 if is_coverage else 10
-    return arguments
-
-
-def main() -> None:
-    arguments = parse()
+def main(arguments: Settings) -> None:
+    """Run the trials that are not there yet, and print the table."""
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="the posterior rests on")
-    is_coverage = arguments.table == "coverage"
+    is_coverage = arguments.is_coverage
+    methods = arguments.methods or (("asbi",) if is_coverage else ("asbi", "nsbi"))
     targets = [arguments.target] if arguments.target else ["1", "2"]
     targets = ["prior"] if is_coverage else targets
     cells = {}
-    for method in arguments.methods:
+    for method in methods:
         for target in targets:
             if not arguments.summary:
                 is_extra = arguments.table == "references"
                 run = add_references if is_extra else run_missing
                 run(method, target, arguments)
             rows = read(path_of(method, target, arguments))
-            rows = [row for row in rows if int(row["seed"]) < arguments.trials]
+            rows = [row for row in rows if int(row["seed"]) < arguments.num_trials]
             if rows:
                 cells[method, target] = rows
     print(coverage_table(cells) if is_coverage else summarize(cells))
     if arguments.figures is not None and cells:
         print(*draw(cells, arguments.figures), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -71,7 +71,3 @@ def main() -> None:
     print(json.dumps(result, indent=2))
     path = Path(__file__).parent / "speed.json"
     path.write_text(json.dumps(result, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main()

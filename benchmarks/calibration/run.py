@@ -1,8 +1,8 @@
 """Are bad networks and beliefs flagged, and good ones not?
 
-    python -m benchmarks.calibration.run --table networks --problem numerical
-    python -m benchmarks.calibration.run --table beliefs --problem square
-    python -m benchmarks.calibration.run --summary
+    python -m benchmarks calibration --table networks --problem numerical
+    python -m benchmarks calibration --table beliefs --problem square
+    python -m benchmarks calibration --summary
 
 networks: under-trained (20 to 100 steps of the paper's network on 5,000 rows), trained
 (3,000 steps of the default one on 20,000; of location 5,000 steps of eight components
@@ -15,9 +15,11 @@ Resumable: a row that stands in the CSV is not run again. Seeds from 2000 on jud
 
 from __future__ import annotations
 
-import argparse
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from benchmarks.calibration import beliefs, networks
 from benchmarks.rows import append, read
@@ -75,16 +77,29 @@ def summary(table: str, first: int) -> None:
         print(f"{line}; {cpu:.1f} CPU s")
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        table: Name of the table.
+        problem: Names of the problems.
+        kind: Kind of cases; all by default.
+        first: Number of the first case.
+        seeds: Seeds, from the first to before the second.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    table: Annotated[str, TABLES] = "networks"
+    problem: Sequence[str] | None = None
+    kind: Sequence[str] | None = None
+    first: int = 2_000
+    seeds: int = 40
+    summary: bool = False
+
+
+def main(given: Settings) -> None:
     """Run what is asked for and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--table", choices=[*TABLES], default="networks")
-    parser.add_argument("--problem", action="append")
-    parser.add_argument("--kind", action="append")
-    parser.add_argument("--first", type=int, default=2_000)
-    parser.add_argument("--seeds", type=int, default=40)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    given = parser.parse_args()
     if given.summary:
         for table in TABLES:
             summary(table, given.first)
@@ -100,7 +115,3 @@ def main() -> None:
                 range(given.first, given.first + given.seeds),
             )
     summary(given.table, given.first)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Robust updates beside plain ones on the numerical task, one gross outlier in ten.
 
-    python -m benchmarks.chain.robust --seeds 2000 2010
-    python -m benchmarks.chain.robust --summary
+    python -m benchmarks chain.robust --seeds 2000 2010
+    python -m benchmarks chain.robust --summary
 
 Ten trials at random actions. In "gross" one of them, drawn by the seed, is off by 100
 deviations of the noise; "clean" has none. Both methods take the word of the same kind
@@ -12,9 +12,9 @@ judge.
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -85,12 +85,23 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs=2, default=[2000, 2010])
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    options = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        seeds: Seeds, from the first to before the second.
+        summary: Whether to run nothing, and print the table of the rows.
+        out: File of the results.
+    """
+
+    seeds: tuple[int, int] = (2000, 2010)
+    summary: bool = False
+    out: Path = RESULTS
+
+
+def main(options: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     path = options.out / "robust.csv"
@@ -136,7 +147,3 @@ def summary(rows: pd.DataFrame) -> str:
     header += ["largest P of others", "largest r_hat: median (most)"]
     header += ["least effective draws", "divergences"]
     return as_table(lines, [*header, *(f"CPU s, {m}" for m in METHODS)])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,9 @@
 """Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
 
-    python -m benchmarks.chain.run --parameters 8 12 16 20 --seeds 2300 2340
-    python -m benchmarks.chain.run --references 2   # first seeds with a reference
-    python -m benchmarks.chain.run --campaign      # CPU time of a round, chosen actions
-    python -m benchmarks.chain.run --summary       # of rounds with --campaign
+    python -m benchmarks chain --parameters 8 12 16 20 --seeds 2300 2340
+    python -m benchmarks chain --references 2   # first seeds with a reference
+    python -m benchmarks chain --campaign      # CPU time of a round, chosen actions
+    python -m benchmarks chain --summary       # of rounds with --campaign
 
 Each seed has a truth drawn from the prior and six trials at random actions, refined
 with the defaults but for a defensive share of 1e-6, since one draw of the prior among
@@ -20,9 +20,10 @@ alone. Rows are added to results/, and those that are there are not run again.
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -191,15 +192,29 @@ def round_summary(path: Path) -> str:
     return as_table(lines, header)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parameters", type=int, nargs="+", default=[8, 12, 16, 20])
-    parser.add_argument("--seeds", type=int, nargs=2, default=[2300, 2340])
-    parser.add_argument("--references", type=int, default=2)
-    parser.add_argument("--campaign", action="store_true")
-    parser.add_argument("--summary", action="store_true")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    options = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        parameters: Numbers of parameters.
+        seeds: Seeds, from the first to before the second.
+        references: Number of seeds with a reference.
+        campaign: Whether to time the rounds of a campaign.
+        summary: Whether to run nothing, and print the table of the rows.
+        out: File of the results.
+    """
+
+    parameters: Sequence[int] = (8, 12, 16, 20)
+    seeds: tuple[int, int] = (2300, 2340)
+    references: int = 2
+    campaign: bool = False
+    summary: bool = False
+    out: Path = RESULTS
+
+
+def main(options: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -219,7 +234,3 @@ def main() -> None:
                 rows = [judged(dim, seed, with_reference=want)]
             append(path, [*rows[0]], rows)
             print(rows[-1], flush=True)
-
-
-if __name__ == "__main__":
-    main()

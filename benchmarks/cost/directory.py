@@ -1,6 +1,6 @@
 """What keeping a campaign on disk costs: a tell, a load, a round.
 
-    python -m benchmarks.cost.directory
+    python -m benchmarks cost.directory
 
 * a ``tell`` of 100 numbers, in memory and on disk, and the ``fsync`` alone of a file of
   as many bytes, in turn;
@@ -171,7 +171,3 @@ def main() -> None:
     result["update_cpu_s_near"] = near
     print(near)
     RESULT.write_text(json.dumps(result, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()

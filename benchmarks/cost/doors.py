@@ -1,6 +1,6 @@
 """CPU seconds until the library answers: imports beside sbi's, and the command line.
 
-    python -m benchmarks.cost.doors
+    python -m benchmarks cost.doors
 
 Each line is a process of its own; lines are run in turn, three times over, and the
 median counts. ``-X importtime`` then names the slowest of what is imported.
@@ -69,7 +69,3 @@ def main() -> None:
     result = {"date": date.today().isoformat(), "cpu_s": medians, "imports_s": imports}
     path = Path(__file__).parent / "doors.json"
     path.write_text(json.dumps(result, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """CPU time of a round that trains its network each time, and of one on demand.
 
-    python -m benchmarks.cost.network
+    python -m benchmarks cost.network
 
 Campaigns of the numerical task, whose noise is declared, with the defaults and with
 ``CampaignOptions(network="on demand")``; the two take turns, seed by seed, in one
@@ -11,11 +11,11 @@ round by stage, simulations a round, and what the campaigns ended with.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
 import warnings
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -58,12 +58,21 @@ def rounds(
         return rows, campaign.belief.sample((4_000,)).std(0).tolist()
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        seeds: Seeds, from the first to before the second.
+        rounds: Number of rounds.
+    """
+
+    seeds: int = 8
+    rounds: int = 3
+
+
+def main(arguments: Settings) -> None:
     """Run both modes in turn, print and write their cost."""
-    parser = argparse.ArgumentParser(description="Cost of a round's network.")
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--rounds", type=int, default=3)
-    arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     made: dict[str, list[Any]] = {mode: [] for mode in MODES}
@@ -73,7 +82,7 @@ def main() -> None:
         for mode in MODES:
             made[mode].append(rounds(mode, seed, arguments.rounds))
     result: dict[str, Any] = {
-        "command": "python -m benchmarks.cost.network "
+        "command": "python -m benchmarks cost.network "
         f"--seeds {arguments.seeds} --rounds {arguments.rounds}",
         "date": date.today().isoformat(),
         "machine": f"{os.cpu_count()} cores, no GPU",
@@ -96,7 +105,3 @@ def main() -> None:
     for mode in MODES:
         print(f"{mode}: {json.dumps(result[mode])}")
     print(f"ratio: {result['ratio']:.1f}")
-
-
-if __name__ == "__main__":
-    main()

@@ -75,7 +75,3 @@ def main() -> None:
     print(f"stock NPE_C(prior), training:    {theirs:7.2f} CPU s")
     print(f"default loop, a whole round:     {ours:7.2f} CPU s")
     print(f"ratio:                           {theirs / ours:7.1f}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,8 @@
 r"""A campaign that starts on the wrong simulator, is alarmed, and goes on.
 
-    python -m benchmarks.criticism.campaign --kind hidden --cases 40
-    python -m benchmarks.criticism.campaign --kind clean --cases 40
-    python -m benchmarks.criticism.campaign --summary
+    python -m benchmarks criticism.campaign --kind hidden --cases 40
+    python -m benchmarks criticism.campaign --kind clean --cases 40
+    python -m benchmarks criticism.campaign --summary
 
 The numerical task, :math:`x = \theta_1 e^{3 - \xi} + \theta_2 \xi + \varepsilon`, with
 theta drawn from its prior. "hidden": the real system adds :math:`c \xi^2`, c drawn from
@@ -20,10 +20,11 @@ One row a case. Resumable: a case that stands in the CSV is not run again.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -288,17 +289,31 @@ def _alarms(rows: Sequence[Mapping[str, str]]) -> str:
     return rate([r["alarm_at"] != "" for r in rows])
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        kind: Kind of cases; all by default.
+        cases: Number of cases.
+        first: Number of the first case.
+        trials: Number of trials.
+        policy: Names of the policies.
+        out: File of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    kind: Annotated[str | None, KINDS] = None
+    cases: int = 40
+    first: int = 0
+    trials: int = NUM_TRIALS
+    policy: Annotated[str, POLICIES] = POLICIES[0]
+    out: Path = RESULTS
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run what is asked for and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--kind", choices=KINDS)
-    parser.add_argument("--cases", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--trials", type=int, default=NUM_TRIALS)
-    parser.add_argument("--policy", choices=POLICIES, default=POLICIES[0])
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, str]] = []
     for kind in KINDS:
@@ -323,7 +338,3 @@ def main() -> None:
                 print({k: row.get(k) for k in COLUMNS if k in row}, flush=True)
         rows += read(path)
     print("\n".join(summary(rows)))
-
-
-if __name__ == "__main__":
-    main()

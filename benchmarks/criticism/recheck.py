@@ -1,7 +1,7 @@
 """Look at single cases again: what raised the alarm, and whether the evidence holds.
 
-    python -m benchmarks.criticism.recheck --world B --kind library --case 8 9 21
-    python -m benchmarks.criticism.recheck --kind removed --trials 12 --case 15
+    python -m benchmarks criticism.recheck --world B --kind library --case 8 9 21
+    python -m benchmarks criticism.recheck --kind removed --trials 12 --case 15
 
 One row a case. log BF: lower end of the Bayes factor's error, which raises the alarm
 above 3.0; p: of the bare model's chi-square; p after: of the verdict's, its parameters
@@ -12,14 +12,16 @@ four times the posterior's covariance and a third from the prior.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 from scipy.stats import chi2, multivariate_normal
 
-from benchmarks.criticism.cases import KINDS, draw_case
+from benchmarks.criticism.cases import Kind, draw_case
 from benchmarks.criticism.worlds import get_world
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.evidence import RivalSet
@@ -67,15 +69,27 @@ def evidence_again(
     return evidence.log_evidence, float(logsumexp(log_weight) - np.log(num_draws))
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        case: Number of the case.
+        world: Name of the world.
+        kind: Kind of cases; all by default.
+        trials: Number of trials.
+        draws: Number of draws.
+    """
+
+    case: Sequence[int]
+    world: Literal["A", "B", "C"] = "B"
+    kind: Kind = "library"
+    trials: int = 8
+    draws: int = 30_000
+
+
+def main(arguments: Settings) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--world", choices=["A", "B", "C"], default="B")
-    parser.add_argument("--kind", choices=KINDS, default="library")
-    parser.add_argument("--trials", type=int, default=8)
-    parser.add_argument("--case", type=int, nargs="+", required=True)
-    parser.add_argument("--draws", type=int, default=30_000)
-    arguments = parser.parse_args()
     world, rows = get_world(arguments.world), []
     for number in arguments.case:
         case = draw_case(world, arguments.kind, number, num_trials=arguments.trials)
@@ -108,7 +122,3 @@ def main() -> None:
     header = ["case", "truth", "verdict", "log BF", "p", "p after"]
     header += ["evidence, again: verdict", "evidence, again: truth"]
     print(pd.DataFrame(rows, columns=pd.Index(header)).to_string(index=False))
-
-
-if __name__ == "__main__":
-    main()

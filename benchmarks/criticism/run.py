@@ -1,14 +1,14 @@
 """The closed loop on worlds whose truth is known, one table a command.
 
-    python -m benchmarks.criticism.run --table loop --world A --trials 8 --cases 200
-    python -m benchmarks.criticism.run --table loop --world B --kind clean --cases 40
-    python -m benchmarks.criticism.run --table open --world A --trials 12 --cases 100
-    python -m benchmarks.criticism.run --table pairs --world B --trials 12 --cases 60
-    python -m benchmarks.criticism.run --table active --world B --trials 10 --cases 40
-    python -m benchmarks.criticism.run --table priors --world A --scale 3 --cases 100
-    python -m benchmarks.criticism.run --table correlation --world C --cases 100
-    python -m benchmarks.criticism.run --table loop --world D --kind library --cases 60
-    python -m benchmarks.criticism.run --table loop --world A --summary
+    python -m benchmarks criticism --table loop --world A --trials 8 --cases 200
+    python -m benchmarks criticism --table loop --world B --kind clean --cases 40
+    python -m benchmarks criticism --table open --world A --trials 12 --cases 100
+    python -m benchmarks criticism --table pairs --world B --trials 12 --cases 60
+    python -m benchmarks criticism --table active --world B --trials 10 --cases 40
+    python -m benchmarks criticism --table priors --world A --scale 3 --cases 100
+    python -m benchmarks criticism --table correlation --world C --cases 100
+    python -m benchmarks criticism --table loop --world D --kind library --cases 60
+    python -m benchmarks criticism --table loop --world A --summary
 
 loop: false alarms, power, tracing, calibration, error before and after. open: the
 effect was removed from the library, or removed with all that could stand in for it, or
@@ -24,9 +24,10 @@ setting, in benchmarks/criticism/results. Give each command a core of its own
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 from benchmarks.criticism import tables
 from benchmarks.criticism.active import ACTIVE_COLUMNS, score_active
@@ -47,7 +48,34 @@ TABLES: dict[str, tuple[str, ...]] = {
 }
 
 
-def settings(arguments: argparse.Namespace) -> Iterator[tuple[str, bool]]:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        table: Name of the table.
+        world: Name of the world.
+        kind: Kind of cases; all by default.
+        trials: Number of trials.
+        cases: Number of cases.
+        first: Number of the first case.
+        scale: Scale of the declared priors.
+        independent: Whether errors are taken as independent (world C).
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    table: Annotated[str, TABLES] = "loop"
+    world: Literal["A", "B", "C", "D"] = "A"
+    kind: Annotated[str | None, KINDS] = None
+    trials: int = 8
+    cases: int = 200
+    first: int = 0
+    scale: float = 1.0
+    independent: bool = False
+    summary: bool = False
+
+
+def settings(arguments: Settings) -> Iterator[tuple[str, bool]]:
     """Yield every kind of case and whether errors are taken as independent."""
     kinds = (arguments.kind,) if arguments.kind else TABLES[arguments.table]
     both = arguments.table == "correlation"
@@ -56,7 +84,7 @@ def settings(arguments: argparse.Namespace) -> Iterator[tuple[str, bool]]:
             yield kind, independent
 
 
-def paths(arguments: argparse.Namespace, kind: str, independent: bool) -> list[Path]:
+def paths(arguments: Settings, kind: str, independent: bool) -> list[Path]:
     """Return the setting's file, then those of processes with another first case."""
     name = f"{arguments.world}_{kind}_{arguments.trials}"
     name += f"_scale_{arguments.scale:.3g}" if arguments.scale != 1 else ""
@@ -67,7 +95,7 @@ def paths(arguments: argparse.Namespace, kind: str, independent: bool) -> list[P
     return [RESULTS / f"{mine}.csv", *others]
 
 
-def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> None:
+def run_setting(arguments: Settings, kind: str, independent: bool) -> None:
     """Run the cases that are in none of the files yet."""
     path, *others = paths(arguments, kind, independent)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,19 +129,8 @@ def run_setting(arguments: argparse.Namespace, kind: str, independent: bool) -> 
         )
 
 
-def main() -> None:
+def main(arguments: Settings) -> None:
     """Run what is asked for and print its table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--table", choices=[*TABLES], default="loop")
-    parser.add_argument("--world", choices=["A", "B", "C", "D"], default="A")
-    parser.add_argument("--kind", choices=KINDS)
-    parser.add_argument("--trials", type=int, default=8)
-    parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--scale", type=float, default=1.0, help="of declared priors")
-    parser.add_argument("--independent", action="store_true", help="errors (world C)")
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
     found: dict[tuple[str, bool], list[dict[str, str]]] = {}
     for kind, independent in settings(arguments):
         if not arguments.summary:
@@ -123,7 +140,3 @@ def main() -> None:
     world = get_world(arguments.world)
     for line in tables.summary(arguments.table, world, found):
         print(line)
-
-
-if __name__ == "__main__":
-    main()

@@ -76,11 +76,11 @@ def _library(world: World, rows: Sequence[Row]) -> list[str]:
     scattered = [r for r in rows if r["effects"] == world.scatter.name]
     named = [r for r in rows if r["effects"] != world.scatter.name]
     lines = _power(named)
-    seen = [r for r in named if _detected(r) and float(r["lambda"]) > BINS[-1][0]]
-    ranks = [_rank(world, r) for r in seen]
+    seen = [r for r in strong(world, rows) if _detected(r)]
+    places = ranks(world, seen)
     lines += [
-        f"top-1 {rate([k == 1 for k in ranks])}",
-        f"top-2 {rate([k <= 2 for k in ranks])}",
+        f"top-1 {rate([k == 1 for k in places])}",
+        f"top-2 {rate([k <= 2 for k in places])}",
         f"mean of the largest stated probability {_mean_largest(world, seen):.3f}",
         f"verdict right {rate([_right(world, r) for r in seen])}",
         "of noise inflation, called scatter "
@@ -99,6 +99,17 @@ def _library(world: World, rows: Sequence[Row]) -> list[str]:
         lines += _of_effect(name, [r for r in named if r["effects"] == name])
     lines += _separated(rows)
     return [*lines, *_errors([r for r in named if _detected(r)])]
+
+
+def strong(world: World, rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of effects that matter, noise inflation apart."""
+    named = [r for r in rows if r["effects"] != world.scatter.name]
+    return [r for r in named if float(r["lambda"]) > BINS[-1][0]]
+
+
+def ranks(world: World, rows: Sequence[Row]) -> list[int]:
+    """Return the true effect's place among the effects, in the rows with an alarm."""
+    return [_rank(world, r) for r in rows if _detected(r)]
 
 
 def _of_effect(name: str, rows: Sequence[Row]) -> list[str]:

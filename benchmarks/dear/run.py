@@ -1,6 +1,6 @@
 """Campaigns with few simulations, beside the default and stock sbi with as many.
 
-    python -m benchmarks.dear.run --tasks numerical oscillator --trials 4
+    python -m benchmarks dear --tasks numerical oscillator --trials 4
 
 The trials (actions, outcomes) of the campaign with a budget are given to the methods of
 sbi, which simulate all executed actions at once and choose none: what is compared is
@@ -10,8 +10,9 @@ round in benchmarks/dear/results/rows.csv, and the table is printed.
 
 from __future__ import annotations
 
-import argparse
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -182,14 +183,27 @@ def table(rows: list[dict[str, str]]) -> str:
     return "\n".join(text)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Few simulations, beside stock sbi.")
-    parser.add_argument("--tasks", nargs="*", default=TASKS)
-    parser.add_argument("--trials", type=int, default=4)
-    parser.add_argument("--sizes", nargs="*", type=int, default=[500, 250, 1_000])
-    parser.add_argument("--methods", nargs="*", default=["campaign", "TSNPE", "SNPE-C"])
-    parser.add_argument("--table", action="store_true", help="print, run nothing")
-    given = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        tasks: Names of the tasks.
+        trials: Number of trials.
+        sizes: Budgets, in simulations a round.
+        methods: Names of methods.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    tasks: Sequence[str] = (*TASKS,)
+    trials: int = 4
+    sizes: Sequence[int] = (500, 250, 1_000)
+    methods: Sequence[str] = ("campaign", "TSNPE", "SNPE-C")
+    summary: bool = False
+
+
+def main(given: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     torch.set_num_threads(1)
     jobs = [
         (name, size, FIRST_SEED + k)
@@ -197,7 +211,7 @@ def main() -> None:
         for size in [*given.sizes, None]
         for name in given.tasks
     ]
-    for name, size, seed in jobs if not given.table else ():
+    for name, size, seed in jobs if not given.summary else ():
         label = "default" if size is None else str(size)
         task = get_task(name)
         with forked_generators(derive_seed(seed, "truth")):
@@ -231,7 +245,3 @@ def main() -> None:
             write([{**key, "method": method, **found, **more}])
         print(name, label, seed, flush=True)
     print(table(read(ROWS)))
-
-
-if __name__ == "__main__":
-    main()

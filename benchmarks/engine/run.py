@@ -17,7 +17,6 @@ process. CPU times are read by psutil, which comes with Dask.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -28,6 +27,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from statistics import median, quantiles
@@ -253,13 +253,21 @@ def text(figures: dict[str, float], form: str) -> str:
     return f"{middle} ({low} to {high})"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure the engine.")
-    parser.add_argument("--repetitions", type=int, default=9)
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).with_name("result.json")
-    )
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        repetitions: Number of repetitions.
+        out: File of the results.
+    """
+
+    repetitions: int = 9
+    out: Path = Path(__file__).with_name("result.json")
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     repetitions = arguments.repetitions
     torch.set_num_threads(1)
     result: dict[str, Any] = {
@@ -295,7 +303,3 @@ def main() -> None:
     print(f"x of the good rows unchanged: {row['x_of_good_rows_unchanged']}")
     result["load_average_at_end"] = os.getloadavg()[0]
     arguments.out.write_text(json.dumps(result, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main()

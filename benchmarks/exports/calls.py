@@ -1,6 +1,6 @@
 """Ten calls of ArviZ on exports in files, the same on 0.x and 1.x.
 
-    python -m benchmarks.exports.run --write DIR   # by this library
+    python -m benchmarks exports --write DIR   # by this library
     python benchmarks/exports/calls.py DIR         # in an environment of each
 
 It needs ArviZ, h5netcdf and Zarr, and not this library. It prints a line a call with

@@ -1,8 +1,8 @@
 """Ten calls of ArviZ on a campaign's export, the same on 0.x and 1.x.
 
-    python -m benchmarks.exports.run
+    python -m benchmarks exports
 
-    python -m benchmarks.exports.run --write DIR   # for benchmarks/exports/calls.py
+    python -m benchmarks exports --write DIR   # for benchmarks/exports/calls.py
 
 Run it in an environment of each: ArviZ 1.x needs Python 3.12. It prints a line a call
 with the warnings raised in it; ArviZ's own dependencies raise some. ArviZ 0.23 reads
@@ -12,7 +12,6 @@ and writes Zarr of the second generation alone, which needs older company:
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from pathlib import Path
 from typing import Any
@@ -84,22 +83,19 @@ def export_rivals(export: Any) -> dict[str, Any]:
     return {name: export(report, model=name) for name in names}
 
 
-def main() -> None:
-    """Print a line a call, or write the exports."""
-    parser = argparse.ArgumentParser(description="Ten calls of ArviZ.")
-    parser.add_argument("--write", type=Path, help="folder; calls.py reads it anywhere")
-    folder = parser.parse_args().write
-    export: Any = to_inference_data if folder is None else to_datatree
+def main(*, write: Path | None = None) -> None:
+    """Print a line a call, or write the exports.
+
+    Args:
+        write: Folder for the exports, which ``calls.py`` reads anywhere.
+    """
+    export: Any = to_inference_data if write is None else to_datatree
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         data, rivals = export_campaign(export), export_rivals(export)
-    if folder is None:
+    if write is None:
         print(run(data, rivals))
         return
-    folder.mkdir(parents=True, exist_ok=True)
+    write.mkdir(parents=True, exist_ok=True)
     for name, tree in {"campaign": data, **rivals}.items():
-        tree.to_netcdf(folder / f"{name}.nc", engine="h5netcdf")
-
-
-if __name__ == "__main__":
-    main()
+        tree.to_netcdf(write / f"{name}.nc", engine="h5netcdf")

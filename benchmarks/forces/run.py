@@ -1,7 +1,7 @@
 """Forces that nobody declared, hidden in machines whose truth is known.
 
-    python -m benchmarks.forces.run --machine pendulum --kind single --first 2000
-    python -m benchmarks.forces.run --summary
+    python -m benchmarks forces --machine pendulum --kind single --first 2000
+    python -m benchmarks forces --summary
 
 Machines are in ``machines.py``. single: one force of the dictionary, of a size at which
 the refitted bare model misses by a chi-square of 40 to 2,000 over its degrees of
@@ -21,9 +21,10 @@ its own (OMP_NUM_THREADS=1).
 
 from __future__ import annotations
 
-import argparse
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -182,18 +183,29 @@ def _held_out(
     return float((scaled**2).mean().sqrt())
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        machine: Name of a machine.
+        kind: Kind of cases; all by default.
+        first: Number of the first case.
+        cases: Number of cases.
+        result: File of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    machine: Annotated[str | None, MACHINES] = None
+    kind: Annotated[str | None, KINDS] = None
+    first: int = FIRST_JUDGED
+    cases: int = 10
+    result: Path = RESULT
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run what is asked for and print the table of the judging seeds."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--machine", choices=[*MACHINES])
-    parser.add_argument("--kind", choices=KINDS)
-    parser.add_argument("--first", type=int, default=FIRST_JUDGED)
-    parser.add_argument("--cases", type=int, default=10)
-    parser.add_argument("--result", type=Path, default=RESULT)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
     names = [arguments.machine] if arguments.machine else [*MACHINES]
     kinds = [arguments.kind] if arguments.kind else [*KINDS]
     numbers = range(arguments.first, arguments.first + arguments.cases)
@@ -217,7 +229,3 @@ def main() -> None:
     first = FIRST_JUDGED if arguments.first >= FIRST_JUDGED else 0
     judged = [r for r in read(arguments.result) if int(r["case"]) >= first]
     print(*summary(judged), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -5,12 +5,10 @@ errors of the exact value, and mean and deviation of the error over its standard
 The nominal number is .0027 of them all. Run from the
 root of the repository::
 
-    python -m benchmarks.information_gain.outcomes [NUM_SEEDS]
+    python -m benchmarks information_gain.outcomes [--seeds 60]
 """
 
 from __future__ import annotations
-
-import sys
 
 import torch
 from torch import Tensor
@@ -45,14 +43,18 @@ def errors(
     return error, reported
 
 
-def main() -> None:
-    """Print the table."""
-    num_seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 15
-    print(f"{num_seeds} seeds; errors at the actions .5, 1, 2, 8 in standard errors")
+def main(*, seeds: int = 15) -> None:
+    """Print the table.
+
+    Args:
+        seeds: Number of seeds.
+    """
+    torch.set_num_threads(1)
+    print(f"{seeds} seeds; errors at the actions .5, 1, 2, 8 in standard errors")
     print(f"{'estimator':14}{'luck':>5}{'> 3':>9}{'mean':>26}{'deviation':>26}")
     for estimator in ESTIMATORS:
         for world in WORLDS:
-            error, reported = errors(world, estimator, num_seeds)
+            error, reported = errors(world, estimator, seeds)
             z = error / reported
             beyond = f"{int((z.abs() > 3).sum())} / {z.numel()}"
             mean, deviation = (
@@ -60,8 +62,3 @@ def main() -> None:
             )
             name = type(estimator).__name__
             print(f"{name:14}{world.luck:5}{beyond:>9}{mean:>26}{deviation:>26}")
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    main()

@@ -10,15 +10,14 @@ simulations an action, and a learning rate that falls a hundredfold; "started" g
 begin at the least-squares regression of the pilot. Run from the root of the
 repository; it writes peers.csv beside this file::
 
-    python -m benchmarks.information_gain.peers [--seeds 5]
+    python -m benchmarks information_gain.peers [--seeds 5]
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -183,31 +182,34 @@ def measure(world: World, method: Method, num_seeds: int) -> dict[str, object]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Information gain beside pyro's.")
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "peers.csv")
-    parser.add_argument("--only", nargs="*", default=METHODS, help="names of methods")
-    arguments = parser.parse_args()
+def main(
+    *,
+    seeds: int = 5,
+    out: Path = Path(__file__).parent / "peers.csv",
+    only: Sequence[str] = (*METHODS,),
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
+
+    Args:
+        seeds: Seeds, from the first to before the second.
+        out: File of the results.
+        only: Names, or parts of names, that are run; all by default.
+    """
     torch.set_num_threads(1)
     rows = []
     for i, world in enumerate(worlds()):
         for name, (given, method) in METHODS.items():
-            if name not in arguments.only or (i > 0 and name in DEAR):
+            if name not in only or (i > 0 and name in DEAR):
                 continue
-            result = measure(world, method, arguments.seeds)
+            result = measure(world, method, seeds)
             result = {
                 k: f"{v:.4g}" if isinstance(v, float) else str(v)
                 for k, v in result.items()
             }
             rows.append({"case": world.name, "method": name, "given": given} | result)
             print(*rows[-1].values(), sep="  ", flush=True)
-    with arguments.out.open("w", newline="") as file:
+    with out.open("w", newline="") as file:
         writer = csv.DictWriter(file, [*rows[0]])
         writer.writeheader()
         writer.writerows(rows)
     print(as_table([[*map(str, r.values())] for r in rows], [*rows[0]]))
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,6 @@ by the default network, trained on 5,000 rows. Writes result.csv beside this fil
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
 from collections.abc import Callable
@@ -105,16 +104,22 @@ def measure(
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Information gain beside the exact.")
-    parser.add_argument("--seeds", type=int, default=20, help="numerical task")
-    parser.add_argument("--oscillator-seeds", type=int, default=4)
-    arguments = parser.parse_args()
+def main(
+    *,
+    seeds: int = 20,
+    oscillator_seeds: int = 4,
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
+
+    Args:
+        seeds: Seeds, from the first to before the second (numerical task).
+        oscillator_seeds: Number of seeds of the oscillator.
+    """
     torch.set_num_threads(1)
     rows: list[dict[str, object]] = []
     for name, task, belief, exact in worlds():
         heavy = task.name == "oscillator"
-        num_seeds = arguments.oscillator_seeds if heavy else arguments.seeds
+        num_seeds = oscillator_seeds if heavy else seeds
         designer = InformationGainDesigner(task.actions)
         simulators = {
             "noise declared": task.simulator,
@@ -153,7 +158,3 @@ def main() -> None:
         writer.writeheader()
         writer.writerows(rows)
     print(as_table([[str(v) for v in r.values()] for r in rows], [*rows[0]]))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,8 @@
 """Source location finding: information gained in T trials, by policy.
 
-    python -m benchmarks.location_finding.run --policy random --rollouts 64 --trials 30
-    python -m benchmarks.location_finding.run --policy fixed myopic_particles
-    python -m benchmarks.location_finding.run --policy myopic --rollouts 64
+    python -m benchmarks location_finding --policy random --rollouts 64 --trials 30
+    python -m benchmarks location_finding --policy fixed myopic_particles
+    python -m benchmarks location_finding --policy myopic --rollouts 64
 
 Resumable: a roll-out that stands in the CSV is not run again. One row a roll-out, one
 file a policy and number of trials, in benchmarks/location_finding/results; the table of
@@ -12,13 +12,14 @@ draws under every policy, so that policies are compared on paired roll-outs.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 import time
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
@@ -110,7 +111,28 @@ def roll_out(
     return row
 
 
-def run(policy: str, arguments: argparse.Namespace) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        policy: Names of the policies.
+        rollouts: Number of rollouts.
+        first: Number of the first case.
+        trials: Number of trials.
+        contrastive: Number of contrastive draws, L.
+        out: File of the results.
+    """
+
+    policy: Annotated[Sequence[str], POLICIES] = (*POLICIES,)
+    rollouts: int = 64
+    first: int = 0
+    trials: int = 30
+    contrastive: int = CONTRASTIVE
+    out: Path = RESULTS
+
+
+def run(policy: str, arguments: Settings) -> None:
     """Run the roll-outs that are not in the file yet."""
     name = f"{policy}_{arguments.trials}"
     if arguments.contrastive != CONTRASTIVE:
@@ -139,15 +161,8 @@ def run(policy: str, arguments: argparse.Namespace) -> None:
         )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Source location finding.")
-    parser.add_argument("--policy", nargs="+", choices=[*POLICIES], default=[*POLICIES])
-    parser.add_argument("--rollouts", type=int, default=64)
-    parser.add_argument("--first", type=int, default=0, help="number of the first one")
-    parser.add_argument("--trials", type=int, default=30)
-    parser.add_argument("--contrastive", type=int, default=CONTRASTIVE, help="L")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     torch.set_num_threads(1)
     # A belief that rests on few draws says so; its bounds do not rest on it.
     warnings.filterwarnings("ignore", module="sbi_active")
@@ -160,7 +175,3 @@ def main() -> None:
 
 def _short(value: object) -> object:
     return f"{value:.6g}" if isinstance(value, float) else value
-
-
-if __name__ == "__main__":
-    main()

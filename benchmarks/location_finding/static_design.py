@@ -1,6 +1,6 @@
 r"""The static design of T places that tells most, by stochastic gradient ascent.
 
-    python -m benchmarks.location_finding.static_design
+    python -m benchmarks location_finding.static_design
 
 All places are chosen before the first measurement. Ascends the prior contrastive bound
 
@@ -18,7 +18,6 @@ References:
 
 from __future__ import annotations
 
-import argparse
 import csv
 import math
 import time
@@ -98,20 +97,22 @@ def load() -> Tensor:
     return torch.tensor(rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Optimize the static design.")
-    parser.add_argument("--trials", type=int, default=30)
-    parser.add_argument("--steps", type=int, default=600)
-    arguments = parser.parse_args()
+def main(
+    *,
+    trials: int = 30,
+    steps: int = 600,
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
+
+    Args:
+        trials: Number of trials.
+        steps: Steps of the search.
+    """
     torch.set_num_threads(1)
     start = time.process_time()
-    place = optimize(arguments.trials, num_steps=arguments.steps)
+    place = optimize(trials, num_steps=steps)
     with PATH.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["place_x", "place_y"])
         writer.writerows([f"{v:.5f}" for v in row] for row in place.tolist())
     print(f"{PATH.name}: {time.process_time() - start:.0f} CPU s")
-
-
-if __name__ == "__main__":
-    main()

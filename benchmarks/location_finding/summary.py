@@ -1,11 +1,10 @@
 """The table of location finding: every policy, paired differences, published figures.
 
-python -m benchmarks.location_finding.summary
+python -m benchmarks location_finding.summary
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
 from pathlib import Path
 
@@ -110,13 +109,15 @@ def table(folder: Path, num_trials: int, num_contrastive: int) -> str:
     return "\n".join([as_table(cells, header), *lines])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Table of location finding.")
-    parser.add_argument("--trials", type=int, default=30)
-    parser.add_argument("--contrastive", type=int, default=FULL)
-    arguments = parser.parse_args()
-    print(table(RESULTS, arguments.trials, arguments.contrastive))
+def main(
+    *,
+    trials: int = 30,
+    contrastive: int = FULL,
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
 
-
-if __name__ == "__main__":
-    main()
+    Args:
+        trials: Number of trials.
+        contrastive: Number of contrastive draws, L.
+    """
+    print(table(RESULTS, trials, contrastive))

@@ -1,7 +1,7 @@
 """The ball and hoop: what a motor of first order lacks, from three records.
 
-    python -m benchmarks.measured.ball_and_hoop --data DIR
-    python -m benchmarks.measured.ball_and_hoop --data DIR --clean 0 --reports reports
+    python -m benchmarks measured.ball_and_hoop --data DIR
+    python -m benchmarks measured.ball_and_hoop --data DIR --clean 0 --reports reports
 
 ``DIR`` holds ``random_steps.csv``, ``fixed_steps.csv`` and ``closed_loop.csv``. The
 first 3,000 samples of the first are fitted, in ten trials of 30 s that start at a speed
@@ -25,8 +25,6 @@ alone.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +33,9 @@ import torch
 from benchmarks.measured.hoop_least_squares import fit_hoop, free_run, run_pieces
 from benchmarks.measured.record_stages import (
     Bench,
+    Settings,
     as_row,
-    run_command,
+    run_settings,
     with_error,
 )
 from sbi_active.criticism import Trials
@@ -113,10 +112,6 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(settings: Settings) -> int:
     """Run the stages that are missing from the results, and print the tables."""
-    return run_command(argv, __doc__, ball_and_hoop, make_bench, RESULT)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return run_settings(settings, ball_and_hoop, make_bench, RESULT)

@@ -1,6 +1,6 @@
 """Falling balls: what gravity alone lacks, from real drops of eleven balls.
 
-``python -m benchmarks.measured.ball_drops --data DIR`` compares the simulator of
+``python -m benchmarks measured.ball_drops --data DIR`` compares the simulator of
 ``sbi_active.tasks.ball_drops`` with the two drops of every ball, writes one row a ball
 and one a fold to ``results/ball_drops.json``, and prints the tables. A fold is fitted
 to one drop and the first 0.8 s of the other; it chooses its own verdict, and is scored
@@ -10,7 +10,6 @@ on the rest. Rows that are there are kept. ``--figures DIR`` draws, and
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -134,49 +133,56 @@ def _found(tracing: Tracing) -> dict[str, Any]:
     }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run what is missing from the results, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--figures", type=Path, help="folder for the figures")
-    parser.add_argument("--reports", type=Path, help="folder for reports")
-    parser.add_argument("--balls", nargs="+", help="some of them")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
+def main(
+    *,
+    data: Path = DATA,
+    out: Path = RESULT,
+    figures: Path | None = None,
+    reports: Path | None = None,
+    balls: Sequence[str] | None = None,
+    seed: int = 0,
+) -> int:
+    """Run what is missing from the results, and print the tables.
+
+    Args:
+        data: Folder of the measured set.
+        out: File of the results.
+        figures: Folder for the figures.
+        reports: Folder for whole reports.
+        balls: Names of balls; all by default.
+        seed: Seed of the engine.
+    """
     try:
-        drops = read_drops(arguments.data)
+        drops = read_drops(data)
     except FileNotFoundError as error:
         print(f"{error}, as in --data DIR", file=sys.stderr)
         return 2
     rows: dict[str, Any] = {}
-    if arguments.out.is_file():
-        rows = json.loads(arguments.out.read_text())
+    if out.is_file():
+        rows = json.loads(out.read_text())
     by_ball: dict[str, list[Drop]] = {}
     for drop in drops:
         by_ball.setdefault(drop.ball, []).append(drop)
     for ball, pair in by_ball.items():
-        if arguments.balls and ball not in arguments.balls:
+        if balls and ball not in balls:
             continue
         for key in (ball, f"{ball} 1", f"{ball} 2"):
             if key in rows:
                 continue
             if key == ball:
-                rows[key] = judge(pair, seed=arguments.seed)
+                rows[key] = judge(pair, seed=seed)
             else:
                 tested = int(key[-1]) - 1
-                rows[key], _ = score(
-                    pair[1 - tested], pair[tested], seed=arguments.seed
-                )
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
+                rows[key], _ = score(pair[1 - tested], pair[tested], seed=seed)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            out.write_text(json.dumps(rows, indent=1) + "\n")
     print(tables([*rows.values()]))
-    if arguments.figures is not None:
-        _draw(rows, by_ball, arguments.figures, seed=arguments.seed)
-    if arguments.reports is not None:
-        for ball in arguments.balls or by_ball:
-            loop = _criticism(trials_of(by_ball[ball]), arguments.seed)
-            print(loop.report(evaluate=False).save(arguments.reports / ball))
+    if figures is not None:
+        _draw(rows, by_ball, figures, seed=seed)
+    if reports is not None:
+        for ball in balls or by_ball:
+            loop = _criticism(trials_of(by_ball[ball]), seed)
+            print(loop.report(evaluate=False).save(reports / ball))
     return 0
 
 
@@ -195,7 +201,3 @@ def _draw(
         folder / "forecasts.png",
         until=UNTIL,
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """The cascaded tanks: what Torricelli's law lacks, from two records.
 
-    python -m benchmarks.measured.cascaded_tanks --data DIR
-    python -m benchmarks.measured.cascaded_tanks --data DIR --clean 0 --reports reports
+    python -m benchmarks measured.cascaded_tanks --data DIR
+    python -m benchmarks measured.cascaded_tanks --data DIR --clean 0 --reports reports
 
 ``DIR`` holds ``estimation.csv`` and ``validation.csv``. The first is fitted, in six
 trials of 600 s that run for 400 s before; the second is scored after its first 50
@@ -13,8 +13,6 @@ squares fits the same pieces, and beside them the first record as a whole.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +20,9 @@ import torch
 
 from benchmarks.measured.record_stages import (
     Bench,
+    Settings,
     as_row,
-    run_command,
+    run_settings,
     with_error,
 )
 from benchmarks.measured.tanks_least_squares import (
@@ -108,10 +107,6 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(settings: Settings) -> int:
     """Run the stages that are missing from the results, and print the tables."""
-    return run_command(argv, __doc__, cascaded_tanks, make_bench, RESULT)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return run_settings(settings, cascaded_tanks, make_bench, RESULT)

@@ -1,7 +1,7 @@
 """The Go2's legs: what rigid legs with friction lack, from one record in the air.
 
-    python -m benchmarks.measured.go2 --data DIR
-    python -m benchmarks.measured.go2 --data DIR --legs FL --figures docs/measured_go2
+    python -m benchmarks measured.go2 --data DIR
+    python -m benchmarks measured.go2 --data DIR --legs FL --figures docs/measured_go2
 
 ``DIR`` holds ``go2_in_air.xml`` and ``trajectory.csv``: 13 triangles of all joints,
 from 3.0 to 0.6 s. Each leg is fitted to the first eight and judged on the five faster
@@ -21,13 +21,13 @@ Beside the verdicts plain least squares, given the same effects.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from benchmarks.criticism.scores import counted
 from benchmarks.measured.go2_least_squares import fit_leg
@@ -134,18 +134,29 @@ def _row(tracing: Tracing) -> dict[str, Any]:
     }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        data: Folder of the measured set.
+        legs: Names of legs.
+        stages: Names of the stages, as in 'removed', 'rigid legs'.
+        out: File of the results.
+        figures: Folder for the figures.
+        seed: Seed of the engine.
+    """
+
+    data: Path = DATA
+    legs: Annotated[Sequence[str], LEGS] = (*LEGS,)
+    stages: Sequence[str] | None = None
+    out: Path = RESULT
+    figures: Path | None = None
+    seed: int = 0
+
+
+def main(arguments: Settings) -> int:
     """Run the stages that are missing from the results, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--legs", nargs="+", choices=LEGS, default=LEGS)
-    parser.add_argument("--stages", nargs="+", help="as in 'removed', 'rigid legs'")
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--figures", type=Path, help="folder for the figure")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
     try:
         legs = [read_leg(arguments.data, name) for name in arguments.legs]
     except FileNotFoundError as error:
@@ -227,7 +238,3 @@ def _least_squares(leg: Leg, sets: Sequence[tuple[str, ...]]) -> dict[str, Any]:
             leg, parameters, [effects[name] for name in each]
         )
     return found
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """What the ball and hoop's verdict owes to the prior of the offset of its input.
 
-    python -m benchmarks.measured.hoop_offset --data DIR
+    python -m benchmarks measured.hoop_offset --data DIR
 
 The hoop turns one way only in the samples that are fitted, so that dry friction and a
 dead zone are an offset of the input there. The verdict on the whole library, as in
@@ -11,10 +11,8 @@ is missing is run.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,19 +50,22 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run what is missing from the results, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--out", type=Path, default=RESULT)
-    arguments = parser.parse_args(argv)
-    rows = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {}
+def main(
+    *,
+    data: Path = DATA,
+    out: Path = RESULT,
+) -> int:
+    """Run what is missing from the results, and print the table.
+
+    Args:
+        data: Folder of the measured set.
+        out: File of the results.
+    """
+    rows = json.loads(out.read_text()) if out.is_file() else {}
     wanted = {f"{sd:g} {every}": (sd, every) for sd in SDS for every in EVERY}
     missing = {name: pair for name, pair in wanted.items() if name not in rows}
     try:
-        records = read_recordings(arguments.data) if missing else {}
+        records = read_recordings(data) if missing else {}
     except FileNotFoundError as error:
         print(f"{error}, as in --data DIR", file=sys.stderr)
         return 2
@@ -72,11 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         bench = make_bench(records, every=every)
         row = judge(replace(bench, prior=make_prior(offset_sd=sd)))
         rows[name] = {"offset_sd": sd, "every": every, **row}
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(rows, indent=1) + "\n")
     print(table({name: rows[name] for name in wanted}))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
@@ -36,7 +35,8 @@ __all__ = [
     "Bench",
     "aliases",
     "judge",
-    "run_command",
+    "Settings",
+    "run_settings",
     "run_stages",
     "said",
     "table",
@@ -97,18 +97,36 @@ class Bench:
         )
 
 
-def run_command(
-    argv: Sequence[str] | None,
-    text: str | None,
-    task: Any,
-    make_bench: Callable[..., Bench],
-    out: Path,
+@dataclass(frozen=True)
+class Settings:
+    """What is run of a task with records.
+
+    Args:
+        data: Folder of the measured set; the task's by default.
+        every: Stride of the readings that are kept; the task's by default.
+        clean: Number of clean sets.
+        full: Number of sets with what helps.
+        out: File of the results; the task's by default.
+        reports: Folder for whole reports.
+        seed: Seed of the engine.
+    """
+
+    data: Path | None = None
+    every: int | None = None
+    clean: int = 10
+    full: int = 0
+    out: Path | None = None
+    reports: Path | None = None
+    seed: int = 0
+
+
+def run_settings(
+    settings: Settings, task: Any, make_bench: Callable[..., Bench], out: Path
 ) -> int:
     """Run the stages that are missing from a file of results, and print the tables.
 
     Args:
-        argv: The command line; None is the process's own.
-        text: That ``--help`` shows.
+        settings: What is run.
         task: A package with records.
         make_bench: ``make_bench(records, every=)``.
         out: The file, unless one is given.
@@ -116,30 +134,18 @@ def run_command(
     Returns:
         The process's exit status.
     """
-    parser = argparse.ArgumentParser(
-        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=task.DATA)
-    every = task.recordings.EVERY
-    parser.add_argument("--every", type=int, default=every, help="readings kept")
-    parser.add_argument("--clean", type=int, default=10, help="clean sets")
-    parser.add_argument("--full", type=int, default=0, help="sets with what helps")
-    parser.add_argument("--out", type=Path, default=out)
-    parser.add_argument("--reports", type=Path, help="folder for whole reports")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
     try:
-        records = task.read_recordings(arguments.data)
+        records = task.read_recordings(settings.data or task.DATA)
     except FileNotFoundError as error:
         print(f"{error}, as in --data DIR", file=sys.stderr)
         return 2
     rows = run_stages(
-        make_bench(records, every=arguments.every),
-        arguments.out,
-        clean=arguments.clean,
-        full=arguments.full,
-        seed=arguments.seed,
-        reports=arguments.reports,
+        make_bench(records, every=settings.every or task.recordings.EVERY),
+        settings.out or out,
+        clean=settings.clean,
+        full=settings.full,
+        seed=settings.seed,
+        reports=settings.reports,
     )
     print(table(rows, "V"))
     return 0

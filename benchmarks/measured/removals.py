@@ -1,8 +1,8 @@
 """What is named when the effect that is there was removed: the servo and the balls.
 
-    python -m benchmarks.measured.removals --set servo
-    python -m benchmarks.measured.removals --set balls
-    python -m benchmarks.measured.removals --table
+    python -m benchmarks measured.removals --set servo
+    python -m benchmarks measured.removals --set balls
+    python -m benchmarks measured.removals --summary
 
 The hoop and the tanks have such stages in their own commands
 (:mod:`benchmarks.measured.record_stages`). The servo is judged by its twelve powered
@@ -16,14 +16,14 @@ removed. An *alias* is an effect that is named then. Each row is added to
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from benchmarks.measured.record_stages import SHARE_LEFT
 from sbi_active.criticism import Criticism, Effect
@@ -146,21 +146,31 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        set: Name of the measured set.
+        data: Folder of the measured set.
+        out: File of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+        seed: Seed of the engine.
+    """
+
+    set: Literal["servo", "balls"] | None = None
+    data: Path | None = None
+    out: Path = RESULT
+    summary: bool = False
+    seed: int = 0
+
+
+def main(arguments: Settings) -> int:
     """Run the removals that are missing from the results, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--set", choices=["servo", "balls"])
-    parser.add_argument("--data", type=Path, help="of the set")
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--table", action="store_true", help="run nothing")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
     rows: dict[str, Any] = {}
     if arguments.out.is_file():
         rows = json.loads(arguments.out.read_text())
-    if arguments.set and not arguments.table:
+    if arguments.set and not arguments.summary:
         jobs, data = (_servo, SERVO) if arguments.set == "servo" else (_balls, BALLS)
         try:
             todo = [*jobs(arguments.data or data)]
@@ -178,7 +188,3 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{key}: {rows[key]['verdict']}, {spent:.0f} CPU s", flush=True)
     print(table(rows))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

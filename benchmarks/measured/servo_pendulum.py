@@ -1,6 +1,6 @@
 """The servo pendulum: what a motor without friction lacks, from recorded trials.
 
-``python -m benchmarks.measured.servo_pendulum --data DIR`` compares the simulator of
+``python -m benchmarks measured.servo_pendulum --data DIR`` compares the simulator of
 ``sbi_active.tasks.servo_pendulum`` with the recorded trials in stages, adds each to
 ``results/servo_pendulum.json`` unless it is there, and prints the tables. Stages:
 
@@ -18,14 +18,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -198,18 +197,33 @@ def _chosen(row: dict[str, Any], off: Sequence[int]) -> int:
     return int(off[int(np.argmax(np.array(row["gain"])[[*off]]))])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        data: Folder of the measured set.
+        replay: Sets to replay.
+        clean: Number of clean sets.
+        fit: Numbers of the trials to fit alone.
+        out: File of the results.
+        reports: Folder for whole reports.
+        figures: Folder for the figures.
+        seed: Seed of the engine.
+    """
+
+    data: Path = DATA
+    replay: Literal["recorded", "clean"] = "recorded"
+    clean: int = NUM_CLEAN
+    fit: Sequence[int] | None = None
+    out: Path = RESULT
+    reports: Path | None = None
+    figures: Path | None = None
+    seed: int = 0
+
+
+def main(arguments: Settings) -> int:
     """Run the stages that are missing from the results, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--replay", choices=["recorded", "clean"], default="recorded")
-    parser.add_argument("--clean", type=int, default=NUM_CLEAN, help="clean sets")
-    parser.add_argument("--fit", type=int, nargs="+", help="these trials alone")
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--reports", type=Path, help="folder for whole reports")
-    parser.add_argument("--figures", type=Path, help="folder for the figure")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args(argv)
     try:
         task = ServoPendulumTask(data=arguments.data)
     except FileNotFoundError as error:
@@ -279,7 +293,3 @@ def _stages(task: ServoPendulumTask, rows: dict[str, Any], arguments: Any) -> An
     ):
         if name not in rows:
             yield name, run(name, iid, *parts)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """What tells a cause from an effect that imitates what nobody declared.
 
-    python -m benchmarks.misfit.odds --group own --kind E --first 700 --cases 10
-    python -m benchmarks.misfit.odds --table
+    python -m benchmarks misfit.odds --group own --kind E --first 700 --cases 10
+    python -m benchmarks misfit.odds --summary
 
 Each effect that a verdict says helps is a claim, with the factors of its odds
 (:class:`sbi_active.criticism.under_misfit.Odds`) and whether it is there. The table
@@ -15,11 +15,11 @@ nothing helps leave a row without an effect.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
+from benchmarks.misfit.cases import FIRST_JUDGED, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
 from benchmarks.rows import append, read
 from sbi_active.criticism import close_loop
@@ -145,24 +145,35 @@ def _scores(right: NDArray[np.int64], p: NDArray[np.float64]) -> str:
     return f"{roc_auc_score(right, p):.3f} | {brier_score_loss(right, p):.3f}"
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        group: Group of worlds; all by default.
+        kind: Kind of cases; all by default.
+        first: Number of the first case.
+        cases: Number of cases.
+        out: File of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    group: Annotated[str, GROUPS] = "own"
+    kind: Kind = "E"
+    first: int = 700
+    cases: int = 10
+    out: Path = RESULT
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run the cases that are asked for and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--group", choices=[*GROUPS], default="own")
-    parser.add_argument("--kind", choices=KINDS, default="E")
-    parser.add_argument("--first", type=int, default=700)
-    parser.add_argument("--cases", type=int, default=10)
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--table", action="store_true", help="run nothing")
-    arguments = parser.parse_args(argv)
-    if not arguments.table:
+    if not arguments.summary:
         _run(arguments)
     print("\n".join(table(read(arguments.out))))
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: Settings) -> None:
     group, kind = arguments.group, arguments.kind
     numbers = range(arguments.first, arguments.first + arguments.cases)
     if numbers.stop > FIRST_JUDGED:
@@ -180,7 +191,3 @@ def _run(arguments: argparse.Namespace) -> None:
             row["effect"]: round(row["cause"], 2) for row in rows if "effect" in row
         }
         print(f"{group} {kind} {number}: {json.dumps(said)}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

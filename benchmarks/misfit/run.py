@@ -1,9 +1,9 @@
 """The closed loop where every model is wrong, on worlds whose truth is known.
 
-    python -m benchmarks.misfit.run --group own --kind E --first 1000 --cases 40
-    python -m benchmarks.misfit.run --group letters --first 1000 --cases 40
-    python -m benchmarks.misfit.run --summary --first 1000
-    python -m benchmarks.misfit.run --truth --kind E --cases 12
+    python -m benchmarks misfit --group own --kind E --first 1000 --cases 40
+    python -m benchmarks misfit --group letters --first 1000 --cases 40
+    python -m benchmarks misfit --summary --first 1000
+    python -m benchmarks misfit --truth --kind E --cases 12
 
 Machines have a declared sensor, wide priors, about nine declared effects, and a smooth
 discrepancy of 2 to 10 sensor deviations that nobody declared. Kinds: E, an effect
@@ -24,8 +24,9 @@ the cases and runs no loop.
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
@@ -77,18 +78,29 @@ def print_truth(group: str, kind: Kind, first: int, cases: int) -> None:
         )
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        group: Group of worlds; all by default.
+        kind: Kind of cases; all by default.
+        first: Number of the first case.
+        cases: Number of cases.
+        summary: Whether to run nothing, and print the table of the rows.
+        truth: Way to a truth (print cases, run nothing).
+    """
+
+    group: Annotated[str | None, GROUPS] = None
+    kind: Kind | None = None
+    first: int = FIRST_JUDGED
+    cases: int = 40
+    summary: bool = False
+    truth: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run what is asked for and print the summary."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--group", choices=[*GROUPS])
-    parser.add_argument("--kind", choices=KINDS)
-    parser.add_argument("--first", type=int, default=FIRST_JUDGED)
-    parser.add_argument("--cases", type=int, default=40)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    parser.add_argument("--truth", action="store_true", help="print cases, run nothing")
-    arguments = parser.parse_args()
     groups = (arguments.group,) if arguments.group else (*GROUPS,)
     kinds = (arguments.kind,) if arguments.kind else KINDS
     is_judged = arguments.first >= FIRST_JUDGED
@@ -107,7 +119,3 @@ def main() -> None:
             print(f"\n## {group}, {seeds} seeds", *summary(rows), sep="\n")
     if len(groups) > 1 and pooled:
         print(f"\n## {' and '.join(groups)}, {seeds} seeds", *summary(pooled), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """A trajectory verdict with a start state in each trial: what it costs.
 
-    python -m benchmarks.misfit.start_states --first 1000 --cases 10
-    python -m benchmarks.misfit.start_states --summary
+    python -m benchmarks misfit.start_states --first 1000 --cases 10
+    python -m benchmarks misfit.start_states --summary
 
 A pendulum driven by a sine: two parameters, eight declared effects, twelve trials of 30
 samples, and the angle and the speed at which a trial starts as nuisances of each. Each
@@ -17,7 +17,6 @@ results/start_states.csv is not run again.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -230,17 +229,27 @@ def summary(rows: Sequence[dict[str, str]]) -> list[str]:
     return lines
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        first: Number of the first case.
+        cases: Number of cases.
+        out: File of the results.
+        bare: Whether no force is hidden.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    first: int = 1000
+    cases: int = 10
+    out: Path = PATH
+    bare: bool = False
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run the cases that are missing and print the summary."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--first", type=int, default=1000)
-    parser.add_argument("--cases", type=int, default=10)
-    parser.add_argument("--out", type=Path, default=PATH)
-    parser.add_argument("--bare", action="store_true", help="no hidden force")
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args(argv)
     done = {(int(r["case"]), r["hidden"]) for r in read(arguments.out)}
     last = arguments.first if arguments.summary else arguments.first + arguments.cases
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
@@ -252,7 +261,3 @@ def main(argv: Sequence[str] | None = None) -> None:
             append(arguments.out, COLUMNS, [row])
             print(*(f"{k} {row[k]}," for k in COLUMNS), flush=True)
     print(*summary(read(arguments.out)), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """The limit of the numerical model: exact posteriors, actions exact or at random.
 
-    python -m benchmarks.numerical.exact
-    python -m benchmarks.numerical.exact --summary
+    python -m benchmarks numerical.exact
+    python -m benchmarks numerical.exact --summary
 
 200 trials of four rounds at theta_true = (-3, 1), seeds 0 to 199 (nothing is tuned).
 One row a trial and way of choosing, in benchmarks/numerical/results/exact.csv.
@@ -9,7 +9,6 @@ One row a trial and way of choosing, in benchmarks/numerical/results/exact.csv.
 
 from __future__ import annotations
 
-import argparse
 import csv
 
 import numpy as np
@@ -25,12 +24,14 @@ FIELDS = ["actions", "seed", *(f"log_prob_{r + 1}" for r in range(NUM_ROUNDS))]
 FIELDS += ["rep_err_-3", "rep_err_0", "rep_err_3"]
 
 
-def main() -> None:
-    """Run what is missing and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--summary", action="store_true", help="run nothing")
+def main(*, summary: bool = False) -> None:
+    """Run what is missing and print the table.
+
+    Args:
+        summary: Whether to run nothing, and print the table of the rows.
+    """
     torch.set_num_threads(1)
-    if not parser.parse_args().summary:
+    if not summary:
         task = get_task("numerical")
         actions = task.actions.values
         with (RESULTS / "exact.csv").open("w", newline="") as file:
@@ -52,7 +53,3 @@ def main() -> None:
                     file.flush()
     for name, values in exact_limits().items():
         print(name, *values, sep="  ")
-
-
-if __name__ == "__main__":
-    main()

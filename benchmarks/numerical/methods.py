@@ -1,7 +1,7 @@
 """Table 1 of the paper: five methods on the numerical model, at equal simulations.
 
-    python -m benchmarks.numerical.methods --setting faithful --trials 10
-    python -m benchmarks.numerical.methods --setting default --methods asbi alhi
+    python -m benchmarks numerical.methods --setting faithful --trials 10
+    python -m benchmarks numerical.methods --setting default --methods asbi alhi
 
 Every simulation counts: to train on, for the information gain, to refine a belief and
 to score a trial. "faithful" has each method as its authors do, 54,000 simulations a
@@ -20,11 +20,11 @@ method and setting, in benchmarks/numerical/results.
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -156,13 +156,25 @@ def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Table 1 of the paper.")
-    parser.add_argument("--methods", nargs="*", default=[*METHODS], choices=[*METHODS])
-    parser.add_argument("--setting", choices=["faithful", "default"], default="default")
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        methods: Names of methods.
+        setting: Name of the settings.
+        trials: Number of trials.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    methods: Annotated[Sequence[str], METHODS] = (*METHODS,)
+    setting: Literal["faithful", "default"] = "default"
+    trials: int = 10
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
     table = []
@@ -181,7 +193,3 @@ def main() -> None:
     header += ["gap: median mean", "mean regret, round 1 / 2 / ..", "C2ST"]
     header += ["simulations a round", "CPU s a round"]
     print(as_table(table, header))
-
-
-if __name__ == "__main__":
-    main()

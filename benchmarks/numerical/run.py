@@ -11,13 +11,12 @@ setting, in benchmarks/numerical/results; the table is printed at the end.
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -71,8 +70,33 @@ def reference(task: Task, trials: Sequence[Trial]) -> Any:
     return task.reference(torch.stack([t.action for t in trials]), x)
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        task: Name of the task.
+        truth: Way to a truth.
+        trials: Number of trials.
+        rounds: Number of rounds.
+        methods: Names of methods.
+        settings: Names of the settings.
+        jitter: Relative error of executed actions.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    task: Annotated[str, [*NUMERICAL, "oscillator"]] = "linear"
+    truth: Literal["fixed", "random"] = "fixed"
+    trials: int = 20
+    rounds: int = 4
+    methods: Sequence[str] = ("asbi", "nsbi")
+    settings: Sequence[str] = ("faithful", "default")
+    jitter: float = 0.0
+    summary: bool = False
+
+
 def run_trial(
-    task: Task, method: str, setting: str, seed: int, arguments: argparse.Namespace
+    task: Task, method: str, setting: str, seed: int, arguments: Settings
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
     campaign = Campaign(
@@ -148,7 +172,7 @@ def round_row(
     return row
 
 
-def run_setting(arguments: argparse.Namespace, method: str, setting: str) -> list[dict]:
+def run_setting(arguments: Settings, method: str, setting: str) -> list[dict]:
     """Run the trials that are not in the file yet and return all its rows."""
     name = f"{arguments.task}_{arguments.truth}_{setting}_{method}"
     name += f"_jitter_{arguments.jitter:g}" if arguments.jitter else ""
@@ -237,19 +261,8 @@ def notes(rows: list[dict[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Campaigns beside the exact limit.")
-    parser.add_argument("--task", choices=[*NUMERICAL, "oscillator"], default="linear")
-    parser.add_argument("--truth", choices=["fixed", "random"], default="fixed")
-    parser.add_argument("--trials", type=int, default=20)
-    parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--methods", nargs="*", default=["asbi", "nsbi"])
-    parser.add_argument("--settings", nargs="*", default=["faithful", "default"])
-    parser.add_argument(
-        "--jitter", type=float, default=0.0, help="relative error of executed actions"
-    )
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     warnings.filterwarnings("ignore", message="the executed action")
     torch.set_num_threads(1)
 
@@ -268,7 +281,3 @@ def main() -> None:
         table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in beside.items()]
     print(as_table(table, header), end="\n\n")
     print("\n".join(lines))
-
-
-if __name__ == "__main__":
-    main()

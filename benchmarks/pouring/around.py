@@ -1,7 +1,7 @@
 r"""A reference posterior of whole campaigns, from many pours around the truth.
 
-    python -m benchmarks.pouring.around --bank FOLDER --target 1 --rows 200
-    python -m benchmarks.pouring.around --summary
+    python -m benchmarks pouring.around --bank FOLDER --target 1 --rows 200
+    python -m benchmarks pouring.around --summary
 
 How far is the belief of a campaign from what its images can tell? Around the final
 beliefs of a target's campaigns, in a box that holds nearly all of them, parameters are
@@ -22,12 +22,11 @@ has an error. Resumable; one row a campaign, in ``results/around.csv``.
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -338,26 +337,36 @@ def run_missing(
             print(row, flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="A reference of whole campaigns.")
-    parser.add_argument("--bank", type=Path, help="folder of pours")
-    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
-    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
-    parser.add_argument("--rows", type=int, default=200, help="pours an action")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        bank: Folder of pours.
+        learned: File that keeps what is learned of the pours.
+        target: Target of the paper; both by default.
+        rows: Number of rows (pours an action).
+        results: Folder of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    bank: Path | None = None
+    learned: Path | None = None
+    target: Literal["1", "2"] | None = None
+    rows: int = 200
+    results: Path = RESULTS
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     torch.set_num_threads(1)
     if not arguments.summary:
         if arguments.bank is None:
-            parser.error("expected --bank FOLDER; got none; make one, see bank.py")
+            raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
         learned = kept(arguments.bank, arguments.learned)
         for target in [arguments.target] if arguments.target else ["1", "2"]:
             run_missing(
                 arguments.bank, learned, target, arguments.rows, arguments.results
             )
     print(summarize(read(arguments.results / "around.csv")))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,9 @@
 """Pours from the prior, kept as poses: what a first round may cost nothing of.
 
-    python -m benchmarks.pouring.bank FOLDER --rows 2300             # 27 actions
-    python -m benchmarks.pouring.bank FOLDER --part likely --rows 150
-    python -m benchmarks.pouring.bank FOLDER --part repeats --rows 100
-    python -m benchmarks.pouring.bank FOLDER --report
+    python -m benchmarks pouring.bank FOLDER --rows 2300             # 27 actions
+    python -m benchmarks pouring.bank FOLDER --part likely --rows 150
+    python -m benchmarks pouring.bank FOLDER --part repeats --rows 100
+    python -m benchmarks pouring.bank FOLDER --report
 
 A part ``likely`` pours at the actions that designs choose most alone, and is learned
 from as ``prior`` is; ``repeats`` pours each theta five times at one action, half of
@@ -17,14 +17,13 @@ cubes is 2.8 kB of poses.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -179,46 +178,41 @@ def report(folder: Path, part: str) -> str:
     return f"{part}: {len(rows)} pours, {seconds:.3f} CPU s each at the mean"
 
 
-def run_command(
-    description: str,
-    option: str,
-    names: Sequence[str],
-    num: int,
-    pours_and_draw: Callable[[str], tuple[Pours, Draw]],
-) -> None:
-    """Fill a part of a folder as the command line says, and print what it holds.
+@dataclass(frozen=True)
+class Filling:
+    """What is poured.
 
     Args:
-        description: Of the command.
-        option: That names the part, such as "part".
-        names: Of the parts, the first of which is the default.
-        num: Rows by default.
-        pours_and_draw: Returns, of a part, what pours it and what draws its rows.
+        folder: Folder of the pours.
+        part: Name of the part.
+        rows: Number of rows.
+        share: Share of the files that is poured, as in 0/2 and 1/2.
+        report: Whether to simulate nothing, and print what the folder holds.
     """
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument(
-        f"--{option}", dest="part", choices=[*names], default=[*names][0]
-    )
-    parser.add_argument("--rows", type=int, default=num)
-    parser.add_argument("--share", default="0/1", help="which, of how many (0/1)")
-    parser.add_argument("--report", action="store_true", help="simulate nothing")
-    arguments = parser.parse_args()
+
+    folder: Path
+    part: Annotated[str, PARTS] = PARTS[0]
+    rows: int = 6_000
+    share: str = "0/1"
+    report: bool = False
+
+
+def run_filling(filling: Filling, pours: Pours, drawn: Draw) -> None:
+    """Fill a part of a folder, and print what it holds.
+
+    Args:
+        filling: What is poured.
+        pours: What pours rows.
+        drawn: What draws them.
+    """
     torch.set_num_threads(1)
-    if not arguments.report:
-        mine, of = map(int, arguments.share.split("/"))
-        pours, drawn = pours_and_draw(arguments.part)
-        fill(arguments.folder, arguments.part, arguments.rows, (mine, of), pours, drawn)
-    print(report(arguments.folder, arguments.part))
+    if not filling.report:
+        mine, of = map(int, filling.share.split("/"))
+        fill(filling.folder, filling.part, filling.rows, (mine, of), pours, drawn)
+    print(report(filling.folder, filling.part))
 
 
-def main() -> None:
-    def pours_and_draw(_: str) -> tuple[Pours, Draw]:
-        task: Any = get_task("pouring")
-        return task.pours, partial(draw, task)
-
-    run_command("Pours from the prior, as poses.", "part", PARTS, 6_000, pours_and_draw)
-
-
-if __name__ == "__main__":
-    main()
+def main(filling: Filling) -> None:
+    """Pour from the prior, as poses."""
+    task: Any = get_task("pouring")
+    run_filling(filling, task.pours, partial(draw, task))

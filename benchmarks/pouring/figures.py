@@ -1,11 +1,10 @@
 """The paper's Figures 11 and 12 as pictures, from the committed rows.
 
-python -m benchmarks.pouring.figures docs/images
+python -m benchmarks pouring.figures docs/images
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -115,10 +114,12 @@ def selected_figure(results: Path = RESULTS) -> Any:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Figures 11 and 12.")
-    parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
+def main(folder: Path) -> None:
+    """Draw figures 11 and 12.
+
+    Args:
+        folder: Folder to write to.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     figures = {
         "log_prob.png": log_prob_figure(),
@@ -126,7 +127,3 @@ def main() -> None:
     }
     for name, figure in figures.items():
         save(figure, str(folder / name))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 r"""A campaign's belief refined by pours around it, beside the reference.
 
-    python -m benchmarks.pouring.refined --bank FOLDER --target 2 --pours 100
-    python -m benchmarks.pouring.refined --summary
+    python -m benchmarks pouring.refined --bank FOLDER --target 2 --pours 100
+    python -m benchmarks pouring.refined --summary
 
 After its last round a campaign pours parameters drawn uniformly in a box about its own
 belief, 100 at each action that it chose, and learns the likelihoods of these actions
@@ -17,9 +17,9 @@ Resumable; one row a campaign, in ``results/refined.csv``.
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -194,8 +194,33 @@ def summarize(rows: list[dict[str, str]]) -> str:
     return as_table(table, [*header, "pours, CPU s"])
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        bank: Folder of pours.
+        learned: File that keeps what is learned of the pours.
+        target: Target of the paper; both by default.
+        rows: Number of rows (of the reference).
+        pours: Number of pours an action.
+        trials: Number of trials.
+        results: Folder of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    bank: Path | None = None
+    learned: Path | None = None
+    target: Literal["1", "2"] | None = None
+    rows: int = 200
+    pours: int = 100
+    trials: int = 5
+    results: Path = RESULTS
+    summary: bool = False
+
+
 def run_missing(
-    bank: Path, learned: ByAction, target: str, arguments: argparse.Namespace
+    bank: Path, learned: ByAction, target: str, arguments: Settings
 ) -> None:
     """Make the rows of a target that are missing."""
     task: Any = get_task("pouring", target=int(target))
@@ -225,26 +250,13 @@ def run_missing(
             print(row, flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Beliefs refined by pours.")
-    parser.add_argument("--bank", type=Path, help="folder of pours")
-    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
-    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
-    parser.add_argument("--rows", type=int, default=200, help="of the reference")
-    parser.add_argument("--pours", type=int, default=100, help="an action")
-    parser.add_argument("--trials", type=int, default=5)
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     torch.set_num_threads(1)
     if not arguments.summary:
         if arguments.bank is None:
-            parser.error("expected --bank FOLDER; got none; make one, see bank.py")
+            raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
         learned = kept(arguments.bank, arguments.learned)
         for target in [arguments.target] if arguments.target else ["1", "2"]:
             run_missing(arguments.bank, learned, target, arguments)
     print(summarize(read(arguments.results / "refined.csv")))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """How far repeats of an action are to be trusted: the share c of ``likelihood``.
 
-    python -m benchmarks.pouring.bank FOLDER --part repeats --rows 100
-    python -m benchmarks.pouring.repeats --bank FOLDER
+    python -m benchmarks pouring.bank FOLDER --part repeats --rows 100
+    python -m benchmarks pouring.repeats FOLDER
 
 Each theta of the part "repeats" was poured five times at one action. The table says,
 by c and by the number of repeats, the mean log density of theta and how often it is
@@ -10,9 +10,8 @@ within regions of highest density. It tunes, and judges nothing.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -87,15 +86,21 @@ def repeats_table(bank: Path, learned: ByAction) -> str:
     return as_table(table, ["c", *[f"{num} pours" for num in SHOWN]])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Repeats of an action.")
-    parser.add_argument("--bank", type=Path, required=True, help="folder of pours")
-    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        bank: Folder of pours.
+        learned: File that keeps what is learned of the pours.
+    """
+
+    bank: Path
+    learned: Path | None = None
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     learned = kept(arguments.bank, arguments.learned)
     print("mean log p(theta), share within 50 % region, within 90 %")
     print(repeats_table(arguments.bank, learned))
-
-
-if __name__ == "__main__":
-    main()

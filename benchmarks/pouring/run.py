@@ -1,9 +1,9 @@
 """The paper's Figures 11 and 12: log p(truth) and selected actions by round.
 
-    python -m benchmarks.pouring.run --bank FOLDER                  # both targets
-    python -m benchmarks.pouring.run --bank FOLDER --table coverage --rounds 3
-    python -m benchmarks.pouring.run --bank FOLDER --table bank     # left-out pours
-    python -m benchmarks.pouring.run --summary
+    python -m benchmarks pouring --bank FOLDER                  # both targets
+    python -m benchmarks pouring --bank FOLDER --table coverage --rounds 3
+    python -m benchmarks pouring --bank FOLDER --table bank     # left-out pours
+    python -m benchmarks pouring --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method and target, in ``benchmarks/pouring/results``.
@@ -18,11 +18,12 @@ summary in their place (``network``).
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -107,7 +108,40 @@ def run_trial(
     return rows
 
 
-def known(method: str, arguments: argparse.Namespace) -> ByAction | ByNetwork:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        table: Name of the table.
+        bank: Folder of pours; needed for all but the summary.
+        learned: File that keeps what is learned of the pours.
+        target: Target of the paper; both by default.
+        methods: Names of methods.
+        trials: Number of trials.
+        first: Seed of the first trial.
+        rounds: Number of rounds.
+        results: Folder of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    table: Literal["paper", "coverage", "bank"] = "paper"
+    bank: Path = Path()
+    learned: Path | None = None
+    target: Literal["1", "2"] | None = None
+    methods: Annotated[Sequence[str], METHODS] = (*METHODS,)
+    trials: int = 5
+    first: int = 2_200
+    rounds: int = 6
+    results: Path = RESULTS
+    summary: bool = False
+
+    def __post_init__(self) -> None:
+        if self.bank == Path() and not self.summary:
+            raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
+
+
+def known(method: str, arguments: Settings) -> ByAction | ByNetwork:
     """Return what a method has learned of the bank."""
     path = arguments.learned
     if method not in BY_NETWORK:
@@ -125,7 +159,7 @@ def make_task(target: str, seed: int) -> Any:
         return task.with_truth(task.prior.sample(torch.Size([1]))[0])
 
 
-def path_of(method: str, target: str, arguments: argparse.Namespace) -> Path:
+def path_of(method: str, target: str, arguments: Settings) -> Path:
     """Return the file of a method and target."""
     return arguments.results / f"target_{target}_{method}.csv"
 
@@ -134,7 +168,7 @@ def run_missing(
     method: str,
     target: str,
     learned: ByAction | ByNetwork,
-    arguments: argparse.Namespace,
+    arguments: Settings,
 ) -> None:
     """Run the trials that are not in the file yet."""
     path = path_of(method, target, arguments)
@@ -156,29 +190,8 @@ def run_missing(
         print(f"{path.stem} {seed}: {values}, {spent:.0f} CPU s", flush=True)
 
 
-def parse() -> argparse.Namespace:
-    """Return the arguments."""
-    parser = argparse.ArgumentParser(description="The paper's pouring.")
-    parser.add_argument(
-        "--table", choices=["paper", "coverage", "bank"], default="paper"
-    )
-    parser.add_argument("--bank", type=Path, help="folder of pours")
-    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
-    parser.add_argument("--target", choices=["1", "2"], help="one alone (both)")
-    parser.add_argument("--methods", nargs="*", choices=METHODS, default=[*METHODS])
-    parser.add_argument("--trials", type=int, default=5)
-    parser.add_argument("--first", type=int, default=2_200, help="seed of the first")
-    parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
-    if arguments.bank is None and not arguments.summary:
-        parser.error("expected --bank FOLDER; got none; make one, see bank.py")
-    return arguments
-
-
-def main() -> None:
-    arguments = parse()
+def main(arguments: Settings) -> None:
+    """Run the trials that are not there yet, and print the table."""
     torch.set_num_threads(1)
     is_coverage = arguments.table == "coverage"
     targets = [arguments.target] if arguments.target else ["1", "2"]
@@ -200,7 +213,3 @@ def main() -> None:
             if rows:
                 cells[method, target] = rows
     print(coverage_table(cells) if is_coverage else summarize(cells))
-
-
-if __name__ == "__main__":
-    main()

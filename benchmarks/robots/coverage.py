@@ -1,7 +1,7 @@
 """Coverage of 95 % intervals beside those of ``mujoco.sysid``, in logs with a truth.
 
-    python -m benchmarks.robots.coverage run --machine spring-mass --seeds 2000 2200
-    python -m benchmarks.robots.coverage show [--by-parameter]
+    python -m benchmarks robots.coverage --machine spring-mass --seeds 2000 2200
+    python -m benchmarks robots.coverage --summary [--by-parameter]
 
 Sets are made by :mod:`.machines`: white noise, noise of autocorrelation .9 and .98, and
 white noise beside dry friction that the model lacks. On each set, in one process:
@@ -23,16 +23,16 @@ measured data beside the project; "swimmer" needs gymnasium, whose MJCF it is, a
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import copy
 import io
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -128,7 +128,7 @@ def rows_of(
 
 
 def run(
-    machine: str, conditions: list[str], seeds: range, out: Path, *, loop: bool
+    machine: str, conditions: Sequence[str], seeds: range, out: Path, *, loop: bool
 ) -> None:
     """Append the rows of sets that are not there yet."""
     done: set[tuple[str, str, int, str]] = set()
@@ -217,18 +217,32 @@ def missing(machine: str) -> str:
     return ""
 
 
-def main(arguments: list[str] | None = None) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        summary: Whether to run nothing, and print the table of the rows.
+        machine: Name of a machine.
+        conditions: Names of the conditions.
+        seeds: Seeds, from the first to before the second.
+        by_parameter: Whether to print a line a parameter.
+        loop: Whether to run the closed loop too.
+        out: File of the results.
+    """
+
+    summary: bool = False
+    machine: Annotated[str, MACHINES] = "spring-mass"
+    conditions: Sequence[str] = (*CONDITIONS,)
+    seeds: tuple[int, int] = (FIRST, FIRST + 200)
+    by_parameter: bool = False
+    loop: bool = False
+    out: Path = RESULTS
+
+
+def main(options: Settings) -> None:
     """Run from a shell."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=("run", "show"))
-    parser.add_argument("--machine", choices=[*MACHINES], default="spring-mass")
-    parser.add_argument("--conditions", nargs="+", default=[*CONDITIONS])
-    parser.add_argument("--seeds", nargs=2, type=int, default=(FIRST, FIRST + 200))
-    parser.add_argument("--by-parameter", action="store_true")
-    parser.add_argument("--loop", action="store_true")
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    if options.what == "show":
+    if options.summary:
         rows: Any = pd.read_csv(options.out)
         told = table if options.by_parameter else summary
         print(
@@ -249,7 +263,3 @@ def main(arguments: list[str] | None = None) -> None:
             options.out,
             loop=options.loop,
         )
-
-
-if __name__ == "__main__":
-    main()

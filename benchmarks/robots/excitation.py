@@ -1,8 +1,8 @@
 """Chosen excitation against chirps: how long a robot must move for the same intervals.
 
-    python -m benchmarks.robots.excitation --machine arm --first 2000 --cases 5
-    python -m benchmarks.robots.excitation --machine leg --first 2000 --cases 5
-    python -m benchmarks.robots.excitation --summary
+    python -m benchmarks robots.excitation --machine arm --first 2000 --cases 5
+    python -m benchmarks robots.excitation --machine leg --first 2000 --cases 5
+    python -m benchmarks robots.excitation --summary
 
 A two-link arm and one leg of the Go2 (whose files are looked for beside the project, or
 at GO2_IN_AIR) with their drives; damping, armature and dry friction of each joint, and
@@ -27,7 +27,6 @@ cover. Seeds below 1000 tune, those from 2000 on judge. Resumable.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
@@ -35,7 +34,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -314,17 +313,28 @@ def summary(rows: Sequence[Mapping[str, str]]) -> list[str]:
     return lines
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        machine: Name of a machine.
+        first: Number of the first case.
+        cases: Number of cases.
+        out: File of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    machine: Annotated[str | None, MACHINES] = None
+    first: int = 2000
+    cases: int = 5
+    out: Path = RESULT
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run the cases that are missing and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--machine", choices=[*MACHINES])
-    parser.add_argument("--first", type=int, default=2000)
-    parser.add_argument("--cases", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args(argv)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     done = {(row["machine"], int(row["case"])) for row in read(arguments.out)}
     machines = [arguments.machine] if arguments.machine else [*MACHINES]
@@ -334,8 +344,3 @@ def main(argv: Sequence[str] | None = None) -> None:
                 append(arguments.out, COLUMNS, score(name, case))
                 print(name, case, flush=True)
     print(*summary(read(arguments.out)), sep="\n")
-
-
-if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    main()

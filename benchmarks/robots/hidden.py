@@ -1,8 +1,8 @@
 """Effects of ``mjcf_effects`` hidden in ten public models, one at a time.
 
-    python -m benchmarks.robots.hidden run --kind hidden --seeds 2000 2010
-    python -m benchmarks.robots.hidden run --kind clean --seeds 2000 2010
-    python -m benchmarks.robots.hidden show
+    python -m benchmarks robots.hidden --kind hidden --seeds 2000 2010
+    python -m benchmarks robots.hidden --kind clean --seeds 2000 2010
+    python -m benchmarks robots.hidden --summary
 
 Of each robot of :mod:`.public` the truth has parameters of its own and one effect,
 drawn with equal odds from all that ``mjcf_effects`` lists; its strength is one at which
@@ -23,14 +23,14 @@ their files, and the Go2's MJCF as in :mod:`.machines`.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -274,16 +274,28 @@ def summary(table: Any) -> Iterator[str]:
         yield f"| {name} | {' | '.join(cells)} |"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        summary: Whether to run nothing, and print the table of the rows.
+        robots: Names of the robots.
+        kind: Kind of cases; all by default.
+        seeds: Seeds, from the first to before the second.
+        out: File of the results.
+    """
+
+    summary: bool = False
+    robots: Annotated[Sequence[str], PUBLIC] = (*PUBLIC,)
+    kind: Annotated[Sequence[str], KINDS] = (*KINDS,)
+    seeds: tuple[int, int] = (FIRST, FIRST + 10)
+    out: Path = RESULTS
+
+
+def main(options: Settings) -> None:
     """Run from a shell."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("what", choices=("run", "show"))
-    parser.add_argument("--robots", nargs="+", choices=[*PUBLIC], default=[*PUBLIC])
-    parser.add_argument("--kind", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--seeds", nargs=2, type=int, default=(FIRST, FIRST + 10))
-    parser.add_argument("--out", type=Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    if options.what == "show":
+    if options.summary:
         table: Any = pd.read_csv(options.out)
         print(*summary(table[table.seed >= FIRST]), sep="\n")
         return
@@ -305,7 +317,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
                         f"{row['cpu_seconds']:.0f} CPU s",
                         flush=True,
                     )
-
-
-if __name__ == "__main__":
-    main()

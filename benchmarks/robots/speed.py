@@ -1,6 +1,6 @@
 """Simulations a CPU second of robots from their MJCF, beside a bare loop.
 
-    python -m benchmarks.robots.speed [--go2 ../shared/data/go2_in_air/go2_in_air.xml]
+    python -m benchmarks robots.speed [--go2 ../shared/data/go2_in_air/go2_in_air.xml]
 
 Of each model a second of simulated time from a start that differs by row, with another
 mass or damping in each row, and all readings of all sensors. Ways take turns in one
@@ -18,7 +18,6 @@ and highest of the repeats).
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable
@@ -36,6 +35,7 @@ from sbi_active.mujoco.effects.powers import PowerForce
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.threads import single_thread
 
+RESULT = Path(__file__).with_suffix(".json")
 SECONDS, SHARED = 1.0, 8
 MODELS = {
     "pendulum": (PENDULUM, "hinge", 0.0, 0.1),
@@ -135,30 +135,33 @@ def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
     return result
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run from a shell."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rows", type=int, default=64)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--go2", type=Path)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    options = parser.parse_args(arguments)
+def main(
+    *,
+    rows: int = 64,
+    repeats: int = 5,
+    go2: Path | None = None,
+    out: Path = RESULT,
+) -> None:
+    """Run from a shell.
+
+    Args:
+        rows: Number of rows.
+        repeats: Number of repeats.
+        go2: File of the Go2's model.
+        out: File of the results.
+    """
     mujoco = mujoco_of()
     models: dict[str, Any] = dict(MODELS)
-    if options.go2 is not None:
-        spec = mujoco.MjSpec.from_file(str(options.go2))
+    if go2 is not None:
+        spec = mujoco.MjSpec.from_file(str(go2))
         models["quadruped, 12 joints"] = (spec, "FL_calf_joint", 0.0, 1.0)
     with single_thread():
-        found = measured(models, options.rows, options.repeats)
+        found = measured(models, rows, repeats)
     record = {
         "date": date.today().isoformat(),
         "mujoco": mujoco.__version__,
-        "rows": options.rows,
-        "repeats": options.repeats,
+        "rows": rows,
+        "repeats": repeats,
         "models": found,
     }
-    options.out.write_text(json.dumps(record, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    out.write_text(json.dumps(record, indent=1) + "\n")

@@ -1,9 +1,9 @@
 r"""Linear-Gaussian problems with a closed form: the error of a belief and what it says.
 
-    python -m benchmarks.robustness.exact
-    python -m benchmarks.robustness.exact --prior box
-    python -m benchmarks.robustness.exact --histories 150
-    python -m benchmarks.robustness.exact --summary
+    python -m benchmarks robustness.exact
+    python -m benchmarks robustness.exact --prior box
+    python -m benchmarks robustness.exact --histories 150
+    python -m benchmarks robustness.exact --summary
 
 Three trials of
 
@@ -31,13 +31,13 @@ Resumable: a problem that has a row is not run again.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -254,17 +254,23 @@ def summary(found: list[dict[str, str]]) -> Iterator[str]:
         yield f"{name}: trustworthy is {said} in {len(agree)} of {len(among)}"
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        prior: Kind of the prior.
+        histories: Number of histories of a refinement.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    prior: Literal["gaussian", "box"] = "gaussian"
+    histories: int | None = None
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run what is missing and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--prior", choices=("gaussian", "box"), default="gaussian")
-    parser.add_argument("--histories", type=int, help="of each refinement")
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
     if not arguments.summary:
         run(arguments.prior, arguments.histories, SEEDS)
     print("\n".join(summary(rows(arguments.prior, arguments.histories))))
-
-
-if __name__ == "__main__":
-    main()

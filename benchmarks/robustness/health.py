@@ -1,8 +1,8 @@
 r"""False alarms: campaigns whose simulator is right, by how many numbers a trial has.
 
-    python -m benchmarks.robustness.health
-    python -m benchmarks.robustness.health --summary
-    python -m benchmarks.robustness.health --campaigns 20 --numbers 50 --lost sensor
+    python -m benchmarks robustness.health
+    python -m benchmarks robustness.health --summary
+    python -m benchmarks robustness.health --campaigns 20 --numbers 50 --lost sensor
 
 Each campaign draws its parameters from the prior and three trials from the simulator
 itself, so that any alarm is false; at most 5 % may raise one. Simulators take turns:
@@ -16,14 +16,13 @@ as too few simulations leave the belief off, are listed as such. Resumable:
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from scipy.stats import beta
@@ -222,16 +221,29 @@ def summary(rows: list[dict[str, str]]) -> Iterator[str]:
             )
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        summary: Whether to run nothing, and print the table of the rows.
+        first: Number of the first case.
+        campaigns: Number of campaigns a cell.
+        numbers: Numbers of an outcome.
+        lost: Kinds of lost numbers.
+        results: Folder of the results.
+    """
+
+    summary: bool = False
+    first: int = 0
+    campaigns: int = NUM_CAMPAIGNS
+    numbers: Sequence[int] = (*NUMBERS,)
+    lost: Annotated[Sequence[str], LOST] = (*LOST,)
+    results: Path = RESULTS
+
+
+def main(chosen: Settings) -> None:
     """Run what is missing and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    parser.add_argument("--first", type=int, default=0, help="index of the first")
-    parser.add_argument("--campaigns", type=int, default=NUM_CAMPAIGNS, help="a cell")
-    parser.add_argument("--numbers", type=int, nargs="*", default=NUMBERS)
-    parser.add_argument("--lost", nargs="*", choices=LOST, default=LOST)
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    chosen = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     if not chosen.summary:
@@ -239,7 +251,3 @@ def main() -> None:
         campaigns = range(chosen.first, chosen.first + chosen.campaigns)
         fill(chosen.results, cells, campaigns)
     print("\n".join(summary(read(chosen.results))))
-
-
-if __name__ == "__main__":
-    main()

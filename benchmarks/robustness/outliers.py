@@ -1,7 +1,7 @@
 """One of eight trials is off by many standard deviations: is it named, or an effect?
 
-    python -m benchmarks.robustness.outliers
-    python -m benchmarks.robustness.outliers --summary
+    python -m benchmarks robustness.outliers
+    python -m benchmarks robustness.outliers --summary
 
 World A is the numerical model with seven declared effects, world B the sliding block
 with its library, whose trials have six numbers, all of them off by as much. In each set
@@ -13,7 +13,6 @@ Resumable: a set that stands in ``results/outliers.csv`` is not run again.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
 from collections.abc import Iterator
@@ -110,7 +109,7 @@ def run() -> None:
                     file.flush()
 
 
-def summary() -> Iterator[str]:
+def shares() -> Iterator[str]:
     """Yield the shares of each setting."""
     for world, size, _ in SETTINGS:
         some = [r for r in rows() if (r["world"], int(r["size"])) == (world, size)]
@@ -132,14 +131,12 @@ def summary() -> Iterator[str]:
         )
 
 
-def main() -> None:
-    """Run what is missing and print the shares."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    if not parser.parse_args().summary:
+def main(*, summary: bool = False) -> None:
+    """Run what is missing and print the shares.
+
+    Args:
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+    if not summary:
         run()
-    print("\n".join(summary()))
-
-
-if __name__ == "__main__":
-    main()
+    print("\n".join(shares()))

@@ -1,8 +1,8 @@
 """What the library survives: an adversary's table, tried and survived by area.
 
-    python -m benchmarks.robustness.run
-    python -m benchmarks.robustness.run --area campaign
-    python -m benchmarks.robustness.run --summary
+    python -m benchmarks robustness
+    python -m benchmarks robustness --area campaign
+    python -m benchmarks robustness --summary
 
 Each case runs in a process of its own with a time limit, and counts as survived where
 the library gives the right numbers, or the error that names the fault; a wrong number,
@@ -12,11 +12,12 @@ stands in ``results/AREA.csv`` is not run again; ``--fresh`` runs an area anew.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import importlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from benchmarks.robustness.attacks import Attack, attempt
 
@@ -100,18 +101,24 @@ def summary() -> Iterator[str]:
     yield from lost
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        area: Name of the area; all by default.
+        fresh: Whether to run all cases again.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    area: Annotated[str | None, AREAS] = None
+    fresh: bool = False
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
     """Run what is missing and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--area", choices=AREAS, help="this one only")
-    parser.add_argument("--fresh", action="store_true", help="run all cases again")
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
     areas = (arguments.area,) if arguments.area else AREAS
     for area in () if arguments.summary else areas:
         run(area, fresh=arguments.fresh)
     print("\n".join(summary()))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Numbers in the wrong unit: named, corrected, and as if they had never been told.
 
-    python -m benchmarks.robustness.units
+    python -m benchmarks robustness.units
 
 A thrown body with three parameters, ten samples of its height a trial, five trials a
 campaign on disk. One trial is told in cm or in mm in place of m: trial 1, 3 or 5, ten
@@ -12,7 +12,6 @@ compared with ``torch.equal`` on 1,000 draws. Writes results/units.json.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
@@ -129,16 +128,21 @@ def campaign_with(place: int, factor: float, seed: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Run all campaigns and print what was named, corrected and equal."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--campaigns", type=int, default=NUM_CAMPAIGNS, help="a place")
-    parser.add_argument("--results", type=Path, default=RESULT)
-    chosen = parser.parse_args()
+def main(
+    *,
+    campaigns: int = NUM_CAMPAIGNS,
+    results: Path = RESULT,
+) -> None:
+    """Run all campaigns and print what was named, corrected and equal.
+
+    Args:
+        campaigns: Number of campaigns a cell.
+        results: Folder of the results.
+    """
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     rows = []
-    for k in range(chosen.campaigns):
+    for k in range(campaigns):
         for place in PLACES:
             factor = FACTORS[k % len(FACTORS)]
             rows.append(campaign_with(place, factor, derive_seed(k, "units", place)))
@@ -152,9 +156,5 @@ def main() -> None:
         "with others named": sum(row["others named"] > 0 for row in rows),
         "healthy at the end": sum(row["health"] == "ok" for row in rows),
     }
-    chosen.results.write_text(json.dumps({**summary, "rows": rows}, indent=1) + "\n")
+    results.write_text(json.dumps({**summary, "rows": rows}, indent=1) + "\n")
     print(summary)
-
-
-if __name__ == "__main__":
-    main()

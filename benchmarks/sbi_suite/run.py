@@ -10,7 +10,6 @@ Writes result.json beside this file: the outcome of every test that differs, and
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -21,6 +20,8 @@ import tarfile
 import tempfile
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -59,18 +60,30 @@ def run_tests(root: Path, files: list[str], *, swap: bool) -> dict[str, str]:
     return outcomes
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="sbi's tests on ASBI.")
-    parser.add_argument(
-        "--files", nargs="*", help="test files; default: all with NPE_C"
-    )
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        files: Names of the test files; all by default.
+    """
+
+    files: Sequence[str] | None = None
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     with tempfile.TemporaryDirectory() as folder:
         root = fetch_tests(Path(folder))
-        files = arguments.files or sorted(
-            f"tests/{path.name}"
-            for path in (root / "tests").glob("*_test.py")
-            if USES_NPE.search(path.read_text()) and path.name != "tutorials_test.py"
+        files = (
+            [*arguments.files]
+            if arguments.files
+            else sorted(
+                f"tests/{path.name}"
+                for path in (root / "tests").glob("*_test.py")
+                if USES_NPE.search(path.read_text())
+                and path.name != "tutorials_test.py"
+            )
         )
         original = run_tests(root, files, swap=False)
         swapped = run_tests(root, files, swap=True)
@@ -91,7 +104,3 @@ def main() -> None:
     (HERE / "result.json").write_text(json.dumps(result, indent=2) + "\n")
     print(json.dumps({k: v for k, v in result.items() if k != "files"}, indent=2))
     sys.exit(bool(differ))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Continuous and mixed action spaces: regret and simulations of the searches.
 
-    python -m benchmarks.search.run [--cases numerical mixed]
-    python -m benchmarks.search.run --cases mixed --first 40   # none was tuned on these
+    python -m benchmarks search [--cases numerical mixed]
+    python -m benchmarks search --cases mixed --first 40   # none was tuned on these
 
 "numerical": the numerical task with any action in [-5, 5], under the prior and under
 the exact posterior after one trial at -5, also by a cost that moves the optimum off the
@@ -18,14 +18,13 @@ result.csv beside this file, and those that are there are not run again.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -211,32 +210,40 @@ def table(rows: list[dict[str, Any]]) -> str:
     return as_table(lines, header)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--cases", nargs="+", choices=[*CASES], default=[*CASES])
-    parser.add_argument("--searches", nargs="+", default=["exhaustive", "gradient"])
-    parser.add_argument("--first", type=int, default=0, help="seed")
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+def main(
+    *,
+    cases: Annotated[Sequence[str], CASES] = (*CASES,),
+    searches: Sequence[str] = ("exhaustive", "gradient"),
+    first: int = 0,
+    summary: bool = False,
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
+
+    Args:
+        cases: Number of cases.
+        searches: Names of the searches.
+        first: Number of the first case.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
     if RESULT.exists():
         with RESULT.open() as file:
             rows = [*csv.DictReader(file)]
-    if arguments.summary:
-        print(table([r for r in rows if int(r["seed"]) >= arguments.first]))
+    if summary:
+        print(table([r for r in rows if int(r["seed"]) >= first]))
         return
     done = {(r["case"], r["search"], int(r["seed"])) for r in rows}
     with RESULT.open("a", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         if not rows:
             writer.writeheader()
-        for name in arguments.cases:
+        for name in cases:
             make, num_seeds = CASES[name]
             for case in make(num_seeds):
-                for search in arguments.searches:
-                    if case.seed < arguments.first:
+                for search in searches:
+                    if case.seed < first:
                         continue
                     key = (case.name, search, case.seed)
                     skipped = name == "mixed" and search == "exhaustive"
@@ -245,8 +252,4 @@ def main() -> None:
                     rows.append(run(case, search))
                     writer.writerow(rows[-1])
                     file.flush()
-    print(table([r for r in rows if int(r["seed"]) >= arguments.first]))
-
-
-if __name__ == "__main__":
-    main()
+    print(table([r for r in rows if int(r["seed"]) >= first]))

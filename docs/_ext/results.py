@@ -7,148 +7,136 @@ section's tables are a file, which ``docs/benchmarks.md`` includes.
 import contextlib
 import io
 import re
-import runpy
 import sys
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
-from unittest import mock
 
 from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+from benchmarks.__main__ import main as run_benchmark  # noqa: E402
+
 PAGES = ROOT / "docs" / "reference" / "api" / "results"
 EMPTY = re.compile(r"nan( (/|\+-) nan)*")
 #: Sections of docs/benchmarks.md, and the commands that print their tables.
 TABLES = {
     "The paper's numerical model": (
-        "benchmarks.numerical.run --summary",
-        "benchmarks.numerical.run --summary --trials 60 --settings default "
-        "--methods asbi",
-        "benchmarks.numerical.run --summary --truth random --trials 40 "
+        "numerical --summary",
+        "numerical --summary --trials 60 --settings default --methods asbi",
+        "numerical --summary --truth random --trials 40 "
         "--settings default --methods asbi",
-        "benchmarks.numerical.run --summary --task sinh "
+        "numerical --summary --task sinh --settings default default_500 --methods asbi",
+        "numerical --summary --task square "
         "--settings default default_500 --methods asbi",
-        "benchmarks.numerical.run --summary --task square "
+        "numerical --summary --task oscillator --truth random "
         "--settings default default_500 --methods asbi",
-        "benchmarks.numerical.run --summary --task oscillator --truth random "
-        "--settings default default_500 --methods asbi",
-        "benchmarks.numerical.run --summary --task oscillator --truth random "
+        "numerical --summary --task oscillator --truth random "
         "--jitter 0.1 --settings default --methods asbi",
     ),
     "Table 1 of the paper": (
-        "benchmarks.numerical.methods --summary --setting faithful",
-        "benchmarks.numerical.methods --summary --setting default",
+        "numerical.methods --summary --setting faithful",
+        "numerical.methods --summary --setting default",
     ),
-    "Expected information gain": ("benchmarks.table information_gain/result.csv",),
-    "Beside pyro.contrib.oed": ("benchmarks.table information_gain/peers.csv",),
+    "Expected information gain": ("table information_gain/result.csv",),
+    "Beside pyro.contrib.oed": ("table information_gain/peers.csv",),
     "Continuous and mixed actions": (
-        "benchmarks.search.run --summary",
-        "benchmarks.search.run --summary --cases mixed --first 40",
+        "search --summary",
+        "search --summary --cases mixed --first 40",
     ),
-    "Source location finding": ("benchmarks.location_finding.summary",),
+    "Source location finding": ("location_finding.summary",),
     "The simulation engine": (
-        "benchmarks.table engine/result.json --only *overhead,*overhead,*median* "
+        "table engine/result.json --only *overhead,*overhead,*median* "
         "workers,*speedup*median faults,*",
     ),
     "What an adversary found": (
-        "benchmarks.robustness.run --summary",
-        "benchmarks.robustness.exact --summary",
-        "benchmarks.robustness.exact --summary --histories 200",
-        "benchmarks.robustness.outliers --summary",
-        "benchmarks.robustness.health --summary",
+        "robustness --summary",
+        "robustness.exact --summary",
+        "robustness.exact --summary --histories 200",
+        "robustness.outliers --summary",
+        "robustness.health --summary",
     ),
     "Campaigns on disk": (
-        "benchmarks.table cost/directory.json --only tell* load,* *near*",
-        "benchmarks.table robustness/results/units.json --only [!r]*",
+        "table cost/directory.json --only tell* load,* *near*",
+        "table robustness/results/units.json --only [!r]*",
     ),
     "Box collision": (
-        "benchmarks.box_collision.run --summary",
-        "benchmarks.box_collision.run --summary --table coverage --rounds 3",
-        "benchmarks.box_collision.run --summary --setting learned "
+        "box_collision --summary",
+        "box_collision --summary --table coverage --rounds 3",
+        "box_collision --summary --setting learned "
         "--methods asbi nsbi alhi nlhi --trials 10",
-        "benchmarks.table box_collision/speed.json",
+        "table box_collision/speed.json",
     ),
     "The closed loop, on worlds whose truth is known": (
+        *(f"criticism --summary --table loop --world {world}" for world in "ABCD"),
         *(
-            f"benchmarks.criticism.run --summary --table loop --world {world}"
-            for world in "ABCD"
-        ),
-        *(
-            f"benchmarks.criticism.run --summary --table {table} --world {world} "
-            "--trials 12"
+            f"criticism --summary --table {table} --world {world} --trials 12"
             for table in ("open", "pairs")
             for world in "AB"
         ),
-        "benchmarks.criticism.run --summary --table active --world A",
+        "criticism --summary --table active --world A",
         *(
-            f"benchmarks.criticism.run --summary --table priors --world A --scale {by}"
+            f"criticism --summary --table priors --world A --scale {by}"
             for by in ("3", "0.3333333")
         ),
-        "benchmarks.criticism.run --summary --table loop --world C --kind clean "
-        "--independent",
-        "benchmarks.criticism.campaign --summary",
-        "benchmarks.criticism.campaign --summary --policy check",
+        "criticism --summary --table loop --world C --kind clean --independent",
+        "criticism.campaign --summary",
+        "criticism.campaign --summary --policy check",
     ),
     "Verdicts where every model is wrong": (
-        "benchmarks.misfit.run --summary",
-        "benchmarks.misfit.odds --table",
-        "benchmarks.misfit.start_states --summary",
+        "misfit --summary",
+        "misfit.odds --summary",
+        "misfit.start_states --summary",
     ),
-    "Forces that nobody declared": ("benchmarks.forces.run --summary",),
+    "Forces that nobody declared": ("forces --summary",),
     "Robots from their MJCF": (
-        "benchmarks.robots.hidden show",
-        "benchmarks.robots.coverage show",
-        "benchmarks.robots.excitation --summary",
+        "robots.hidden --summary",
+        "robots.coverage --summary",
+        "robots.excitation --summary",
     ),
     "A chain of many parameters": (
-        "benchmarks.chain.run --summary",
-        "benchmarks.chain.run --campaign --summary",
+        "chain --summary",
+        "chain --campaign --summary",
     ),
-    "Bad networks and beliefs flagged": ("benchmarks.calibration.run --summary",),
+    "Bad networks and beliefs flagged": ("calibration --summary",),
     "Every way to a belief, where the answer is known": (
-        "benchmarks oracles --summary",
-        "benchmarks oracles.calibration --summary",
+        "oracles --summary",
+        "oracles.calibration --summary",
     ),
-    "Dear simulators": ("benchmarks.dear.run --table",),
+    "Dear simulators": ("dear --summary",),
     "The cost of a round": (
-        "benchmarks.table cost/result.json",
-        "benchmarks.table cost/network.json",
-        "benchmarks.table cost/doors.json --only cpu_s*",
+        "table cost/result.json",
+        "table cost/network.json",
+        "table cost/doors.json --only cpu_s*",
     ),
-    "Robust updates": ("benchmarks.chain.robust --summary",),
+    "Robust updates": ("chain.robust --summary",),
     "sbi's own tests with the class swapped": (
-        "benchmarks.table sbi_suite/result.json --only date sbi original* swapped*",
+        "table sbi_suite/result.json --only date sbi original* swapped*",
     ),
     "Pouring": (
-        "benchmarks.pouring.run --summary",
-        "benchmarks.pouring.around --summary",
-        "benchmarks.pouring.refined --summary",
-        "benchmarks.pouring.material.run --summary",
-        "benchmarks.pouring.loop.run --summary",
+        "pouring --summary",
+        "pouring.around --summary",
+        "pouring.refined --summary",
+        "pouring.material --summary",
+        "pouring.loop --summary",
     ),
 }
 
 
 def printed(command: str) -> str:
-    """Return what a command prints, run in this process."""
-    module, *_ = argv = command.split()
+    """Return what a benchmark prints, run in this process by its name and options."""
     text = io.StringIO()
-    path = [str(ROOT), *sys.path]
-    with (
-        mock.patch.object(sys, "argv", argv),
-        mock.patch.object(sys, "path", path),
-        contextlib.redirect_stdout(text),
-    ):
+    with contextlib.redirect_stdout(text):
         try:
-            runpy.run_module(module, run_name="__main__")
-        except SystemExit as done:  # the one command for all benchmarks
-            if done.code:
-                raise
+            status = run_benchmark(command.split())
         except FileNotFoundError:  # rows that are being made again
             return "No rows are committed now."
-    if not text.getvalue().strip():
-        raise ValueError(f"expected a table of {command}; got nothing; commit its rows")
+    if status or not text.getvalue().strip():
+        raise ValueError(
+            f"expected a table of {command}; got {text.getvalue()!r} and the status "
+            f"{status}; commit its rows"
+        )
     return text.getvalue()
 
 
@@ -223,7 +211,7 @@ def tables(commands: Iterable[str]) -> str:
     """Return tables, each under the command that printed it."""
     lines = ["::::{container} rows", ""]
     for command in commands:
-        lines += [f"```bash\npython -m {command}\n```", ""]
+        lines += [f"```bash\npython -m benchmarks {command}\n```", ""]
         lines += [as_markdown(printed(command)), ""]
     return "\n".join([*lines, "::::", ""])
 

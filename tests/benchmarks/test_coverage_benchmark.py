@@ -14,7 +14,8 @@ if not hasattr(sysid, "Parameter"):
         allow_module_level=True,
     )
 
-from benchmarks.robots.coverage import main, missing, table  # noqa: E402
+from benchmarks.__main__ import main as run  # noqa: E402
+from benchmarks.robots.coverage import missing, table  # noqa: E402
 from benchmarks.robots.machines import MACHINES, recorded  # noqa: E402
 
 
@@ -39,19 +40,26 @@ def test_conditions_differ_in_what_they_say():
 
 def test_rows_are_run_once_and_told(tmp_path, capsys):
     out = tmp_path / "coverage.csv"
-    command = ["run", "--seeds", "2000", "2001", "--conditions", "friction 1"]
-    main([*command, "--out", str(out)])
+    command = [
+        "robots.coverage",
+        "--seeds",
+        "2000",
+        "2001",
+        "--conditions",
+        "friction 1",
+    ]
+    run([*command, "--out", str(out)])
     rows = pd.read_csv(out)
     assert rows.groupby("way").size().to_dict() == {"bare": 2, "ours": 2, "sysid": 2}
     inside = (rows.low <= rows.truth) & (rows.truth <= rows.high)
     assert inside[rows.way == "ours"].all()
     assert not inside[rows.way == "sysid"].any()
-    main([*command, "--out", str(out)])
+    run([*command, "--out", str(out)])
     assert len(pd.read_csv(out)) == len(rows)
     capsys.readouterr()
-    main(["show", "--by-parameter", "--out", str(out)])
+    run(["robots.coverage", "--summary", "--by-parameter", "--out", str(out)])
     assert "| ours  | 1      | 1.00 (0.34 to 1.00)" in capsys.readouterr().out
-    main(["show", "--out", str(out)])
+    run(["robots.coverage", "--summary", "--out", str(out)])
     assert "| friction 1  | 0.00    | 1.00   | 1.00" in capsys.readouterr().out
 
 

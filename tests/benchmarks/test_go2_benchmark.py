@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.measured.go2 import main
+from benchmarks.__main__ import main as run
 from benchmarks.measured.go2_leg import FITTED, read_leg, usual_parameters
 from benchmarks.measured.go2_tables import tables
 from sbi_active.mujoco import mjcf_effects
@@ -75,5 +75,5 @@ def test_tables_say_what_was_found_and_what_it_cost():
 
 
 def test_a_folder_without_files_is_said(tmp_path, capsys):
-    assert main(["--data", str(tmp_path)]) == 2
+    assert run(["measured.go2", "--data", str(tmp_path)]) == 2
     assert "--data DIR" in capsys.readouterr().err

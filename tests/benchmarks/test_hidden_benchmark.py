@@ -9,13 +9,13 @@ import pytest
 if find_spec("mujoco") is None:
     pytest.skip("needs mujoco", allow_module_level=True)
 
+from benchmarks.__main__ import main as run
 from benchmarks.robots.hidden import (
     EXCESS,
     NUM_READINGS,
     NUM_TRIALS,
     Truth,
     hidden_effect,
-    main,
     planned,
     summary,
 )
@@ -73,16 +73,16 @@ def test_the_table_counts_stated_groups_and_clean_sets(tmp_path, capsys):
     assert lines[2].split(" | ")[1:7] == ["30", "0/2", "1/2", "1/2", "1/2", "1/2"]
     out = tmp_path / "hidden.csv"
     rows.assign(seed=[0, 1, 2, 3]).to_csv(out, index=False)  # tuned on
-    main(["show", "--out", str(out)])
+    run(["robots.hidden", "--summary", "--out", str(out)])
     assert "| a |" not in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_the_servo_tells_what_it_lacks(tmp_path, capsys):
     out = tmp_path / "hidden.csv"
-    main(["run", "--robots", "servo", "--seeds", "0", "1", "--out", str(out)])
+    run(["robots.hidden", "--robots", "servo", "--seeds", "0", "1", "--out", str(out)])
     rows = pd.read_csv(out)
     assert rows.right.all()
     assert rows.simulated_trials.max() < 15_000
-    main(["run", "--robots", "servo", "--seeds", "0", "1", "--out", str(out)])
+    run(["robots.hidden", "--robots", "servo", "--seeds", "0", "1", "--out", str(out)])
     assert len(pd.read_csv(out)) == 2

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from benchmarks.__main__ import main as run
 from benchmarks.measured import hoop_offset
 from benchmarks.measured.record_stages import said
 from sbi_active.tasks.ball_and_hoop import make_prior  # pyright: ignore
@@ -33,7 +34,9 @@ def test_rows_that_stand_in_the_results_are_printed_and_not_run(tmp_path, capsys
     }
     out = tmp_path / "rows.json"
     out.write_text(json.dumps(rows))
-    assert hoop_offset.main(["--data", str(tmp_path), "--out", str(out)]) == 0
+    assert (
+        run(["measured.hoop_offset", "--data", str(tmp_path), "--out", str(out)]) == 0
+    )
     printed = capsys.readouterr().out
     assert printed.count("| compression, dead zone helps | 0.500 / 0.250 | 8 |") == 9
     assert "| 0.05 | 0.3 |" in printed
@@ -41,7 +44,7 @@ def test_rows_that_stand_in_the_results_are_printed_and_not_run(tmp_path, capsys
 
 def test_without_the_records_it_says_where_they_should_be(tmp_path, capsys):
     out = ["--out", str(tmp_path / "rows.json")]
-    assert hoop_offset.main(["--data", str(tmp_path), *out]) == 2
+    assert run(["measured.hoop_offset", "--data", str(tmp_path), *out]) == 2
     assert "expected a record in" in capsys.readouterr().err
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.misfit import odds
+from benchmarks.__main__ import main as run
 from benchmarks.misfit.odds import COLUMNS, claims, table
 from benchmarks.rows import append, read
 
@@ -47,5 +47,5 @@ def test_claims_have_the_factors_of_their_odds():
 def test_cases_that_judge_are_refused(tmp_path):
     out = tmp_path / "odds.csv"
     with pytest.raises(SystemExit, match="expected cases below 1000"):
-        odds.main(["--first", "990", "--cases", "20", "--out", str(out)])
+        run(["misfit.odds", "--first", "990", "--cases", "20", "--out", str(out)])
     assert not out.exists()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import HalfNormal, Independent, Normal
 
-from benchmarks.measured import ball_and_hoop, cascaded_tanks
+from benchmarks.__main__ import main as run
 from benchmarks.measured.hoop_least_squares import free_run, run_pieces
 from benchmarks.measured.record_stages import Bench, aliases, run_stages, table
 from sbi_active import GaussianNoise, SimulatorModel
@@ -103,9 +103,9 @@ def test_an_alias_is_what_the_whole_library_does_not_name():
     )
 
 
-@pytest.mark.parametrize("module", [ball_and_hoop, cascaded_tanks])
-def test_without_the_records_it_says_where_they_should_be(module, tmp_path, capsys):
-    assert module.main(["--data", str(tmp_path)]) == 2
+@pytest.mark.parametrize("name", ["ball_and_hoop", "cascaded_tanks"])
+def test_without_the_records_it_says_where_they_should_be(name, tmp_path, capsys):
+    assert run([f"measured.{name}", "--data", str(tmp_path)]) == 2
     assert "expected a record in" in capsys.readouterr().err
 
 

@@ -2,7 +2,8 @@
 
 import torch
 
-from benchmarks.measured.removals import main, removed, table
+from benchmarks.__main__ import main as run
+from benchmarks.measured.removals import removed, table
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
 
 
@@ -32,5 +33,7 @@ def test_the_table_counts_aliases():
 
 def test_without_the_recordings_it_says_where_they_should_be(tmp_path, capsys):
     out = ["--out", str(tmp_path / "rows.json")]
-    assert main(["--set", "balls", "--data", str(tmp_path), *out]) == 2
+    assert (
+        run(["measured.removals", "--set", "balls", "--data", str(tmp_path), *out]) == 2
+    )
     assert "as in --data DIR" in capsys.readouterr().err

@@ -3,7 +3,11 @@
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
 
@@ -25,6 +29,9 @@ def test_options_are_arguments():
         seeds: list[int] | None = None,
         first_seed: int = 3,
         path: Path = ROOT,
+        kind: Literal["a", "b"] | None = None,
+        names: Annotated[Sequence[str], {"x": 1, "y": 2}] = ("x",),
+        pair: tuple[int, int] = (1, 2),
     ) -> None:
         """Run.
 
@@ -38,17 +45,72 @@ def test_options_are_arguments():
         "seeds": None,
         "first_seed": 3,
         "path": ROOT,
+        "kind": None,
+        "names": ("x",),
+        "pair": (1, 2),
     }
-    options = "--summary --seeds 1 2 --path a --first-seed 4"
+    options = "--summary --seeds 1 2 --path a --first-seed 4 --kind b --names y x"
+    options += " --pair 3 4"
     given = parse(options.split())
     assert vars(given) == {
         "summary": True,
         "seeds": [1, 2],
         "first_seed": 4,
         "path": Path("a"),
+        "kind": "b",
+        "names": ["y", "x"],
+        "pair": [3, 4],
     }
+    for wrong in ("--seeds one", "--kind c", "--names z", "--pair 1"):
+        with pytest.raises(SystemExit):
+            parse(wrong.split())
+
+
+def test_arguments_without_a_default_are_given_by_place_or_must_be_named():
+    def run(folder: Path, *, bank: int) -> None: ...
+
+    parse = parser_of(run, "some").parse_args
+    assert vars(parse(["a", "--bank", "3"])) == {"folder": Path("a"), "bank": 3}
     with pytest.raises(SystemExit):
-        parse(["--seeds", "one"])
+        parse(["a"])
+
+
+@dataclass(frozen=True)
+class Base:
+    """What all share.
+
+    Args:
+        first: Number of the first,
+            on two lines.
+    """
+
+    first: int = 0
+
+
+@dataclass(frozen=True)
+class Settings(Base):
+    """What one has."""
+
+    first: int = 7
+    last: int = 9
+
+
+def test_settings_are_options():
+    def run(settings: Settings) -> None: ...
+
+    parser = parser_of(run, "some")
+    assert vars(parser.parse_args(["--last", "3"])) == {"first": 7, "last": 3}
+    assert "Number of the first, on two lines." in parser.format_help()
+
+
+@pytest.mark.parametrize("name", benchmarks())
+def test_every_benchmark_has_a_parser_and_describes_its_options(name):
+    try:
+        run = import_module(module_of(name)).main
+    except ImportError as error:
+        pytest.skip(str(error))
+    parser = parser_of(run, name)
+    assert all(action.help for action in parser._actions)
 
 
 def test_an_unknown_name_is_an_error_with_those_alike(capsys):
@@ -65,7 +127,7 @@ def test_all_are_listed(capsys):
         assert line, name
 
 
-def test_one_reads_its_own_command_line(capsys):
+def test_a_table_is_printed(capsys):
     assert main(["table", "cost/doors.json", "--only", "nothing*"]) == 0
     assert capsys.readouterr().out.startswith("| what | value |")
 

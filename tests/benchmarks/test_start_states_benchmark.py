@@ -5,7 +5,7 @@ import csv
 import pytest
 import torch
 
-from benchmarks.misfit import start_states
+from benchmarks.__main__ import main as run
 from benchmarks.misfit.start_states import COLUMNS, EFFECTS, SENSOR, draw_case, swing
 
 
@@ -52,7 +52,7 @@ def test_the_summary_counts_the_bars(tmp_path, capsys):
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
-    start_states.main(["--summary", "--out", str(path)])
+    run(["misfit.start_states", "--summary", "--out", str(path)])
     *_, bare, hidden = capsys.readouterr().out.splitlines()
     assert "| none | 40 | 0.500 (1/2)" in bare
     assert "| 4 of 16 | 10 (10) | 2,000 (3,000) | 1.000 (2/2)" in bare

@@ -57,10 +57,10 @@ def test_markdown_and_headings_pass(results):
 
 
 def test_committed_rows_are_printed_and_their_absence_is_a_fault(results, monkeypatch):
-    text = results.printed("benchmarks.forces.run --summary")
+    text = results.printed("forces --summary")
     assert "| single: right family |" in results.as_markdown(text)
     with pytest.raises(ValueError, match="commit its rows"):
-        results.printed("benchmarks.calibration.run --summary --first 1000000")
+        results.printed("calibration --summary --first 1000000")
 
 
 def test_each_section_shows_its_tables(results):

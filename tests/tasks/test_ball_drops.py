@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.stats import kstest
 
+from benchmarks.__main__ import main as run
 from benchmarks.measured import ball_drops as benchmark
 from benchmarks.measured.ball_tables import tables
 from benchmarks.measured.fall_least_squares import forecast_error, second_drop_error
@@ -146,7 +147,7 @@ def test_a_cut_drop_is_masked_from_there_on():
 def test_data_that_are_not_there(capsys):
     with pytest.raises(FileNotFoundError, match="got no drops.csv there; give"):
         read_drops("nowhere")
-    assert benchmark.main(["--data", "nowhere"]) == 2
+    assert run(["measured.ball_drops", "--data", "nowhere"]) == 2
     printed = capsys.readouterr().err
     assert "expected the measured drops in nowhere" in printed
     assert "--data DIR" in printed

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.measured.servo_pendulum import main
+from benchmarks.__main__ import main as run
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.data import Measurements
 from sbi_active.criticism.results import ModelKey
@@ -280,7 +280,18 @@ def test_recordings_that_do_not_fit(folder, name, change, message):
 
 
 def test_the_benchmark_says_where_it_looked(tmp_path, capsys):
-    assert main(["--data", str(tmp_path), "--out", str(tmp_path / "out.json")]) == 2
+    assert (
+        run(
+            [
+                "measured.servo_pendulum",
+                "--data",
+                str(tmp_path),
+                "--out",
+                str(tmp_path / "out.json"),
+            ]
+        )
+        == 2
+    )
     assert "got no such file; give the folder" in capsys.readouterr().err
     assert not (tmp_path / "out.json").exists()
 

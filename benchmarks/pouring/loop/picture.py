@@ -1,7 +1,7 @@
 """The residual of a set over the picture, before and after an effect is added.
 
-    python -m benchmarks.pouring.loop.picture --bank FOLDER --case 2 docs/pouring
-    python -m benchmarks.pouring.loop.picture --bank FOLDER --kind material docs/pouring
+    python -m benchmarks pouring.loop.picture --bank FOLDER --case 2 docs/pouring
+    python -m benchmarks pouring.loop.picture --bank FOLDER --kind material docs/pouring
 
 The loop compares few numbers; here the simulator itself pours draws of the posterior of
 the bare model, and of the verdict's, and the mean picture is taken off that of the set,
@@ -10,9 +10,8 @@ in units of the chaos of both, in squares of 1 cm.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -110,20 +109,23 @@ def residual_figure(bank: Path, kind: str, case: int, number: int) -> Any:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="The residual over the picture.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--bank", type=Path, required=True)
-    parser.add_argument("--kind", choices=KINDS, default="hidden")
-    parser.add_argument("--case", type=int, default=0)
-    parser.add_argument("--action", type=int, default=0, help="which, of the world's")
-    arguments = parser.parse_args()
+def main(
+    folder: Path,
+    *,
+    bank: Path,
+    kind: Annotated[str, KINDS] = "hidden",
+    case: int = 0,
+    action: int = 0,
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
+
+    Args:
+        folder: Folder to write to.
+        bank: Folder of pours.
+        kind: Kind of cases; all by default.
+        case: Number of the case.
+        action: Number of the action, of the world's.
+    """
     torch.set_num_threads(1)
-    figure = residual_figure(
-        arguments.bank, arguments.kind, arguments.case, arguments.action
-    )
-    save(figure, str(arguments.folder / f"residual_{arguments.kind}.png"))
-
-
-if __name__ == "__main__":
-    main()
+    figure = residual_figure(bank, kind, case, action)
+    save(figure, str(folder / f"residual_{kind}.png"))

@@ -1,7 +1,7 @@
 """The closed loop on images: hidden, clean, and a material that is not in the model.
 
-    python -m benchmarks.pouring.loop.run --bank FOLDER --kind hidden clean material
-    python -m benchmarks.pouring.loop.run --summary
+    python -m benchmarks pouring.loop --bank FOLDER --kind hidden clean material
+    python -m benchmarks pouring.loop --summary
 
 "hidden" and "clean": ten sets each, of twelve pours of 100 cubes at three actions (two
 pours of each are fitted, two are held out), with parameters from the prior; hidden sets
@@ -16,11 +16,12 @@ of them (``emulator``). Resumable; one row a set.
 
 from __future__ import annotations
 
-import argparse
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -217,18 +218,32 @@ def error(by_metric: dict[str, Any]) -> float:
     return float(np.sqrt(np.mean(by_metric["rmse"] ** 2)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="The closed loop on images.")
-    parser.add_argument("--bank", type=Path, help="folder of pours, see worlds.py")
-    parser.add_argument("--kind", nargs="*", choices=KINDS, default=[*KINDS])
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        bank: Folder of pours.
+        kind: Kind of cases; all by default.
+        results: Folder of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    bank: Path | None = None
+    kind: Annotated[Sequence[str], KINDS] = (*KINDS,)
+    results: Path = RESULTS
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     torch.set_num_threads(1)
     path = arguments.results / "loop.csv"
     if not arguments.summary:
         if arguments.bank is None:
-            parser.error("expected --bank FOLDER; got none; make one, see worlds.py")
+            raise SystemExit(
+                "expected --bank FOLDER; got none; make one, see worlds.py"
+            )
         done = {(row["kind"], row["case"]) for row in read(path)}
         for kind in arguments.kind:
             for case in range(CASES[kind]):
@@ -238,7 +253,3 @@ def main() -> None:
                 append(path, COLUMNS, [row])
                 print(kind, case, row["truth"], "->", row["verdict"], flush=True)
     print(summarize(read(path)))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,8 @@
 """Worlds of the closed loop on images: what is poured, where, and with which effects.
 
-    python -m benchmarks.pouring.loop.worlds FOLDER --world cubes --rows 900
-    python -m benchmarks.pouring.loop.worlds FOLDER --world material --rows 600
-    python -m benchmarks.pouring.loop.worlds FOLDER --world cubes --report
+    python -m benchmarks pouring.loop.worlds FOLDER --part cubes --rows 900
+    python -m benchmarks pouring.loop.worlds FOLDER --part material --rows 600
+    python -m benchmarks pouring.loop.worlds FOLDER --part cubes --report
 
 Rows are pours at a world's few actions with parameters from the prior and with effects:
 each is absent from half of the rows, and else up to two and a half times as strong as
@@ -16,17 +16,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring.bank import ROWS_A_FILE, Draw, Drawn, run_command
+from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, Filling, run_filling
 from sbi_active.criticism import Effect
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
-from sbi_active.tasks.pouring import Pours
 
 __all__ = ["WORLDS", "World", "draw", "phi_of", "poured_effects"]
 
@@ -85,13 +84,15 @@ def draw(world: World, part: str, number: int) -> Drawn:
     return Drawn(theta, world.actions[place], row_seeds(seed, ROWS_A_FILE), effects)
 
 
-def main() -> None:
-    def pours_and_draw(name: str) -> tuple[Pours, Draw]:
-        world = get_world(name)
-        return world.task.pours, partial(draw, world)
+@dataclass(frozen=True)
+class WorldFilling(Filling):
+    """What is poured with effects, in one of the worlds."""
 
-    run_command("Pours with effects.", "world", [*WORLDS], 350, pours_and_draw)
+    part: Annotated[str, WORLDS] = next(iter(WORLDS))
+    rows: int = 350
 
 
-if __name__ == "__main__":
-    main()
+def main(filling: WorldFilling) -> None:
+    """Pour with effects."""
+    world = get_world(filling.part)
+    run_filling(filling, world.task.pours, partial(draw, world))

@@ -1,8 +1,8 @@
 """Pours of the eight-parameter model, behind campaigns on a material.
 
-    python -m benchmarks.pouring.material.bank FOLDER --part prior --rows 300
-    python -m benchmarks.pouring.material.bank FOLDER --part compared --rows 150
-    python -m benchmarks.pouring.material.bank FOLDER --report
+    python -m benchmarks pouring.material.bank FOLDER --part prior --rows 300
+    python -m benchmarks pouring.material.bank FOLDER --part compared --rows 150
+    python -m benchmarks pouring.material.bank FOLDER --report
 
 Rows of ``prior`` are shared out by where the bucket stands: half of them at p = 0, two
 fifths at -30 cm, a tenth at 30 cm, from where next to nothing comes into view; a
@@ -13,16 +13,16 @@ One bank serves beads and gravel: where all particles have one density it cancel
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
-from benchmarks.pouring.bank import ROWS_A_FILE, Draw, Drawn, run_command
+from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, Filling, run_filling
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
-from sbi_active.tasks.pouring import Pours
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
 
 __all__ = ["draw"]
@@ -51,14 +51,15 @@ def draw(task: Any, part: str, number: int) -> Drawn:
     return Drawn(theta, torch.tensor(action).float(), row_seeds(seed, ROWS_A_FILE))
 
 
-def main() -> None:
-    def pours_and_draw(_: str) -> tuple[Pours, Draw]:
-        task: Any = get_task("pouring_real")
-        return task.pours, partial(draw, task)
+@dataclass(frozen=True)
+class MaterialFilling(Filling):
+    """What is poured of the eight-parameter model."""
 
-    text = "Pours of the eight-parameter model."
-    run_command(text, "part", PARTS, 300, pours_and_draw)
+    part: Annotated[str, PARTS] = PARTS[0]
+    rows: int = 300
 
 
-if __name__ == "__main__":
-    main()
+def main(filling: MaterialFilling) -> None:
+    """Pour from the prior of the eight-parameter model."""
+    task: Any = get_task("pouring_real")
+    run_filling(filling, task.pours, partial(draw, task))

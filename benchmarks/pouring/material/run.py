@@ -1,8 +1,8 @@
 """The paper's Figure 16: what calibrated cubes share with a material, by round.
 
-    python -m benchmarks.pouring.material.run --bank FOLDER              # campaigns
-    python -m benchmarks.pouring.material.run --bank FOLDER --check 40   # poured anew
-    python -m benchmarks.pouring.material.run --summary
+    python -m benchmarks pouring.material --bank FOLDER              # campaigns
+    python -m benchmarks pouring.material --bank FOLDER --check 40   # poured anew
+    python -m benchmarks pouring.material --summary
 
 The material is simulated, with particles that the model does not have, and no robot was
 here: see ``get_task("pouring_real")``. Resumable: a trial that stands in the CSV is not
@@ -17,9 +17,9 @@ beliefs instead.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import defaultdict
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -120,7 +120,30 @@ def poured(belief: PointBelief, material: str, num: int, seed: int) -> np.ndarra
     return torch.stack(each).mean(0).double().numpy()
 
 
-def run_missing(learned: ByPlace, arguments: argparse.Namespace) -> None:
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        bank: Folder of pours.
+        learned: File that keeps what is learned of the pours.
+        trials: Number of trials.
+        first: Number of the first case.
+        check: Number of pours of each belief; none by default.
+        results: Folder of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    bank: Path | None = None
+    learned: Path | None = None
+    trials: int = 3
+    first: int = 2_300
+    check: int = 0
+    results: Path = RESULTS
+    summary: bool = False
+
+
+def run_missing(bank: Path, learned: ByPlace, arguments: Settings) -> None:
     """Run the trials, or the checks, that are not in the files yet."""
     trials = arguments.results / "intervol.csv"
     checks = arguments.results / "intervol_poured.csv"
@@ -128,7 +151,7 @@ def run_missing(learned: ByPlace, arguments: argparse.Namespace) -> None:
     done = {(r["seed"], r["material"], r["method"]) for r in read(path)}
     for material in MATERIALS:
         task: Any = get_task("pouring_real", material=material)
-        overlap = compared_pours(arguments.bank, compared_images(material))
+        overlap = compared_pours(bank, compared_images(material))
         print(
             f"{material}: {overlap.explained:.2f} of the variance, {overlap.num} pours"
         )
@@ -154,24 +177,13 @@ def run_missing(learned: ByPlace, arguments: argparse.Namespace) -> None:
                 print(material, method, seed, short(row["poured"]), flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="InterVol by round.")
-    parser.add_argument("--bank", type=Path, help="folder of pours")
-    parser.add_argument("--learned", type=Path, help="keeps what is learned of it")
-    parser.add_argument("--trials", type=int, default=3)
-    parser.add_argument("--first", type=int, default=2_300, help="seed of the first")
-    parser.add_argument("--check", type=int, default=0, help="pours of each belief")
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    arguments = parser.parse_args()
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
     torch.set_num_threads(1)
     if not arguments.summary:
         if arguments.bank is None:
-            parser.error("expected --bank FOLDER; got none; make one, see bank.py")
-        run_missing(kept(arguments.bank, arguments.learned), arguments)
+            raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
+        learned = kept(arguments.bank, arguments.learned)
+        run_missing(arguments.bank, learned, arguments)
     print(summarize(read(arguments.results / "intervol.csv")))
     print(checks_table(read(arguments.results / "intervol_poured.csv")))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,10 @@
 """Figure 16 of the paper, from the rows of a run: tables and the picture.
 
-python -m benchmarks.pouring.material.summary docs/pouring
+python -m benchmarks pouring.material.summary docs/pouring
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -112,11 +111,10 @@ def intervol_figure(results: Path = RESULTS) -> Any:
     return figure
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Figure 16.")
-    parser.add_argument("folder", type=Path)
-    save(intervol_figure(), str(parser.parse_args().folder / "intervol.png"))
+def main(folder: Path) -> None:
+    """Draw figure 16.
 
-
-if __name__ == "__main__":
-    main()
+    Args:
+        folder: Folder to write to.
+    """
+    save(intervol_figure(), str(folder / "intervol.png"))
