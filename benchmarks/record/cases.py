@@ -20,6 +20,7 @@ from benchmarks.criticism import cases as letters
 from benchmarks.criticism.worlds import get_world
 from benchmarks.misfit import cases as misfit
 from benchmarks.oracles.calibration import drawn
+from benchmarks.record.measured import MEASURED
 from sbi_active import BoxActions, Campaign, CampaignOptions
 from sbi_active.criticism import Trials, close_loop, identify
 from tests.oracles.problem import Problem
@@ -75,14 +76,20 @@ def moments(found: Result, name: str, theta: Any, effective: float) -> None:
         found.figures[f"{name} sd {k}"] = float(sd), error
 
 
-def closed_loop(draw: Callable[[int], Any], number: int, seed: int) -> Result:
-    """Return what the closed loop says of a case of a benchmark's worlds."""
-    problem = draw(number).problem
+def closed_loop(draw: Callable[[], Any], seed: int) -> Result:
+    """Return what the closed loop says of a problem.
+
+    Args:
+        draw: Returns its model, prior, trials and effects, and nuisances where there
+            are any.
+        seed: Seed of the engine.
+    """
+    problem = draw()
     report = close_loop(
         problem.model,
         problem.prior,
         problem.trials,
-        effects=problem.effects,
+        effects=[*problem.effects, *getattr(problem, "nuisances", ())],
         seed=seed,
         evaluate=False,
         plan=False,
@@ -154,14 +161,14 @@ def cases() -> dict[str, Callable[[int], Result]]:
     for number in numbers:
         for world in "ABC":
             for kind in ("clean", "library", "removed", "pair"):
-                draw = partial(letters.draw_case, get_world(world), kind)
+                draw = partial(letters.draw_case, get_world(world), kind, number)
                 name = f"loop {world} {kind} {number}"
-                found[name] = partial(closed_loop, draw, number)
+                found[name] = partial(closed_loop, lambda draw=draw: draw().problem)
         for group in ("own", "letters"):
             for kind in get_args(misfit.Kind):
-                draw = partial(misfit.draw_case, group, kind)
+                draw = partial(misfit.draw_case, group, kind, number)
                 name = f"misfit {group} {kind} {number}"
-                found[name] = partial(closed_loop, draw, number)
+                found[name] = partial(closed_loop, lambda draw=draw: draw().problem)
     for number in range(FIRST_SEED, FIRST_SEED + NUM_CAMPAIGNS):
         for problem in CAMPAIGNS:
             options: dict[str, Any] = {"network": "on demand"}
@@ -173,6 +180,8 @@ def cases() -> dict[str, Callable[[int], Result]]:
         for problem in IDENTIFIED:
             own = drawn(problem, number)
             found[f"identify {problem} {number}"] = partial(identified, own)
+    for name, make in MEASURED.items():
+        found[f"measured {name}"] = partial(closed_loop, make)
     return found
 
 

@@ -2,12 +2,12 @@
 
 import importlib.util
 import re
-import runpy
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from benchmarks.__main__ import main as run
 
 ROOT = Path(__file__).parents[2]
 #: Numbers of docs/benchmarks.md that were chosen and not measured: a level of a test,
@@ -85,14 +85,11 @@ def test_no_figure_is_typed_beside_the_tables():
         assert set(figures) <= SETTINGS, section.splitlines()[0]
 
 
-def test_a_file_is_a_table(results, monkeypatch, capsys, tmp_path):
+def test_a_file_is_a_table(capsys, tmp_path):
     (tmp_path / "rows.csv").write_text("a,b\n1,x|y\n")
     (tmp_path / "runs.json").write_text('{"cpu": {"ours": 1.25}, "date": "today"}')
     for arguments in (["rows.csv"], ["runs.json", "--only", "cpu*"]):
-        paths = [str(tmp_path / arguments[0]), *arguments[1:]]
-        monkeypatch.setattr(sys, "argv", ["table", *paths])
-        monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])
-        runpy.run_module("benchmarks.table", run_name="__main__")
+        run(["table", str(tmp_path / arguments[0]), *arguments[1:]])
     assert capsys.readouterr().out.splitlines() == [
         "| a | b |",
         "| --- | --- |",

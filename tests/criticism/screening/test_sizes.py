@@ -1,0 +1,49 @@
+"""A library of 24 effects, whose sets are all fitted, and one of 25 say the same."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Normal
+
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.screening.screening import MANY
+
+TIMES = torch.linspace(0, 2, 60)
+PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))
+
+
+def series(theta, action):
+    return theta * action * TIMES
+
+
+def pattern(k):
+    wave = (torch.cos, torch.sin)[k % 2](3 * (1 + k // 2) * TIMES)
+    return Effect(
+        f"wave {k}",
+        hook="observation",
+        prior=Normal(0.0, 0.3),
+        null=0.0,
+        apply=lambda x, phi, action, context: x + phi * wave,
+        family="wave",
+    )
+
+
+def verdict(number, strength):
+    rng = np.random.default_rng(7)
+    model = SimulatorModel(series, noise=GaussianNoise(0.05))
+    action = torch.tensor([[0.5], [1.0], [1.5]])
+    x = series(torch.tensor([[0.7]]), action) + strength * torch.cos(6 * TIMES)
+    x = x + 0.05 * torch.from_numpy(rng.standard_normal(x.shape)).float()
+    effects = [pattern(k) for k in range(number)]
+    loop = Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
+    return loop.trace()
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.2])
+def test_one_effect_more_does_not_change_the_verdict(strength):
+    few, many = (verdict(MANY + k, strength) for k in (0, 1))
+    assert few.verdict == many.verdict == ("wave 2" if strength else "none")
+    for name in {few.verdict} - {"none"}:
+        assert abs(few.inclusion[name] - many.inclusion[name]) < 0.1

@@ -1,0 +1,83 @@
+"""Modes and widths by Gauss-Newton steps, where both are known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sbi_active.inference.declared.gauss_newton import (
+    WIDER,
+    WhitenedTrials,
+    find_laplace,
+)
+
+
+class Residuals(WhitenedTrials):
+    """Residuals that are given as a function of u."""
+
+    def __init__(self, function, dim, observed):
+        bound = np.full(dim, 8.0)
+        self.coordinates = SimpleNamespace(
+            dim=dim,
+            precision=np.ones(dim),
+            center=np.zeros(dim),
+            low=-bound,
+            high=bound,
+            sample=lambda n, rng: rng.standard_normal((n, dim)),
+        )
+        self.dim, self.searched = dim, np.ones(dim, dtype=bool)
+        self.function, self.num_observed = function, observed
+
+    def residual(self, u):
+        return (self.function(u),)
+
+
+def test_a_linear_model_has_one_mode_of_the_posterior_width():
+    rng = np.random.default_rng(0)
+    matrix, truth = rng.standard_normal((12, 4)) * 5, rng.standard_normal(4)
+    x = matrix @ truth + rng.standard_normal(12)
+    found = find_laplace(Residuals(lambda u: x - u @ matrix.T, 4, 12), rng)
+    precision = matrix.T @ matrix + np.eye(4)
+    assert found is not None
+    assert found.modes.shape == (1, 4)
+    mean = np.linalg.solve(precision, matrix.T @ x)
+    sd = np.sqrt(np.diag(np.linalg.inv(precision)))
+    assert (np.abs(found.modes[0] - mean) < 0.05 * sd).all()
+    factor = found.guess.factors[0] / WIDER
+    np.testing.assert_allclose(
+        factor @ factor.T, np.linalg.inv(precision), rtol=1e-3, atol=1e-6
+    )
+    assert found.informed.all()
+
+
+@pytest.mark.xfail(
+    strict=True, reason="equally good modes count as one found again: 5 of 8"
+)
+def test_every_mode_is_found():
+    # u^2 is seen: each sign of each coordinate explains it.
+    x = np.array([1.0, 0.64, 1.44])
+    residuals = Residuals(lambda u: (x - u**2) / 0.02, 3, 3)
+    found = find_laplace(residuals, np.random.default_rng(1))
+    assert found is not None
+    signs = {tuple(np.sign(mode)) for mode in found.modes}
+    assert len(signs) == 8
+    np.testing.assert_allclose(np.abs(found.modes), np.tile(x**0.5, (8, 1)), atol=0.01)
+
+
+def test_fewer_numbers_than_parameters_leave_the_prior_where_nothing_is_known():
+    residuals = Residuals(lambda u: (2.0 - u[:, :1]) / 0.1, 5, 1)
+    found = find_laplace(residuals, np.random.default_rng(2))
+    assert found is not None
+    np.testing.assert_array_equal(found.informed, [True, *[False] * 4])
+    sd = np.sqrt(np.diag(found.guess.factors[0] @ found.guess.factors[0].T)) / WIDER
+    np.testing.assert_allclose(sd[1:], 1.0, rtol=1e-3)
+    np.testing.assert_allclose(sd[0], 1 / np.sqrt(101), rtol=1e-2)
+
+
+def test_a_lost_simulation_counts_as_a_large_residual():
+    def function(u):
+        return np.where(u[:, :1] > 1, 1e6, (0.5 - u[:, :1]) / 0.1)
+
+    found = find_laplace(Residuals(function, 1, 1), np.random.default_rng(3))
+    assert found is not None
+    assert abs(found.modes[0, 0] - 0.5 * 100 / 101) < 0.01
