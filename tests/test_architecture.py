@@ -39,6 +39,7 @@ FLOORS = (
     "inference.beliefs",
     "inference.rounds",
     "inference.regression",
+    "inference.engine",
     "inference.declared",
     "inference.refinement",
     "inference.emulation",

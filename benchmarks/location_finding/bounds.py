@@ -41,7 +41,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.inference.sampling import KernelProposal
+from benchmarks.location_finding.kernels import KernelProposal
 from sbi_active.tasks.location_finding.model import log_likelihood
 
 __all__ = [

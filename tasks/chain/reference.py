@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.sampling.bridge import NormalMixture, bridge
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.smc import bridge
+from sbi_active.inference.sampling.student_mixture import NormalMixture
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     log_sum_exp,
@@ -72,7 +73,6 @@ class ChainReference:
             num_particles=num_particles,
             max_moves=MAX_MOVES,
             forgotten=FORGOTTEN,
-            settled=SETTLED,
         )
         if found is None:
             raise RuntimeError(

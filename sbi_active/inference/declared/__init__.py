@@ -1,21 +1,11 @@
 """The posterior under declared noise: its likelihood is simulated, and so exact.
 
-Here live that likelihood, searches of its modes, samplers, and what trials show that
-contradict one another. Nothing is regressed here.
+Here lives what makes a belief of a fit: how far it is to be trusted, and what trials
+show that contradict one another. Nothing is regressed here.
 """
 
-from sbi_active.inference.declared.importance import importance_sample
+from sbi_active.inference.declared.refining import refine_declared
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.declared.simulated_belief import SimulatedBelief
-from sbi_active.inference.declared.simulated_likelihood import (
-    MeanTable,
-    SimulatedLikelihood,
-    declares_noise,
-)
 
-__all__ = [
-    "MeanTable",
-    "SimulatedBelief",
-    "SimulatedLikelihood",
-    "declares_noise",
-    "importance_sample",
-]
+__all__ = ["RefinementOptions", "SimulatedBelief", "refine_declared"]

@@ -38,23 +38,18 @@ class RefinementOptions:
             simulations; its effective number bounds the error of the normalizer. More
             are taken beyond six parameters, in proportion to these.
         max_regions: Ellipsoids at most, but for splits against misfit.
-        max_regressed: Numbers of an outcome at most that are regressed where the noise
-            is declared; beyond, its likelihood is simulated from the start. The cost
-            of a regression grows with their cube: of three trials it takes 1.3 times
-            the CPU time at half and here, 1.7 times at twice as many.
         check_order: Refine a second time, with the trials in reverse and new
             simulations, and report the divergence between the two: what the order and
             the draws contribute. It doubles the cost. A simulated likelihood has no
             order and no such check.
         checked_share: Share of the budget that is simulated beyond it, to compare a
-            learned belief with simulations that it was not fitted to; half of it where
-            the likelihood itself can be simulated. A mean is then known to about .06
-            standard deviations at 3,000 histories; with half the share to .08.
-        largest_divergence: Divergence in nats beyond which a learned belief is not
-            trusted, or is sampled anew by its simulated likelihood.
-        largest_shift: The same for the error of a mean in standard deviations, or three
-            standard errors of the check where these are more. Less than the .3 that a
-            user may see, by two standard errors at 3,000 histories.
+            learned belief with simulations that it was not fitted to. A mean is then
+            known to about .06 standard deviations at 3,000 histories; with half the
+            share to .08.
+        largest_shift: Error of a learned belief's mean, in standard deviations, beyond
+            which it is not trusted, or three standard errors of the check where these
+            are more. Less than the .3 that a user may see, by two standard errors at
+            3,000 histories.
         contradiction_level: Tail probability of the best fit's residuals under the
             declared noise, below which the noise is inflated to what trials show. A
             right simulator crosses it once in a million updates; half and twice are
@@ -72,10 +67,8 @@ class RefinementOptions:
     replicate_share: float = 0.2
     num_particles: int = 8_000
     max_regions: int = 8
-    max_regressed: int = 500
     check_order: bool = False
     checked_share: float = 0.1
-    largest_divergence: float = 0.05
     largest_shift: float = 0.2
     contradiction_level: float = 1e-6
     workers: Workers = IN_PROCESS
@@ -91,9 +84,7 @@ class RefinementOptions:
             ("replicate_share", 0.05, 0.5),
             ("num_particles", 1_000, np.inf),
             ("max_regions", 1, 32),
-            ("max_regressed", 0, np.inf),
             ("checked_share", 0.0, 1.0),
-            ("largest_divergence", 0.0, np.inf),
             ("largest_shift", 0.0, np.inf),
             ("contradiction_level", 0.0, 0.01),
         ):

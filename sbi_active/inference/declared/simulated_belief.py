@@ -2,20 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.declared.importance import WeightedPool
-from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
-from sbi_active.inference.regression.histories import HistoryRecord
-from sbi_active.inference.regression.regions import PriorProposal
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.kernels import KernelProposal
+from sbi_active.inference.engine import Fit, SimulatedPotential
+from sbi_active.inference.engine.importance import Pool
+from sbi_active.inference.engine.simulated_likelihood import MeanTable
+from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.population import GaussianMixture
+from sbi_active.inference.sampling.student_mixture import NormalMixture
+from sbi_active.inference.sampling.weights import systematic
 
 BEYOND = 20.0  # nats below the defensive share at which a density is given up
+NUM_FITTED = 1_000  # draws behind the smooth density
+
+
+@dataclass(frozen=True)
+class DeclaredRecord:
+    """What a belief goes on from when a further trial is known.
+
+    Attributes:
+        trials: Actions and outcomes in the likelihood of the draws.
+        coordinates: Coordinates that they are in.
+        table: Noise-free outcomes so far.
+        pool: The draws.
+    """
+
+    trials: tuple[Tensor, Tensor]
+    coordinates: NormalCoordinates
+    table: MeanTable
+    pool: Pool
+
+    def leads_to(self, simulator: Any, action: Tensor, x: Tensor) -> bool:
+        """Return whether its trials are the first of these, of the same simulator."""
+        t = len(self.trials[0])
+        return (
+            self.table.simulator is simulator
+            and torch.equal(self.trials[0], action[:t])
+            and torch.equal(self.trials[1].nan_to_num(), x[:t].nan_to_num())
+            and torch.equal(self.trials[1].isnan(), x[:t].isnan())
+        )
 
 
 class SimulatedBelief(Belief):
@@ -25,48 +57,57 @@ class SimulatedBelief(Belief):
         b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k
         p\big(x_k \mid f(\theta, \xi_k)\big) + \epsilon\, p(\theta)
 
-    Draws are the weighted ones of an importance sample, again and again, whose
-    density costs nothing. ``log_prob`` elsewhere costs a simulation a trial and row;
-    ``smooth_log_prob`` has kernels around the draws in place of the likelihood, and
-    misses what the response does within their width.
+    Draws are the weighted ones of a fit, again and again, whose density costs nothing.
+    Parameters that no trial informs, and that are independent of the others under the
+    prior, are drawn from the prior afresh. ``log_prob`` elsewhere costs a simulation a
+    trial and row; ``smooth_log_prob`` has a mixture fitted to the draws in place of the
+    likelihood, and misses what the response does within its width.
 
     Args:
         prior: The original prior p.
-        coordinates: Of the prior.
-        likelihood: Of all trials.
-        pool: Weighted draws, which give Z.
+        potential: Potential of all trials.
+        fit: Weighted draws, and the evidence Z.
         defensive: The share :math:`\epsilon`.
 
     Attributes:
         histories: What a refinement goes on from after a further trial.
+        free: Parameters that keep their prior, shape (d,).
     """
 
     label = "refined"
-    histories: HistoryRecord
+    histories: DeclaredRecord
 
     def __init__(
         self,
         prior: Distribution,
-        coordinates: PriorCoordinates,
-        likelihood: SimulatedLikelihood,
-        pool: WeightedPool,
+        potential: SimulatedPotential,
+        fit: Fit,
         *,
         defensive: float,
     ) -> None:
         super().__init__(prior)
-        self._coordinates, self._likelihood = coordinates, likelihood
-        self._defensive = defensive
-        self._log_evidence = pool.log_evidence
-        self._z = pool.z[pool.is_final]
-        self._weight = pool.weight[pool.is_final]
-        self._kernels = KernelProposal.around(
-            self._z, self._weight, PriorProposal(coordinates), np.random.default_rng(0)
+        self._normal, self._likelihood = potential.coordinates, potential.likelihood
+        self._coordinates = self._normal.base
+        self._defensive, self._log_evidence = defensive, fit.log_evidence
+        self.free = fit.free
+        self._z, self._weight = self._normal.to_z(fit.u), fit.weight
+        rng = np.random.default_rng(0)
+        u = fit.u[systematic(self._weight, NUM_FITTED, 0.5)]
+        mixture = GaussianMixture.fit(u, 4, rng)
+        self._fitted = NormalMixture(
+            np.exp(mixture.log_weight), mixture.mean, mixture.factor
         )
 
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:
         z = self._coordinates.to_z(theta)
-        log_jacobian = self._coordinates.log_jacobian(z)
-        return torch.from_numpy(self._kernels.log_prob(z) - log_jacobian)
+        u = self._normal.from_z(z)
+        log_volume = self._normal.log_slope(u) - self._coordinates.log_jacobian(z)
+        log_prior = self._coordinates.log_prior(z) - self._coordinates.log_jacobian(z)
+        density = np.logaddexp(
+            np.log1p(-self._defensive) + self._fitted.log_prob(u) + log_volume,
+            np.log(self._defensive) + log_prior,
+        )
+        return torch.from_numpy(density)
 
     def _log_prob(self, theta: Tensor) -> Tensor:
         z = self._coordinates.to_z(theta)
@@ -87,4 +128,8 @@ class SimulatedBelief(Belief):
         row = rng.choice(len(self._z), size=num_samples - num_prior, p=self._weight)
         prior = self._coordinates.sample_prior(num_prior, rng)
         z = rng.permutation(np.concatenate([self._z[row], prior]))
-        return self._coordinates.to_theta(z)
+        theta = self._coordinates.to_theta(z)
+        if self.free.any():
+            fresh = self.prior.sample(torch.Size([num_samples])).to(theta)
+            theta = torch.where(torch.from_numpy(self.free), fresh, theta)
+        return theta

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sbi_active.inference.emulation.likelihood import PooledLikelihood
 from sbi_active.inference.regression.regions import PriorProposal
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.bridge import NormalMixture, bridge
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.inference.sampling.population import (
@@ -18,7 +17,12 @@ from sbi_active.inference.sampling.population import (
     Particles,
     StudentProposal,
 )
-from sbi_active.inference.sampling.student_mixture import Defended, Proposal
+from sbi_active.inference.sampling.smc import bridge
+from sbi_active.inference.sampling.student_mixture import (
+    Defended,
+    NormalMixture,
+    Proposal,
+)
 
 Array = NDArray[Any]
 

@@ -1,14 +1,7 @@
 r"""Is a learned belief right? By simulations that it was not fitted to.
 
-Where the likelihood itself can be simulated, at draws of the belief b,
-
-.. math::
-    \delta(\theta) = \log L(\theta) - \log \hat L(\theta), \qquad
-    \mathrm{KL}(b \| p) = \log E_b\, e^{\delta} - E_b\, \delta, \qquad
-    \Delta = E_b\, w \theta - E_b\, \theta, \quad w \propto e^\delta .
-
-Where it cannot, fresh simulations show by how much the regression misses their mean,
-e = whitened outcome less prediction, and that moves the mean of the belief by about
+Fresh simulations at draws of the belief b show by how much the regression misses their
+mean, e = whitened outcome less prediction, which moves the mean of the belief by about
 
 .. math::
     \Delta = E_b \bigl[(J^\top J + P)^{-1} J^\top e\bigr],
@@ -26,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
-from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.seeding import forked_generators
@@ -44,77 +36,36 @@ class Confirmation:
     """How far a learned belief is from what fresh simulations give.
 
     Attributes:
-        divergence: KL divergence of the belief from the posterior, nats; None where the
-            likelihood cannot be simulated.
         shift: Largest error of a mean, in standard deviations of the belief.
         num_simulations: Rows simulated.
-        limits: Largest divergence and shift of a belief that is to be trusted.
+        limit: Largest shift of a belief that is to be trusted.
     """
 
-    divergence: float | None
     shift: float
     num_simulations: int
-    limits: tuple[float, float]
+    limit: float
 
     @property
     def holds(self) -> bool:
-        """Whether both lie within their limits."""
-        divergence, shift = self.limits
-        return (self.divergence or 0.0) <= divergence and self.shift <= shift
+        """Whether the shift lies within its limit."""
+        return self.shift <= self.limit
 
     def noted(self, diagnostics: Diagnostics) -> Diagnostics:
         """Return diagnostics with the figures, and a warning where they are large."""
-        worst = self.shift if self.divergence is None else self.divergence
         known = diagnostics.extended(
             num_simulations=diagnostics.num_simulations + self.num_simulations,
             assumptions={
                 **diagnostics.assumptions,
-                "confirmed": Assumption(self.holds, worst),
+                "confirmed": Assumption(self.holds, self.shift),
             },
             mean_shift=self.shift,
         )
         if self.holds:
             return known
-        kl = "" if self.divergence is None else f"by about {self.divergence:.2g} nats, "
         return known.warned(
-            f"fresh simulations do not confirm the belief: it is off {kl}its mean by "
+            f"fresh simulations do not confirm the belief: its mean is off by "
             f"{self.shift:.2g} standard deviations; raise num_histories"
         )
-
-
-def by_likelihoods(
-    stages: Stages,
-    belief: LearnedBelief,
-    likelihood: SimulatedLikelihood,
-    rng: np.random.Generator,
-) -> Confirmation:
-    """Compare with the simulated likelihood at draws of the belief.
-
-    Args:
-        stages: Refinement that led to the belief.
-        belief: Learned belief.
-        likelihood: Likelihood of all trials.
-        rng: Source of the draws.
-    """
-    settings, coordinates = stages.settings, stages.coordinates
-    num = max(FEWEST, int(settings.checked_share * settings.num_histories / 2))
-    with forked_generators(int(rng.integers(2**62))):
-        theta = belief.sample(torch.Size([num])).float()
-    z = coordinates.to_z(theta)
-    delta = likelihood(theta) - belief.log_likelihood(z)
-    delta = np.where(np.isfinite(delta), delta, -np.inf)
-    top = delta.max()
-    if not np.isfinite(top):
-        divergence, shift = np.inf, np.inf
-    else:
-        weight = np.exp(delta - top)
-        counts = np.isfinite(delta)
-        mean = delta[counts].mean() if counts.all() else -np.inf
-        divergence = max(0.0, float(top + np.log(weight.mean()) - mean))
-        weight = weight / weight.sum()
-        shift = float(np.abs((weight @ z - z.mean(0)) / (z.std(0) + 1e-300)).max())
-    limits = settings.largest_divergence, settings.largest_shift
-    return Confirmation(divergence, shift, likelihood.table.num_simulations, limits)
 
 
 def by_replicates(
@@ -158,4 +109,4 @@ def by_replicates(
         error = float(moves[:, worst].std() / np.sqrt(len(moves)))
     used = histories.num_simulations - before
     limit = max(settings.largest_shift, STANDARD_ERRORS * error)
-    return Confirmation(None, shift, used, (settings.largest_divergence, limit))
+    return Confirmation(shift, used, limit)

@@ -14,22 +14,13 @@ from torch.distributions import Distribution
 from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.beliefs.comparison import compare_orders
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.inference.declared.contradiction import (
-    MAX_INFLATIONS,
-    Contradiction,
-    contradiction_at,
-)
+from sbi_active.inference.declared import SimulatedBelief, refine_declared
+from sbi_active.inference.declared.contradiction import MAX_INFLATIONS, Contradiction
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.declared.simulated import ExactRecord, refine_exactly
-from sbi_active.inference.declared.simulated_belief import SimulatedBelief
-from sbi_active.inference.declared.simulated_likelihood import SimulatedLikelihood
-from sbi_active.inference.refinement.confirmation import (
-    Confirmation,
-    by_likelihoods,
-    by_replicates,
-)
+from sbi_active.inference.declared.simulated_belief import DeclaredRecord
+from sbi_active.inference.refinement.confirmation import by_replicates
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.stages import MANY, Stages, Task
+from sbi_active.inference.refinement.stages import Stages, Task
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.threads import single_thread
@@ -42,29 +33,25 @@ def refine(
     x: Tensor,
     *,
     start: Distribution | Sequence[Distribution] | None = None,
-    past: HistoryRecord | None = None,
+    past: HistoryRecord | DeclaredRecord | None = None,
     settings: RefinementOptions | None = None,
     seed: int,
 ) -> LearnedBelief | SimulatedBelief:
     r"""Return the posterior of all trials given the original prior.
 
-    Stage by stage, over the whole prior and then in ellipsoids around what is still
-    plausible: simulate every executed action at each parameter set, regress the
-    outcomes on the parameters (:mod:`.surrogate`), sample prior
-    times surrogate likelihood without simulations
-    (:func:`.population_monte_carlo`), and put new
-    ellipsoids around the sample. It ends when the residuals are pure noise and a stage
-    changes nothing, or when the budget is spent.
+    Where the simulator is noise-free beside a declared noise, a simulation gives the
+    likelihood itself, and the posterior is sampled with that (:func:`.infer`).
 
-    Misfit that stays, as of a response that jumps, is no noise. Where the simulator is
-    noise-free beside a declared noise, a simulation gives the likelihood itself, and
-    the posterior is then sampled with that
-    (:func:`.importance_sample`), from the learned posterior or from the draws of the
-    earlier call; beyond six parameters at once, from Gauss-Newton modes.
+    Of any other simulator it is learned, stage by stage, over the whole prior and then
+    in ellipsoids around what is still plausible: simulate every executed action at each
+    parameter set, regress the outcomes on the parameters (:mod:`.surrogate`), sample
+    prior times surrogate likelihood without simulations
+    (:func:`.population_monte_carlo`), and put new ellipsoids around the sample. It ends
+    when the residuals are pure noise and a stage changes nothing, or when the budget is
+    spent.
 
     A trial without a measurement counts by the probability of having none, one that was
     partly observed by the numbers that were (:mod:`.outcomes`).
-
 
     Args:
         simulator: ``simulator(theta, action)``; not kept in the result.
@@ -108,9 +95,13 @@ def refine(
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
     task = Task(simulator, prior, action, outcome, [*hints], settings)
     with single_thread():
-        belief, many = None, parameter_dim(prior) > MANY
-        if many or outcome[0].numel() > settings.max_regressed:
-            belief = task.many(past, seed, weighted=not many)
+        belief = refine_declared(
+            *(simulator, prior, action, outcome),
+            hints=task.hints,
+            past=past,
+            settings=settings,
+            seed=seed,
+        )
         if belief is None:
             belief = _within_memory(task, past, seed)
         if settings.check_order and isinstance(belief, LearnedBelief):
@@ -121,11 +112,9 @@ def refine(
     return belief
 
 
-def _within_memory(
-    task: Task, past: HistoryRecord | None, seed: int
-) -> LearnedBelief | SimulatedBelief:
+def _within_memory(task: Task, past: object, seed: int) -> LearnedBelief:
     try:
-        return _few(task, past, seed)
+        return _learned(task, past, seed)
     except RuntimeError as error:
         if "allocate memory" not in str(error):
             raise
@@ -136,79 +125,26 @@ def _within_memory(
         ) from error
 
 
-def _few(
-    task: Task, past: HistoryRecord | None, seed: int
-) -> LearnedBelief | SimulatedBelief:
-    """Return the belief of a regression, or of what takes its place where it fails."""
-    belief = _continued(task, past, seed)
-    if belief is not None and _is_consistent(task, belief, seed):
-        return belief
-    stages = Stages(task, past, seed)
-    belief = stages.run()
-    contradiction = stages.contradiction()
-    if contradiction is not None or not _is_consistent(task, belief, seed):
-        wider = task.many(None, seed, weighted=True)
-        return wider or _inflated(stages, belief, contradiction, seed)
-    if isinstance(belief, SimulatedBelief):
-        return belief
-    belief.diagnostics = _confirmed(stages, belief, seed).noted(belief.diagnostics)
-    if not belief.diagnostics.trustworthy:
-        other = task.many(None, seed, weighted=True)
-        if other is not None and other.diagnostics.trustworthy:
-            return other
+def _learned(task: Task, past: object, seed: int) -> LearnedBelief:
+    """Return the belief of a regression, of a wider noise where trials contradict."""
+    known = past if isinstance(past, HistoryRecord) else None
+    stages = Stages(task, known, seed)
+    belief, contradiction = stages.run(), stages.contradiction()
+    if contradiction is not None:
+        return _inflated(stages, belief, contradiction, seed)
+    rng = np.random.default_rng(derive_seed(seed, "confirm"))
+    found = by_replicates(stages, belief, rng)
+    belief.diagnostics = found.noted(belief.diagnostics)
     return belief
 
 
-def _continued(
-    task: Task, past: HistoryRecord | None, seed: int
-) -> SimulatedBelief | None:
-    """Return the belief that goes on from the draws of a simulated likelihood."""
-    if not isinstance(past, ExactRecord):
-        return None
-    if not past.leads_to(task.simulator, task.action, task.outcome):
-        return None
-    past.table.workers = task.settings.workers
-    return refine_exactly(
-        task.prior,
-        SimulatedLikelihood(past.table, task.action, task.outcome),
-        past.coordinates,
-        first=[],
-        histories=past,
-        pool=past.pool,
-        settings=task.settings,
-        seed=seed,
-    )
-
-
-def _is_consistent(
-    task: Task, belief: LearnedBelief | SimulatedBelief, seed: int
-) -> bool:
-    """Return whether the best draw of a simulated likelihood explains all trials."""
-    if not isinstance(belief, SimulatedBelief):
-        return True
-    record = belief.histories
-    assert isinstance(record, ExactRecord)
-    best = record.coordinates.to_theta(
-        record.pool.z[[record.pool.log_likelihood.argmax()]]
-    )
-    likelihood = SimulatedLikelihood(record.table, task.action, task.outcome)
-    rng = np.random.default_rng(derive_seed(seed, "consistent"))
-    level = task.settings.contradiction_level
-    return contradiction_at(likelihood, best, level=level, rng=rng) is None
-
-
 def _inflated(
-    stages: Stages,
-    belief: LearnedBelief | SimulatedBelief,
-    contradiction: Contradiction | None,
-    seed: int,
-) -> LearnedBelief | SimulatedBelief:
+    stages: Stages, belief: LearnedBelief, first: Contradiction, seed: int
+) -> LearnedBelief:
     """Return a belief by simulations with noise as large as the trials scatter."""
-    first, task = contradiction, stages.task
+    task, contradiction = stages.task, first
     histories, sds, inflation = belief.histories, stages.histories.noise_sds, 1.0
     for number in range(MAX_INFLATIONS):
-        if first is None or contradiction is None:
-            break
         inflation *= contradiction.inflation
         stages = Stages(
             task,
@@ -216,22 +152,13 @@ def _inflated(
             derive_seed(seed, "inflated", number),
             further_noise=np.sqrt(max(inflation**2 - 1, 0.0)) * sds,
         )
-        belief, contradiction = stages.run(), stages.contradiction()
-    if first is not None:
-        known = replace(first, inflation=inflation).noted(belief.diagnostics)
-        belief.diagnostics = known
-        belief.histories = histories  # those without the further noise
+        belief, now = stages.run(), stages.contradiction()
+        if now is None:
+            break
+        contradiction = now
+    belief.diagnostics = replace(first, inflation=inflation).noted(belief.diagnostics)
+    belief.histories = histories  # those without the further noise
     return belief
-
-
-def _confirmed(stages: Stages, belief: LearnedBelief, seed: int) -> Confirmation:
-    """Compare a learned belief with simulations that it was not fitted to."""
-    task, rng = stages.task, np.random.default_rng(derive_seed(seed, "confirm"))
-    table = task.table(stages.coordinates)
-    if table is not None:
-        likelihood = SimulatedLikelihood(table, task.action, task.outcome)
-        return by_likelihoods(stages, belief, likelihood, rng)
-    return by_replicates(stages, belief, rng)
 
 
 def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

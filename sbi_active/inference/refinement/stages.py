@@ -12,24 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.declared.bridged import BridgedBelief, refine_many
 from sbi_active.inference.declared.contradiction import (
     Contradiction,
     compared,
 )
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.declared.simulated import refine_exactly
-from sbi_active.inference.declared.simulated_belief import SimulatedBelief
-from sbi_active.inference.declared.simulated_likelihood import (
-    MeanTable,
-    SimulatedLikelihood,
-    declares_noise,
-)
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
 from sbi_active.inference.refinement.regression_error import SMALL, widened
 from sbi_active.inference.refinement.trust import (
-    SERIOUS_MISFIT,
     Course,
     Stage,
     diagnose,
@@ -53,12 +44,10 @@ from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
 Array = NDArray[Any]
 
-HALF = 0.5  # of the budget, after which misfit is taken to stay
 MANY = 6  # parameters beyond which each covariance needs more particles
 MOST_FORCED = 32  # regions that split misfit, as many as the options allow
 MIN_STAGE = 60  # histories below which another stage adds nothing; more by dimension
@@ -74,47 +63,6 @@ class Task:
     outcome: Tensor
     hints: list[Distribution]
     settings: RefinementOptions
-
-    def table(self, coordinates: PriorCoordinates) -> MeanTable | None:
-        """Return where noise-free outcomes are simulated; None without declared noise.
-
-        Args:
-            coordinates: Coordinates of the prior.
-        """
-        few = coordinates.sample_prior(8, np.random.default_rng(0))
-        theta, action = coordinates.to_theta(few), self.action[:1].expand(8, -1)
-        if not declares_noise(self.simulator, theta, action):
-            return None
-        return MeanTable(self.simulator, self.settings.workers)
-
-    def many(
-        self, past: HistoryRecord | None, seed: int, *, weighted: bool = False
-    ) -> BridgedBelief | None:
-        """Return the belief by Gauss-Newton steps and sequential Monte Carlo.
-
-        Args:
-            past: Of an earlier call, as in :func:`.refine`.
-            seed: Seed of everything random.
-            weighted: Whether to end with an importance sample.
-        """
-        return refine_many(
-            self.simulator,
-            self.prior,
-            self.action,
-            self.outcome,
-            hints=self.hints,
-            past=past,
-            settings=self.settings,
-            seed=seed,
-            weighted=weighted,
-        )
-
-    def jumps(self, stage: Stage) -> bool:
-        """Return whether misfit is serious and the likelihood can be simulated."""
-        if stage.excess <= SERIOUS_MISFIT:
-            return False
-        few = stage.surrogate.coordinates.to_theta(stage.draws[:8])
-        return declares_noise(self.simulator, few, self.action[:1].expand(8, -1))
 
 
 class Stages:
@@ -148,7 +96,7 @@ class Stages:
         self.course, self.num_forced = Course(), 1
         self.least = max(MIN_STAGE, 2 * fewest_rows(self.coordinates.dim))
 
-    def run(self) -> LearnedBelief | SimulatedBelief:
+    def run(self) -> LearnedBelief:
         """Return the belief of the last stage."""
         while True:
             self._simulate(self._size())
@@ -159,14 +107,10 @@ class Stages:
             if stage.error > SMALL and self.course.stages:
                 stage = self._with_more(stage)
             self.course.append(stage)
-            enough = self.histories.num_drawn >= HALF * self.settings.num_histories
-            is_settled = is_last or self.course.is_settled
-            if is_settled or (enough and self.task.jumps(stage)):
+            if is_last or self.course.is_settled:
                 break
             self._propose(stage, next_size)
-        can_be_exact = self.histories.further_noise is None and self.task.jumps(stage)
-        exact = self._simulated(stage) if can_be_exact else None
-        return self._learned(stage, fitted) if exact is None else exact
+        return self._learned(stage, fitted)
 
     def contradiction(self) -> Contradiction | None:
         """Return what contradicts at the draw that the last stage explains best."""
@@ -294,27 +238,6 @@ class Stages:
             return stage
         wide = self._sample(surrogate, stage.particles.proposal)
         return replace(wide, error=wide.error + bias)
-
-    def _simulated(self, stage: Stage) -> SimulatedBelief | None:
-        """Return the belief of the likelihood itself; None where few draws count."""
-        task, count = self.task, self.settings.num_histories // 4
-        assert isinstance(task.simulator, SimulatorModel)
-        table = MeanTable(task.simulator, self.settings.workers)
-        prior = PriorProposal(self.coordinates)
-        exact = refine_exactly(
-            task.prior,
-            SimulatedLikelihood(table, task.action, task.outcome),
-            self.coordinates,
-            first=[(count, prior), (count, stage.particles.proposal)],
-            histories=self.histories.record(),
-            pool=None,
-            settings=self.settings,
-            seed=self.seed,
-        )
-        if exact is not None:
-            spent = exact.diagnostics.num_simulations + self.histories.num_simulations
-            exact.diagnostics = exact.diagnostics.extended(num_simulations=spent)
-        return exact
 
     def _learned(self, stage: Stage, fitted: Surrogate) -> LearnedBelief:
         """Return the belief of the last stage, and judge it.

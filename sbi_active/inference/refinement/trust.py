@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
-from sbi_active.inference.declared.simulated import misplaced
+from sbi_active.inference.declared.diagnosing import misplaced
 from sbi_active.inference.refinement.regression_error import (
     SMALL,
     expected_error,

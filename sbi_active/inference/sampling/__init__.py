@@ -4,7 +4,6 @@ Here live tools that know a density and nothing of trials, networks or simulator
 """
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.kernels import EitherProposal, KernelProposal
 from sbi_active.inference.sampling.population import (
     GaussianMixture,
     Particles,
@@ -15,9 +14,7 @@ from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
 __all__ = [
-    "EitherProposal",
     "GaussianMixture",
-    "KernelProposal",
     "Particles",
     "PriorCoordinates",
     "StudentProposal",

@@ -30,8 +30,10 @@ class Proposal(Protocol):
         ...
 
 
-def log_student(square: Array, log_volume: Array, dim: int) -> Array:
-    r"""Return log densities of multivariate t distributions of 5 degrees of freedom.
+def log_student(
+    square: Array, log_volume: Array, dim: int, freedom: float = FREEDOM
+) -> Array:
+    r"""Return log densities of multivariate t distributions.
 
     .. math::
         \log \Gamma\big(\tfrac{\nu + d}{2}\big) - \log \Gamma\big(\tfrac{\nu}{2}\big)
@@ -42,13 +44,14 @@ def log_student(square: Array, log_volume: Array, dim: int) -> Array:
         square: :math:`\|L^{-1} (z - m)\|^2`, any shape.
         log_volume: :math:`\log |L|`, a shape that broadcasts with it.
         dim: d.
+        freedom: Degrees of freedom, :math:`\nu`.
     """
     constant = (
-        gammaln(0.5 * (FREEDOM + dim))
-        - gammaln(0.5 * FREEDOM)
-        - 0.5 * dim * np.log(np.pi * FREEDOM)
+        gammaln(0.5 * (freedom + dim))
+        - gammaln(0.5 * freedom)
+        - 0.5 * dim * np.log(np.pi * freedom)
     )
-    tail = 0.5 * (FREEDOM + dim) * np.log1p(square / FREEDOM)
+    tail = 0.5 * (freedom + dim) * np.log1p(square / freedom)
     return constant - log_volume - tail
 
 
@@ -66,16 +69,18 @@ class StudentMixture:
         means: Shape (k, dim).
         factors: Lower Cholesky factors of the scale matrices, shape (k, dim, dim).
         weights: Sum to 1, shape (k,); None has equal ones.
+        freedom: Degrees of freedom.
     """
 
     means: Array
     factors: Array
     weights: Array | None = None
+    freedom: float = FREEDOM
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return draws, shape (n, dim), each component's share of them fixed."""
         normal = rng.normal(size=(num_samples, self.means.shape[1]))
-        square = rng.chisquare(FREEDOM, size=(num_samples, 1)) / FREEDOM
+        square = rng.chisquare(self.freedom, size=(num_samples, 1)) / self.freedom
         return self.moved(self.components(num_samples), normal / np.sqrt(square))
 
     def components(self, num: int) -> NDArray[np.int64]:
@@ -99,7 +104,92 @@ class StudentMixture:
         apart = (z - self.means[:, None]).transpose(0, 2, 1)
         square = (np.linalg.solve(self.factors, apart) ** 2).sum(1)
         log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
-        return log_student(square, (log_volume - np.log(weights))[:, None], z.shape[1])
+        log_volume = (log_volume - np.log(weights))[:, None]
+        return log_student(square, log_volume, z.shape[1], self.freedom)
+
+
+@dataclass(frozen=True)
+class SplitStudentMixture(Proposal):
+    r"""Mixture of t distributions whose widths differ from side to side.
+
+    With e of a t distribution of unit scale,
+
+    .. math::
+        u = m + A\, (s \odot e), \qquad s_i = r_i \text{ if } e_i > 0,
+        \text{ else } l_i,
+
+    which is piecewise linear: its density is that of e over
+    :math:`|A| \prod_i s_i`.
+
+    Attributes:
+        means: m, shape (k, d).
+        axes: A, whose columns are axes of unit scale, shape (k, d, d).
+        left: l, shape (k, d).
+        right: r, shape (k, d).
+        weights: Sum to 1, shape (k,).
+        freedom: Degrees of freedom.
+
+    References:
+        Geweke, Econometrica 57 (1989).
+    """
+
+    means: Array
+    axes: Array
+    left: Array
+    right: Array
+    weights: Array
+    freedom: float = FREEDOM
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
+        which = systematic(self.weights, num_samples, rng.random())
+        normal = rng.standard_normal((num_samples, self.means.shape[1]))
+        square = rng.chisquare(self.freedom, (num_samples, 1)) / self.freedom
+        e = normal / np.sqrt(square)
+        step = e * np.where(e > 0, self.right[which], self.left[which])
+        return self.means[which] + np.einsum("nij,nj->ni", self.axes[which], step)
+
+    def log_prob(self, z: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        apart = (z - self.means[:, None]).transpose(0, 2, 1)
+        step = np.linalg.solve(self.axes, apart)  # (k, d, n)
+        scale = np.where(step > 0, self.right[..., None], self.left[..., None])
+        volume = np.linalg.slogdet(self.axes)[1][:, None] + np.log(scale).sum(1)
+        volume = volume - np.log(self.weights)[:, None]
+        square = ((step / scale) ** 2).sum(1)
+        parts = log_student(square, volume, z.shape[1], self.freedom)
+        return log_sum_exp(parts, axis=0)
+
+
+@dataclass(frozen=True)
+class NormalMixture(Proposal):
+    """Normal components.
+
+    Attributes:
+        weights: Sum to 1, shape (k,).
+        means: Shape (k, d).
+        factors: Lower Cholesky factors, shape (k, d, d).
+    """
+
+    weights: Array
+    means: Array
+    factors: Array
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
+        which = systematic(self.weights, num_samples, rng.random())
+        step = rng.standard_normal((num_samples, self.means.shape[1]))
+        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], step)
+
+    def log_prob(self, z: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        parts = [
+            np.log(w) + log_normal(z, mean, factor)
+            for w, mean, factor in zip(
+                self.weights, self.means, self.factors, strict=True
+            )
+        ]
+        return log_sum_exp(np.stack(parts), axis=0)
 
 
 @dataclass(frozen=True)
@@ -135,3 +225,10 @@ class Defended(Proposal):
             np.log1p(-self.share) + self.main.log_prob(z),
             np.log(self.share) + self.base.log_prob(z),
         )
+
+
+def log_normal(z: Array, mean: Array, factor: Array) -> Array:
+    """Return log normal densities, shape (n,), of places (n, d)."""
+    step = np.linalg.solve(factor, (z - mean).T)
+    volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
+    return -0.5 * (step**2).sum(0) - volume

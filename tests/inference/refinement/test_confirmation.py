@@ -3,76 +3,65 @@
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch.distributions import Independent, Normal
 
-from sbi_active.inference.refinement.confirmation import by_likelihoods
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.refinement.confirmation import by_replicates
+from sbi_active.inference.refinement.stages import Stages, Task
+
+PRIOR = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
+ACTION = torch.tensor([[1.0], [2.0]])
 
 
-class Normal:
-    """A belief over two coordinates with the likelihood that led to it."""
+def simulator(theta, action):
+    mean = torch.stack([theta[:, 0] * action[:, 0], theta.sum(1)], 1)
+    return mean + 0.1 * torch.randn_like(mean)
 
-    def __init__(self, mean, sd):
-        self.mean, self.sd = torch.tensor(mean).float(), torch.tensor(sd).float()
+
+class Moved:
+    """A belief that is off by some deviations."""
+
+    def __init__(self, belief, by):
+        self.belief = belief
+        self.off = by * belief.variance.sqrt()
 
     def sample(self, shape):
-        return self.mean + self.sd * torch.randn(*shape, 2)
-
-    def log_likelihood(self, z):
-        return log_normal(z, self.mean.double().numpy(), self.sd.double().numpy())
+        return self.belief.sample(shape) + self.off
 
 
-def log_normal(z, mean, sd):
-    return -0.5 * (((z - mean) / sd) ** 2).sum(1) - np.log(sd).sum()
+@pytest.mark.parametrize("by", [0.0, 1.0])
+def test_a_mean_that_the_regression_is_right_about_holds(by):
+    x = torch.tensor([[0.5, 0.9], [1.0, 0.9]])
+    settings = RefinementOptions(num_histories=1_000)
+    task = Task(simulator, PRIOR, ACTION, x.double(), [], settings)
+    torch.manual_seed(0)
+    stages = Stages(task, None, 0)
+    belief = stages.run()
+    # Fresh simulations judge the regression, wherever the draws lie.
+    found = by_replicates(stages, Moved(belief, by), np.random.default_rng(0))
+    assert found.shift < 0.3
+    assert found.holds
+    assert found.num_simulations == 2 * 100
 
 
-class Likelihood:
-    """The exact likelihood: a standard normal."""
-
-    class table:  # noqa: N801
-        num_simulations = 7
-
-    def __call__(self, theta: Tensor):
-        return log_normal(theta.double().numpy(), np.zeros(2), np.ones(2))
-
-
-class Stages:
-    class settings:  # noqa: N801
-        checked_share, num_histories = 0.5, 4_000
-        largest_divergence, largest_shift = 0.1, 0.3
-
-    class coordinates:  # noqa: N801
-        @staticmethod
-        def to_z(theta):
-            return theta.double().numpy()
-
-
-@pytest.mark.parametrize(
-    ("mean", "sd", "kl", "rel", "holds"),
-    [
-        ([0.0, 0.0], [1.0, 1.0], 0.0, 0.15, True),
-        ([0.1, 0.0], [1.0, 1.0], 0.005, 0.15, True),
-        ([0.6, 0.0], [1.0, 1.0], 0.18, 0.15, False),
-        ([0.0, 0.0], [0.5, 0.5], 0.636, 0.6, False),
-        ([0.5, 0.5], [0.8, 0.8], 0.336, 0.15, False),
-    ],
-)
-def test_divergence_of_normal_beliefs_is_the_exact_one(mean, sd, kl, rel, holds):
-    found = by_likelihoods(
-        Stages(), Normal(mean, sd), Likelihood(), np.random.default_rng(0)
+def test_a_regression_that_is_off_does_not():
+    x = torch.tensor([[0.5, 0.9], [1.0, 0.9]])
+    task = Task(
+        simulator, PRIOR, ACTION, x.double(), [], RefinementOptions(num_histories=1_000)
     )
-    # Of 1,000 draws; the weights of a belief that is half as wide have no variance.
-    assert found.divergence == pytest.approx(kl, rel=rel, abs=0.005)
-    assert found.holds is holds
-    assert found.num_simulations == 7
+    torch.manual_seed(0)
+    stages = Stages(task, None, 0)
+    belief = stages.run()
+    fresh = stages.histories.fresh
 
+    def other(theta):
+        x, lost = fresh(theta)
+        return x + 0.1, lost
 
-def test_a_likelihood_that_is_nowhere_finite_confirms_nothing():
-    class Nowhere(Likelihood):
-        def __call__(self, theta):
-            return np.full(len(theta), -np.inf)
-
-    found = by_likelihoods(
-        Stages(), Normal([0.0, 0.0], [1.0, 1.0]), Nowhere(), np.random.default_rng(0)
-    )
+    stages.histories.fresh = other  # a deviation of the noise, in all numbers
+    found = by_replicates(stages, belief, np.random.default_rng(0))
     assert not found.holds
-    assert found.shift == np.inf
+    assert found.shift > 0.5
+    noted = found.noted(belief.diagnostics)
+    assert noted.trustworthy is False
+    assert "its mean is off by" in noted.warnings[-1]

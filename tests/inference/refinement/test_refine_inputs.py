@@ -17,6 +17,7 @@ from torch.distributions import (
 )
 
 from sbi_active.inference import RefinementOptions, refine
+from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior
@@ -155,7 +156,9 @@ def test_past_histories_are_used_first():
 def test_the_record_keeps_outcomes_and_pairs():
     task = get_task("numerical")
     action, x = torch.tensor([[0.0]]), torch.tensor([[-60.0]])
-    past = refine(task.simulator, task.prior, action, x, seed=0).histories
+    # Called by its method, it declares no noise.
+    past = refine(task.simulator.__call__, task.prior, action, x, seed=0).histories
+    assert isinstance(past, HistoryRecord)
     assert past.x.shape == (len(past.theta), 1, 1)
     mean = task.simulator.mean(past.theta, action.expand(len(past.theta), 1))
     residual = torch.from_numpy(past.x[:, :, 0]) - mean
@@ -174,7 +177,7 @@ def test_a_lack_of_memory_is_said(monkeypatch):
     def lacking(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
 
-    monkeypatch.setattr("sbi_active.inference.refinement.refining._few", lacking)
+    monkeypatch.setattr("sbi_active.inference.refinement.refining._learned", lacking)
     one = torch.ones(1, 1)
     with pytest.raises(MemoryError, match="belief of 2 parameters; got none left"):
-        refine(numerical(), BOX, one, one, seed=0)
+        refine(numerical().__call__, BOX, one, one, seed=0)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from sbi_active.inference.sampling.kernels import KernelMixture
+from benchmarks.location_finding.kernels import KernelMixture
 from sbi_active.inference.sampling.population import GaussianMixture, WidenedMixture
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
+    SplitStudentMixture,
     StudentMixture,
     student_steps,
 )
@@ -77,3 +78,26 @@ def test_a_defended_proposal_mixes_densities_and_draws():
     assert len(draws) == 20_000
     # Of the far kernels' draws half lie at the second mean.
     assert (draws[:, 0] > 1.5).mean() == pytest.approx(0.15, abs=0.01)
+
+
+def test_a_split_mixture_is_normalized_and_matches_its_draws():
+    rng = np.random.default_rng(0)
+    axes = FACTORS @ np.array([[0.8, -0.6], [0.6, 0.8]])
+    left, right = np.array([[1.0, 1.0], [2.0, 1.0]]), np.array([[3.0, 1.0], [1.0, 0.5]])
+    split = SplitStudentMixture(MEANS, axes, left, right, WEIGHTS, 7.0)
+    wide = StudentMixture(MEANS, 4 * FACTORS, WEIGHTS)
+    z = wide.sample(200_000, rng)
+    ratio = np.exp(split.log_prob(z) - wide.log_prob(z))
+    error = ratio.std() / len(z) ** 0.5
+    assert ratio.mean() == pytest.approx(1.0, abs=4 * error)
+    draws = split.sample(200_000, rng)
+    for region in (lambda u: u[:, 0] > 3.0, lambda u: u[:, 1] > u[:, 0]):
+        expected = (ratio * region(z)).mean()
+        assert region(draws).mean() == pytest.approx(expected, abs=0.02)
+
+
+def test_a_split_mixture_of_equal_sides_is_a_student_mixture():
+    ones = np.ones((2, 2))
+    split = SplitStudentMixture(MEANS, FACTORS, ones, ones, WEIGHTS)
+    mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
+    assert split.log_prob(Z) == pytest.approx(mixture.log_prob(Z))

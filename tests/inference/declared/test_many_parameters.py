@@ -8,9 +8,9 @@ from torch.distributions import Independent, LogNormal, MultivariateNormal, Norm
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
-from sbi_active.inference.declared.bridged import BridgedBelief
-from sbi_active.inference.declared.gauss_newton import WhitenedTrials, find_laplace
-from sbi_active.inference.declared.simulated_likelihood import (
+from sbi_active.inference.declared import SimulatedBelief
+from sbi_active.inference.engine import SimulatedPotential, search
+from sbi_active.inference.engine.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,
 )
@@ -44,7 +44,7 @@ def test_linear_models_have_their_exact_density(num):
     model, action, x, exact = linear(dim, num)
     prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
     belief = refine(model, prior, action, x, seed=1)
-    assert isinstance(belief, BridgedBelief)
+    assert isinstance(belief, SimulatedBelief)
     with forked_generators(0):
         theta = exact.sample(torch.Size([200]))
         draws = belief.sample((5_000,)).double()
@@ -67,7 +67,7 @@ def test_uninformed_parameters_keep_their_prior():
     simulator = SimulatorModel(mean, noise=GaussianNoise(0.5))
     x = mean(torch.ones(1, dim), action)
     belief = refine(simulator, prior, action, x, seed=0)
-    assert isinstance(belief, BridgedBelief)
+    assert isinstance(belief, SimulatedBelief)
     assert belief.free.tolist() == [False] * known + [True] * (dim - known)
     with forked_generators(3):
         draws = belief.sample((4_000,))[:, known:].log() / 0.4
@@ -95,7 +95,7 @@ def test_correlated_priors_are_not_split():
     belief = refine(
         simulator, prior, torch.zeros(1, 1), torch.full((1, 1), 2.0), seed=0
     )
-    assert isinstance(belief, BridgedBelief)
+    assert isinstance(belief, SimulatedBelief)
     assert not belief.free.any()
     with forked_generators(0):
         draws = belief.sample((4_000,))
@@ -130,7 +130,7 @@ def test_other_simulators_are_regressed():
 
     prior = Independent(Normal(torch.zeros(7), torch.ones(7)), 1)
     belief = refine(simulator, prior, torch.zeros(1, 1), torch.zeros(1, 7), seed=0)
-    assert not isinstance(belief, BridgedBelief)
+    assert not isinstance(belief, SimulatedBelief)
 
 
 def test_a_chain_is_trustworthy():
@@ -158,7 +158,7 @@ def test_searches_that_agree_on_a_wrong_place_go_on(seed):
     c = NormalCoordinates(PriorCoordinates(task.prior, rng), rng)
     table = MeanTable(task.simulator, IN_PROCESS)
     likelihood = SimulatedLikelihood(table, action, x.double())
-    found = find_laplace(WhitenedTrials(likelihood, c), rng)
+    found = search(SimulatedPotential(likelihood, c), rng)
     assert found is not None
     best, truth = likelihood(c.to_theta(found.modes[:1])), task.theta_true[None]
     assert float(best[0]) > float(likelihood(truth)[0]) - 3
@@ -169,7 +169,7 @@ def test_many_numbers_of_a_trial_are_not_regressed():
     model, action, x, exact = linear(2, 3_000)
     prior = MultivariateNormal(torch.zeros(2), torch.eye(2))
     belief = refine(model, prior, action, x, seed=0)
-    assert isinstance(belief, BridgedBelief)
+    assert isinstance(belief, SimulatedBelief)
     assert belief.diagnostics.trustworthy
     sd = exact.covariance_matrix.diagonal().sqrt()
     torch.manual_seed(0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.inference.sampling.student_mixture import Proposal, log_normal
 from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
@@ -23,40 +23,8 @@ Array = NDArray[Any]
 SHARE = 0.5  # particles that a step leaves effective
 MAX_STEPS = 200
 ACCEPTED = 0.35  # share of moves that the step's length is adapted to
-FORGOTTEN = 0.5  # correlation with the start after the moves of a step
-SETTLED = 0.03  # the same after the last ones
+FORGOTTEN = 0.05  # correlation with the start after the moves of a step
 SHRUNK = 0.05  # share of the guess's covariance in that of the particles
-
-
-@dataclass(frozen=True)
-class NormalMixture(Proposal):
-    """Normal components.
-
-    Attributes:
-        weights: Sum to 1, shape (k,).
-        means: Shape (k, d).
-        factors: Lower Cholesky factors, shape (k, d, d).
-    """
-
-    weights: Array
-    means: Array
-    factors: Array
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, d)."""
-        which = systematic(self.weights, num_samples, rng.random())
-        step = rng.standard_normal((num_samples, self.means.shape[1]))
-        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], step)
-
-    def log_prob(self, z: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        parts = [
-            np.log(w) + _log_normal(z, mean, factor)
-            for w, mean, factor in zip(
-                self.weights, self.means, self.factors, strict=True
-            )
-        ]
-        return log_sum_exp(np.stack(parts), axis=0)
 
 
 @dataclass(frozen=True)
@@ -94,7 +62,6 @@ def bridge(
     most: float = np.inf,
     max_moves: int = 100,
     forgotten: float = FORGOTTEN,
-    settled: float = SETTLED,
 ) -> Bridged | None:
     r"""Return particles of :math:`p(u) L(u)`, or None where it takes too many moves.
 
@@ -122,8 +89,9 @@ def bridge(
         num_particles: n.
         most: Evaluations of the likelihood at most.
         max_moves: A step.
-        forgotten: Correlation with where they were that ends the moves of a step.
-        settled: That of the last step.
+        forgotten: Correlation with where they were that ends the moves of a step. At
+            half the evidence is not known better; at .5 particles lag behind, and in 20
+            dimensions the log evidence is off by twenty times its error.
 
     References:
         Del Moral, Doucet & Jasra, J. R. Stat. Soc. B 68 (2006); Cotter, Roberts, Stuart
@@ -166,7 +134,7 @@ def bridge(
         family = np.bincount(which, minlength=n)
         u, target, start, b = u[which], target[which], start[which], power
         factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
-        kept, goal = 1.0, settled if b == 1 else forgotten
+        kept = 1.0
         for _ in range(max_moves):
             new = mean + np.sqrt(1 - length**2) * (u - mean)
             new = new + length * rng.standard_normal(u.shape) @ factor.T
@@ -174,7 +142,7 @@ def bridge(
             spent += n
             with np.errstate(invalid="ignore"):
                 gain = b * (new_target - target) + (1 - b) * (new_start - start)
-            gain = gain + _log_normal(u, mean, factor) - _log_normal(new, mean, factor)
+            gain = gain + log_normal(u, mean, factor) - log_normal(new, mean, factor)
             accept = np.log(rng.random(n)) < np.where(np.isnan(gain), -np.inf, gain)
             u = np.where(accept[:, None], new, u)
             target = np.where(accept, new_target, target)
@@ -183,7 +151,7 @@ def bridge(
             kept *= 1 - acceptance * (1 - np.sqrt(1 - length**2))
             length = length * np.exp(acceptance - ACCEPTED)
             length = float(np.clip(length, 0.02, 1.0))
-            if kept <= goal:
+            if kept <= forgotten:
                 break
             if spent > most:
                 break
@@ -215,9 +183,3 @@ def _size(cov: Array, other: Array) -> float:
     dim = len(cov)
     logs = np.linalg.slogdet(cov + 1e-14 * np.eye(dim))[1] - np.linalg.slogdet(other)[1]
     return float(np.exp(logs / dim))
-
-
-def _log_normal(z: Array, mean: Array, factor: Array) -> Array:
-    step = np.linalg.solve(factor, (z - mean).T)
-    volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
-    return -0.5 * (step**2).sum(0) - volume

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.inference.sampling.kernels import KernelProposal
+from benchmarks.location_finding.kernels import KernelProposal
 from sbi_active.inference.sampling.student_mixture import StudentMixture
 
 

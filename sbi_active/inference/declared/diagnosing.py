@@ -1,0 +1,160 @@
+"""How far a belief by a simulated likelihood can be trusted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
+from sbi_active.inference.engine import Fit, SimulatedPotential
+from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
+from sbi_active.seeding import derive_seed, forked_generators
+
+Array = NDArray[Any]
+
+COARSE = 60.0  # effective draws, below which a warning is due
+HEAVY = 0.7  # shape of the weights' tail beyond which their mean does not settle
+MOVING = 0.02  # share of moves accepted, below which particles are stuck
+REMEMBERED = 0.3  # correlation of particles with where they began that is too much
+NUM_CHECKED = 200  # draws that tail probabilities rest on
+EDGE = 0.5  # mass within 1 % of the edge of one parameter that calls for a warning
+RARE = 1e-3  # tail probability of the observation that calls for a warning
+NUM_REPEATS = 50  # of the noise a draw
+
+
+def diagnose_fit(
+    fit: Fit, potential: SimulatedPotential, declared: SimulatedLikelihood, seed: int
+) -> Diagnostics:
+    """Return figures about a fit, what it assumes, and warnings in words.
+
+    Args:
+        fit: Posterior of the potential.
+        potential: Potential whose noise may be inflated.
+        declared: Likelihood under the noise as it was declared.
+        seed: Seed of the draws behind tail probabilities.
+    """
+    assumptions, doubts = _assumptions(fit)
+    base = potential.coordinates.base
+    z = potential.coordinates.to_z(fit.u)
+    near_edge = np.abs(z[:, base.bounded]) > 0.98
+    edge_mass = float((fit.weight @ near_edge).max(initial=0.0))
+    rng = np.random.default_rng(derive_seed(seed, "tail"))
+    rows = rng.choice(len(z), size=NUM_CHECKED, p=fit.weight)
+    tail = _tail_probability(declared, base.to_theta(z[rows]), seed)
+    warnings = [*doubts, *misplaced(tail[:-1], tail[-1], edge_mass)]
+    found = fit.found
+    return Diagnostics(
+        trustworthy=not warnings,
+        warnings=(*warnings,),
+        assumptions=assumptions,
+        effective_sample_size=fit.effective_sample_size,
+        error_nats=float(max(fit.effective_sample_size, 1e-9) ** -0.5),
+        tail_probability=tail[-1],
+        tail_probability_of_trial=(*tail[:-1],),
+        figures={
+            "likelihood": "simulated",
+            "method": fit.method,
+            "num_stages": len(fit.pool.proposals),
+            "num_modes": 0 if found is None else len(found.modes),
+            "num_uninformed": int(fit.free.sum()),
+            "log_evidence": fit.log_evidence,
+            "log_evidence_error": fit.standard_error,
+            "prior_edge_mass": edge_mass,
+        },
+    )
+
+
+def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
+    """Return what was taken for granted, and a sentence for each that fails."""
+    effective = fit.effective_sample_size
+    found = {"enough_draws": Assumption(effective >= COARSE, effective)}
+    words = {
+        "enough_draws": f"the belief rests on {effective:.0f} effective draws, so that "
+        f"its log density is off by about {max(effective, 1e-9) ** -0.5:.2g} nats; "
+        "raise num_histories"
+    }
+    if fit.particles is None:
+        shape = fit.tail_shape
+        found["light_tails"] = Assumption(shape <= HEAVY, shape)
+        words["light_tails"] = (
+            f"few draws outweigh all others (tail shape {shape:.2g}), so that the "
+            "belief may miss where they are from; raise num_histories"
+        )
+    else:
+        own = fit.particles
+        moves = own.acceptance >= MOVING and own.memory <= REMEMBERED
+        found["particles_move"] = Assumption(moves, own.acceptance)
+        words["particles_move"] = (
+            f"{own.acceptance:.1%} of the moves of the particles were accepted, too "
+            "few for them to reach the posterior; raise num_histories"
+        )
+    if fit.found is not None and not fit.is_rough:
+        twice = fit.found.num_found >= 2
+        found["mode_found_twice"] = Assumption(twice, float(fit.found.num_found))
+        words["mode_found_twice"] = (
+            f"the best mode was found by one of {fit.found.num_starts} searches, so "
+            "that a better one may be missed; check against another seed"
+        )
+    return found, [words[name] for name, a in found.items() if not a.holds]
+
+
+def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
+    """Return warnings of a belief that may be far from the truth.
+
+    By the tail probability of each trial and of all, and the belief's mass near the
+    edge of one parameter.
+    """
+    warnings = []
+    if joint < RARE or min(tail) < RARE / len(tail):
+        warnings.append(
+            f"the observations are unlike anything simulated (tail probability "
+            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
+            "excludes the truth, or a measurement is wrong"
+        )
+    if edge_mass > EDGE:
+        warnings.append(
+            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
+            "prior may exclude the truth"
+        )
+    return warnings
+
+
+def _tail_probability(
+    likelihood: SimulatedLikelihood, theta: Tensor, seed: int
+) -> list[float]:
+    r"""Return how often the noise is less likely than what was observed.
+
+    .. math::
+        P\big(p(x' | \theta) \le p(x_o | \theta)\big), \quad \theta \sim b,\;
+        x' \sim p(x | \theta),
+
+    a trial and, last, for all trials.
+
+    References:
+        Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
+    """
+    noise, size = likelihood.noise, len(theta) * NUM_REPEATS
+    total_observed, total_simulated = np.zeros(size), np.zeros(size)
+    tail = []
+    for k, (action, x) in enumerate(zip(likelihood.action, likelihood.x, strict=True)):
+        observed = np.repeat(likelihood.terms(theta, k), NUM_REPEATS)
+        simulated = np.zeros(size)
+        if bool(x.isfinite().any()):
+            mean = torch.from_numpy(likelihood.table.mean(theta, action)[0])
+            mean = mean.repeat_interleave(NUM_REPEATS, 0)
+            with forked_generators(derive_seed(seed, "tail", k)):
+                draws = noise.sample(mean).double()
+            draws = torch.where(x.isfinite(), draws, torch.nan)
+            simulated = noise.log_prob(draws, mean).double().numpy()
+        tail.append(_share(simulated <= observed))
+        total_observed += observed
+        total_simulated += simulated
+    return [*tail, _share(total_simulated <= total_observed)]
+
+
+def _share(exceeds: NDArray[np.bool_]) -> float:
+    return float((exceeds.sum() + 1) / (exceeds.size + 1))

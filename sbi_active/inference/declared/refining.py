@@ -1,0 +1,223 @@
+"""The posterior of trials under declared noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.declared.contradiction import (
+    MAX_INFLATIONS,
+    Contradiction,
+    contradiction_at,
+    find_contradiction,
+)
+from sbi_active.inference.declared.diagnosing import diagnose_fit
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.simulated_belief import (
+    DeclaredRecord,
+    SimulatedBelief,
+)
+from sbi_active.inference.engine import (
+    Fit,
+    Found,
+    Settings,
+    SimulatedPotential,
+    infer,
+    search,
+)
+from sbi_active.inference.engine.importance import Pool
+from sbi_active.inference.engine.search import STEP, unchanged
+from sbi_active.inference.engine.simulated_likelihood import (
+    MeanTable,
+    SimulatedLikelihood,
+    declares_noise,
+)
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.weights import normalized, systematic
+from sbi_active.messages import warn
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation.outcomes import MissingRowsWarning
+
+Array = NDArray[Any]
+
+NUM_HINTED = 250  # draws of each hint
+NUM_AROUND = 64  # parameters among which heavy tails have their best fit
+AROUND = 3.0  # times the width of a mode that these are drawn from
+STABLE = 1.1  # growth of the inflation below which it is settled
+
+
+def refine_declared(
+    simulator: Callable[..., Any],
+    prior: Distribution,
+    action: Tensor,
+    x: Tensor,
+    *,
+    hints: Sequence[Distribution],
+    past: object,
+    settings: RefinementOptions,
+    seed: int,
+) -> SimulatedBelief | None:
+    """Return the posterior, if its likelihood can be simulated.
+
+    Args:
+        simulator: Deterministic beside a declared noise.
+        prior: The original prior.
+        action: Executed actions, shape (t, action_dim).
+        x: Their outcomes, shape (t, *x_shape).
+        hints: Where else to look first.
+        past: Of an earlier call: draws to go on from, and what needs no simulation.
+        settings: Budget.
+        seed: Seed of everything random.
+
+    Returns:
+        None for another simulator.
+
+    Raises:
+        UnexplainedOutcomeError: If no parameters have a likelihood.
+    """
+    with forked_generators(derive_seed(seed, "few")):
+        few = prior.sample(torch.Size([4])).float()
+    if not declares_noise(simulator, few, action[:1].expand(len(few), -1)):
+        return None
+    rng = np.random.default_rng(derive_seed(seed, "declared"))
+    before = past if isinstance(past, DeclaredRecord) else None
+    if before is not None and before.leads_to(simulator, action, x):
+        coordinates, table = before.coordinates, before.table
+        table.workers = settings.workers
+    else:
+        before = None
+        coordinates = NormalCoordinates(PriorCoordinates(prior, rng), rng)
+        table = MeanTable(simulator, settings.workers)
+    spent = table.num_simulations, table.num_missing
+    declared = SimulatedLikelihood(table, action, x)
+    potential, contradiction, fit = (
+        SimulatedPotential(declared, coordinates),
+        None,
+        None,
+    )
+    own = _engine_settings(settings, len(action))
+    if before is not None:
+        fit = _gone_on(before.pool, potential, settings, own, rng)
+    if fit is None:
+        near = _near(hints, coordinates, seed)
+        potential, found, contradiction = _searched(potential, near, settings, own, rng)
+        fit = infer(potential, rng, found=found, near=near, settings=own)
+    if not len(fit.u):
+        raise UnexplainedOutcomeError(
+            "expected outcomes that some parameters may explain; got none with a "
+            "likelihood; correct the outcome, or leave the trial out"
+        )
+    belief = SimulatedBelief(prior, potential, fit, defensive=settings.defensive)
+    known = diagnose_fit(fit, potential, declared, seed)
+    if contradiction is not None:
+        known = contradiction.noted(known)
+    num_simulations = table.num_simulations - spent[0]
+    num_missing = table.num_missing - spent[1]
+    belief.diagnostics = known.extended(
+        num_simulations=num_simulations, num_missing=num_missing
+    )
+    belief.histories = DeclaredRecord((action, x), coordinates, table, fit.pool)
+    if num_missing:
+        warn(
+            f"{num_missing} of {num_simulations} simulations of the refinement are "
+            "missing, by faults of the simulator; their draws were left out",
+            MissingRowsWarning,
+            stacklevel=5,
+        )
+    return belief
+
+
+def _engine_settings(settings: RefinementOptions, num_trials: int) -> Settings:
+    num_draws = settings.num_draws or max(settings.num_histories // 6, 100)
+    return Settings(
+        num_effective=settings.num_effective,
+        num_simulations=3 * settings.num_histories * num_trials,
+        num_draws=num_draws,
+    )
+
+
+def _near(
+    hints: Sequence[Distribution], coordinates: NormalCoordinates, seed: int
+) -> Array | None:
+    """Return draws of all hints, shape (n, d), those first that stand for each."""
+    drawn, base = [], coordinates.base
+    for hint in hints[:2]:
+        with forked_generators(derive_seed(seed, "start")):
+            z = base.to_z(hint.sample(torch.Size([NUM_HINTED])).float())
+        inside = base.inside(z)
+        if inside.any():
+            drawn.append(coordinates.from_z(z[inside]))
+    if not drawn:
+        return None
+    return np.concatenate([*[u[:1] for u in drawn], *[u[1:] for u in drawn]])
+
+
+def _gone_on(
+    past: Pool,
+    potential: SimulatedPotential,
+    settings: RefinementOptions,
+    own: Settings,
+    rng: np.random.Generator,
+) -> Fit | None:
+    """Return the posterior from draws of the earlier trials; None where it fails."""
+    pool, _ = past.with_trials(potential, own)
+    if not len(pool.u):
+        return None
+    weight = normalized(pool.log_mixture_weight)
+    rows = [weight.argmax(), *systematic(weight, own.num_near - 1, rng.random())]
+    again = replace(own.search, num_screened=0)
+    found = search(potential, rng, pool.u[rows], again)
+    fit = infer(potential, rng, past=past, found=found, settings=own)
+    if fit.effective_sample_size < own.num_effective:
+        return None
+    if fit.tail_shape > own.largest_shape:
+        return None
+    best = potential.coordinates.to_theta(fit.u[[fit.log_likelihood.argmax()]])
+    level = settings.contradiction_level
+    contradicted = contradiction_at(potential.likelihood, best, level=level, rng=rng)
+    return fit if contradicted is None else None
+
+
+def _searched(
+    potential: SimulatedPotential,
+    near: Array | None,
+    settings: RefinementOptions,
+    own: Settings,
+    rng: np.random.Generator,
+) -> tuple[SimulatedPotential, Found | None, Contradiction | None]:
+    """Return the modes, of a noise that is inflated where trials contradict."""
+    declared, c = potential.likelihood, potential.coordinates
+    points = None if near is None else near[: len(near) and 2]
+    found, contradiction = search(potential, rng, points, own.search), None
+    for _ in range(MAX_INFLATIONS):
+        if found is None:
+            break
+        likelihood, best = potential.likelihood, found.modes[:1]
+        residual, jacobian = potential.jacobian(best, unchanged, STEP)
+        around = best + AROUND * (found.guess.sample(NUM_AROUND, rng) - best)
+        now = find_contradiction(
+            declared,
+            c.to_theta(np.concatenate([best, around])),
+            residual[0] * likelihood.inflation,
+            jacobian[0] * likelihood.inflation,
+            level=settings.contradiction_level,
+            rng=rng,
+        )
+        if now is None or now.inflation < STABLE * likelihood.inflation:
+            break
+        contradiction = now
+        wider = SimulatedLikelihood(
+            declared.table, declared.action, declared.x, inflation=now.inflation
+        )
+        potential = SimulatedPotential(wider, c)
+        found = search(potential, rng, found.modes, own.search) or found
+    return potential, found, contradiction

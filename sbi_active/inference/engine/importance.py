@@ -1,0 +1,335 @@
+r"""Importance sampling from mixtures that are fitted to all draws so far.
+
+Each draw is weighted under the mixture of all proposals,
+
+.. math::
+    w_i = \frac{p(u_i)\, L(u_i)}{\sum_k n_k\, q_k(u_i) / n} .
+
+Where few draws count, the next proposal is fitted to
+
+.. math::
+    p(u)\, L_{\mathrm{past}}(u)\, L_{\mathrm{new}}(u)^\beta
+
+with the largest :math:`\beta` that leaves enough of them, up to 1: of a response that
+jumps, the draws of the prior are led to the posterior so.
+
+References:
+    Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012 (adaptive multiple importance
+    sampling); Veach & Guibas, SIGGRAPH 1995 (the balance heuristic).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import genpareto
+
+from sbi_active.inference.engine.potential import SimulatedPotential
+from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.population import GaussianMixture
+from sbi_active.inference.sampling.student_mixture import (
+    Defended,
+    Proposal,
+    StudentMixture,
+)
+from sbi_active.inference.sampling.tempering import largest_power
+from sbi_active.inference.sampling.weights import (
+    effective_sample_size,
+    normalized,
+    systematic,
+)
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class PriorDraws(Proposal):
+    """The prior as a proposal.
+
+    Attributes:
+        coordinates: Coordinates of the prior.
+    """
+
+    coordinates: NormalCoordinates
+
+    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
+        """Return draws, shape (n, d)."""
+        return self.coordinates.sample(num_samples, rng)
+
+    def log_prob(self, z: Array) -> Array:
+        """Return log densities, shape (n,)."""
+        return self.coordinates.log_prior(z)
+
+
+@dataclass
+class Pool:
+    """Draws of all proposals so far that may still count.
+
+    Attributes:
+        u: Places, shape (n, d).
+        log_prior: Log prior density, shape (n,).
+        log_likelihood: Log likelihood of the trials so far, shape (n,).
+        log_mixture: Log of the sum over proposals, each times its number of draws.
+        log_own: Log density of the proposal that each was drawn from.
+        is_final: Which of them the posterior rests on, shape (n,).
+        num_final: Draws of their proposal, also those that do not count.
+        proposals: Pairs of the number of draws and the proposal.
+        num_trials: Number of trials in the likelihood.
+    """
+
+    u: Array
+    log_prior: Array
+    log_likelihood: Array
+    log_mixture: Array
+    log_own: Array
+    is_final: NDArray[np.bool_]
+    num_final: int = 0
+    proposals: list[tuple[int, Proposal]] = field(default_factory=list)
+    num_trials: int = 0
+
+    @staticmethod
+    def empty(dim: int, num_trials: int) -> Pool:
+        """Return a pool without draws."""
+        no, none = np.zeros((0, dim)), np.zeros(0)
+        flags = np.zeros(0, dtype=bool)
+        return Pool(no, none, none, none, none, flags, num_trials=num_trials)
+
+    @property
+    def log_mixture_weight(self) -> Array:
+        """Log weights of all draws, to fit the next proposal with, shape (n,)."""
+        return self.log_prior + self.log_likelihood - self.log_mixture
+
+    @property
+    def log_weight(self) -> Array:
+        """Log weights of the posterior, shape (n,); -inf where it does not rest."""
+        log_weight = self.log_prior + self.log_likelihood - self.log_own
+        return np.where(self.is_final, log_weight, -np.inf)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of prior times likelihood."""
+        if not self.is_final.any():
+            return -np.inf
+        return float(logsumexp(self.log_weight) - np.log(self.num_final))
+
+    @property
+    def effective_sample_size(self) -> float:
+        r""":math:`(\sum w_i)^2 / \sum w_i^2` of the posterior's draws."""
+        return effective_sample_size(self.log_weight)
+
+    def restart(self) -> None:
+        """Rest the posterior on draws to come."""
+        self.is_final, self.num_final = np.zeros_like(self.is_final), 0
+
+    def add(
+        self,
+        proposal: Proposal,
+        drawn: Array,
+        potential: SimulatedPotential,
+        floor: float = -np.inf,
+    ) -> None:
+        """Simulate draws of a proposal, shape (n, d), and weigh all.
+
+        Args:
+            proposal: What they were drawn from.
+            drawn: The draws.
+            potential: Potential of all trials.
+            floor: Log likelihood below which a draw is given up.
+        """
+        u = potential.simulated(drawn)
+        log_likelihood = potential.log_likelihood(u, floor=floor)
+        counts = np.isfinite(log_likelihood)
+        u, log_likelihood = u[counts], log_likelihood[counts]
+        own = np.log(len(drawn)) + proposal.log_prob(self.u)
+        self.log_mixture = np.logaddexp(self.log_mixture, own)
+        self.proposals.append((len(drawn), proposal))
+        log_mixture = np.full(len(u), -np.inf)
+        for num, each in self.proposals if len(u) else []:
+            log_mixture = np.logaddexp(log_mixture, np.log(num) + each.log_prob(u))
+        self.u = np.concatenate([self.u, u])
+        self.log_prior = np.concatenate([self.log_prior, potential.log_prior(u)])
+        self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
+        self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
+        self.log_own = np.concatenate([self.log_own, proposal.log_prob(u)])
+        self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
+        self.num_final += len(drawn)
+
+    def with_trials(
+        self, potential: SimulatedPotential, settings: Settings
+    ) -> tuple[Pool, Array]:
+        """Return the draws that count with the likelihood of further trials.
+
+        Args:
+            potential: Potential of these trials and further ones.
+            settings: How far below the best a draw is left out.
+
+        Returns:
+            The draws, and their log likelihood of the earlier trials, shape (n,).
+        """
+        log_weight = self.log_mixture_weight
+        rows = np.flatnonzero(log_weight > log_weight.max() - settings.negligible)
+        new = potential.log_likelihood(self.u[rows], first=self.num_trials)
+        rows, new = rows[np.isfinite(new)], new[np.isfinite(new)]
+        pool = Pool(
+            self.u[rows],
+            self.log_prior[rows],
+            self.log_likelihood[rows] + new,
+            self.log_mixture[rows],
+            self.log_own[rows],
+            np.zeros(len(rows), dtype=bool),
+            proposals=[*self.proposals],
+            num_trials=len(potential.likelihood),
+        )
+        return pool, self.log_likelihood[rows]
+
+
+def importance_sample(
+    pool: Pool,
+    potential: SimulatedPotential,
+    rng: np.random.Generator,
+    *,
+    log_past: Array,
+    num_past: int,
+    num_components: int,
+    settings: Settings,
+) -> bool:
+    """Add draws to a pool until enough are effective; return whether it is rough.
+
+    A likelihood is rough where it had to be tempered often. The posterior rests on the
+    draws of one proposal, which was fitted to none of them: its evidence has no bias.
+
+    Args:
+        pool: Draws to begin with.
+        potential: Potential of all trials.
+        rng: Source of the draws.
+        log_past: Log likelihood of the first trials at the draws, shape (n,), which is
+            not tempered.
+        num_past: Number of these trials.
+        num_components: Number of components of a proposal at most.
+        settings: Numbers of draws.
+    """
+    own, start = settings, potential.num_simulations
+    budget, fewest = own.budget(potential.dim), own.draws_of_fit(potential.dim)
+    best, latched, tries, tempered = 0.0, 0.0, 0, 0
+    proposal = pool.proposals[-1][1] if pool.num_final else None
+    for _ in range(own.max_rounds):
+        spent = potential.num_simulations - start
+        is_rough = tempered > own.few_tempered
+        log_new = pool.log_likelihood - log_past
+        log_rest = pool.log_prior + log_past - pool.log_mixture
+        power = _largest_power(log_rest, log_new, own.fewest)
+        effective = pool.effective_sample_size
+        wanted = own.num_effective
+        if spent < own.share_of_plenty * budget and not is_rough:
+            wanted *= max(own.plenty, 0.5 * potential.dim)
+        if power == 1 and effective >= wanted or not len(pool.u) or spent >= budget:
+            break
+        efficiency = effective / max(pool.num_final, 1)
+        is_good = power == 1 and efficiency >= own.efficient
+        # It no longer gets better by being fitted again.
+        is_good |= tries >= own.max_fits and efficiency >= 0.5 * best
+        is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
+        if proposal is not None and is_good and efficiency > 0:
+            rows = (own.num_effective - effective) / efficiency * pool.num_trials
+            if num_past and rows > budget - spent:
+                break  # modes serve better than draws of fewer trials
+            latched = latched or efficiency
+            lacking = 1.1 * (wanted - effective) / efficiency
+            size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
+        else:
+            best, latched = max(best, efficiency), 0.0
+            tries += power == 1
+            tempered += power < 1
+            weight, size = normalized(log_rest + power * log_new), fewest
+            pool.restart()
+            proposal = fitted(pool.u, weight, num_components, own, rng)
+            # What is dense around the draws alone misses tails, and of a rough
+            # likelihood the peaks between those that were found.
+            share = own.share_if_rough if is_rough else own.share_of_wide
+            wide = fitted(pool.u, _flattened(pool, own), 2, own, rng)
+            proposal = Defended(proposal, wide, share)
+        floor = float(pool.log_likelihood.max()) - own.negligible / power
+        before = len(pool.u)
+        pool.add(proposal, proposal.sample(size, rng), potential, floor)
+        # Of what counts every trial has been simulated; this only looks it up.
+        added = potential.log_likelihood(pool.u[before:], last=num_past)
+        log_past = np.concatenate([log_past, added])
+    return tempered > own.few_tempered
+
+
+def fitted(
+    u: Array,
+    weight: Array,
+    num_components: int,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> StudentMixture:
+    """Return a mixture fitted to weighted draws, wider than these.
+
+    Args:
+        u: Draws, shape (n, d).
+        weight: Their weights, which sum to 1, shape (n,).
+        num_components: Number of components at most; fewer where few draws count.
+        settings: How much wider it is.
+        rng: Source of its starts.
+    """
+    dim = u.shape[1]
+    num = 2 * settings.draws_of_fit(dim)
+    effective = 1 / float((weight**2).sum())
+    num_components = int(np.clip(effective / (dim + 1), 1, num_components))
+    some = u[systematic(weight, num, rng.random())]
+    some = some + settings.jitter * some.std(0) * rng.standard_normal(some.shape)
+    fit = GaussianMixture.fit(some, num_components, rng)
+    return StudentMixture(
+        fit.mean,
+        wider(settings.wider, dim) * fit.factor,
+        np.exp(fit.log_weight),
+        max(settings.freedom, float(dim)),
+    )
+
+
+def wider(factor: float, dim: int) -> float:
+    """Return the factor of widths in more dimensions that costs as many draws."""
+    return (1 + (factor**2 - 1) / dim**0.5) ** 0.5
+
+
+def pareto_shape(log_weight: Array) -> float:
+    r"""Return the shape k of the tail of weights, of which moments below 1/k exist.
+
+    Args:
+        log_weight: Shape (n,).
+
+    References:
+        Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 25 (2024).
+    """
+    weight = np.sort(normalized(log_weight))
+    num = int(min(0.2 * len(weight), 3 * len(weight) ** 0.5))
+    if num < 5 or weight[-1] <= 0:
+        return np.inf
+    excess = weight[-num:] - weight[-num - 1]
+    if excess[-1] <= 1e-12 * weight[-1]:
+        return -np.inf  # all alike
+    shape, _, _ = genpareto.fit(excess / excess.mean(), floc=0)
+    return float(shape)
+
+
+def _flattened(pool: Pool, settings: Settings) -> Array:
+    """Return weights of a power of the likelihood that leaves many draws."""
+    log_rest = pool.log_prior - pool.log_mixture
+    power = _largest_power(log_rest, pool.log_likelihood, settings.broad)
+    return normalized(log_rest + power * pool.log_likelihood)
+
+
+def _largest_power(log_rest: Array, log_new: Array, needed: float) -> float:
+    """Return the largest power of a likelihood that leaves enough draws effective."""
+    needed = min(needed, 0.5 * effective_sample_size(log_rest))
+
+    def suffices(power: float) -> bool:
+        return effective_sample_size(log_rest + power * log_new) >= needed
+
+    return largest_power(suffices)

@@ -1,0 +1,365 @@
+"""The posterior of a potential, in one way: search, importance sampling, SMC.
+
+1. Gauss-Newton searches find the modes and their widths.
+2. Importance sampling from a mixture around these and the prior, which is fitted to the
+   draws again and again; where too few count, the likelihood is tempered.
+3. Where enough draws are effective and the tail of their weights is light, that is the
+   posterior. Otherwise particles are led from the modes to it by sequential Monte
+   Carlo, whose cost grows little with the number of parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.inference.engine.importance import (
+    Pool,
+    PriorDraws,
+    fitted,
+    importance_sample,
+    pareto_shape,
+    wider,
+)
+from sbi_active.inference.engine.potential import SimulatedPotential
+from sbi_active.inference.engine.search import WIDER, Found
+from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.smc import Bridged, bridge
+from sbi_active.inference.sampling.student_mixture import (
+    Defended,
+    NormalMixture,
+    Proposal,
+    SplitStudentMixture,
+)
+from sbi_active.inference.sampling.weights import log_sum_exp, normalized
+
+Array = NDArray[Any]
+
+WIDTHS = ((1.0, 0.4), (2.0, 0.3), (3.0, 0.3))  # of the guess, and their weights
+NUM_INTEGRAL = 4_000  # draws, which cost no simulation
+UNCHANGED = 2e-3  # deviations of the noise, which single precision may change
+NUM_PROBES = 16  # draws at which uninformed parameters are changed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """The posterior of a potential.
+
+    Attributes:
+        u: Draws in the potential's coordinates, shape (n, d).
+        weight: Their weights, which sum to 1, shape (n,).
+        log_likelihood: Log likelihood of each, shape (n,).
+        log_evidence: Log of the integral of prior times likelihood, nats.
+        standard_error: Standard error of log_evidence, nats.
+        effective_sample_size: Number of draws that count.
+        tail_shape: Shape of the tail of the weights; NaN of particles.
+        method: What gave the draws, "importance" or "smc".
+        is_rough: Whether the likelihood had to be tempered.
+        free: Parameters that keep their prior, shape (d,).
+        found: What the search found; None where it got nowhere.
+        particles: What moved them; None of importance sampling.
+        pool: Draws to go on from after a further trial.
+    """
+
+    u: Array
+    weight: Array
+    log_likelihood: Array
+    log_evidence: float
+    standard_error: float
+    effective_sample_size: float
+    tail_shape: float
+    method: str
+    is_rough: bool
+    free: NDArray[np.bool_]
+    found: Found | None
+    particles: Bridged | None
+    pool: Pool
+
+
+def infer(
+    potential: SimulatedPotential,
+    rng: np.random.Generator,
+    *,
+    found: Found | None = None,
+    past: Pool | None = None,
+    near: Array | None = None,
+    settings: Settings = Settings(),  # noqa: B008  (frozen)
+) -> Fit:
+    """Return the posterior of a potential.
+
+    Args:
+        potential: Log density of the parameters given all trials.
+        rng: Source of the draws.
+        found: Modes of the potential; None where a search got nowhere.
+        past: Draws for the first of these trials, to go on from.
+        near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.
+        settings: Numbers of draws, and what decides between the ways.
+    """
+    free = np.zeros(potential.dim, dtype=bool)
+    if past is None:
+        num_past = 0
+        pool = Pool.empty(potential.dim, len(potential.likelihood))
+        free = _begin(pool, potential, rng, found, near, settings)
+        log_past = np.zeros(len(pool.u))
+    else:
+        num_past = past.num_trials
+        pool, log_past = past.with_trials(potential, settings)
+        if found is not None:
+            before = len(pool.u)
+            _go_on(pool, potential, rng, found, settings)
+            added = potential.log_likelihood(pool.u[before:], last=num_past)
+            log_past = np.concatenate([log_past, added])
+    num_modes = 0 if found is None else len(found.modes)
+    rough = False
+    if not free.any():
+        rough = importance_sample(
+            pool,
+            potential,
+            rng,
+            log_past=log_past,
+            num_past=num_past,
+            num_components=max(settings.num_components, num_modes),
+            settings=settings,
+        )
+    final = pool.is_final
+    shape = pareto_shape(pool.log_weight[final]) if final.any() else np.inf
+    effective = pool.effective_sample_size
+    is_enough = effective >= settings.num_effective and not free.any()
+    particles = None
+    is_enough &= shape <= settings.largest_shape
+    # After a further trial the modes are not all, and the draws may know others.
+    if found is not None and past is None and not is_enough:
+        particles = _particles(potential, found, free, rng, settings)
+    if particles is not None and (
+        free.any()
+        or shape > settings.largest_shape
+        or particles.effective_sample_size > effective
+    ):
+        n = len(particles.u)
+        return Fit(
+            u=particles.u,
+            weight=np.full(n, 1 / n),
+            log_likelihood=particles.log_likelihood,
+            log_evidence=particles.log_evidence,
+            standard_error=particles.standard_error,
+            effective_sample_size=particles.effective_sample_size,
+            tail_shape=np.nan,
+            method="smc",
+            is_rough=rough,
+            free=free,
+            found=found,
+            particles=particles,
+            pool=_as_pool(particles, potential, settings, rng),
+        )
+    num = max(pool.num_final, 1)
+    return Fit(
+        u=pool.u[final],
+        weight=normalized(pool.log_weight[final]) if final.any() else np.zeros(0),
+        log_likelihood=pool.log_likelihood[final],
+        log_evidence=pool.log_evidence,
+        standard_error=float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0))),
+        effective_sample_size=effective,
+        tail_shape=shape,
+        method="importance",
+        is_rough=rough,
+        free=np.zeros_like(free),
+        found=found,
+        particles=None,
+        pool=pool,
+    )
+
+
+def _begin(
+    pool: Pool,
+    potential: SimulatedPotential,
+    rng: np.random.Generator,
+    found: Found | None,
+    near: Array | None,
+    settings: Settings,
+) -> NDArray[np.bool_]:
+    """Add the first draws to a pool; return the parameters that keep their prior."""
+    prior = PriorDraws(potential.coordinates)
+    if found is not None:
+        free = _free(found, potential, rng)
+        if free.any():
+            return free
+        pool.add(prior, found.screened, potential)  # simulated for the search already
+        pool.restart()
+        first = _around(found, potential, settings)
+        pool.add(first, first.sample(settings.num_draws, rng), potential)
+        if pool.effective_sample_size >= settings.fewest:
+            return free
+    if near is not None and len(near) > 2 * potential.dim:
+        own = fitted(near, np.full(len(near), 1 / len(near)), 2, settings, rng)
+        pool.add(own, own.sample(settings.num_draws, rng), potential)
+    num = int(1.5 * settings.num_draws)
+    pool.add(prior, prior.sample(num, rng), potential)
+    return np.zeros(potential.dim, dtype=bool)
+
+
+def _go_on(
+    pool: Pool,
+    potential: SimulatedPotential,
+    rng: np.random.Generator,
+    found: Found,
+    settings: Settings,
+) -> None:
+    """Add draws of the modes that were found, and of what the pool says."""
+    first: Proposal = _around(found, potential, settings)
+    weight = normalized(pool.log_mixture_weight)
+    if len(pool.u) and 1 / float((weight**2).sum()) > 2 * potential.dim + 2:
+        own = fitted(pool.u, weight, settings.num_components, settings, rng)
+        first = Defended(first, own, 0.5)
+    pool.add(first, first.sample(settings.num_draws, rng), potential)
+
+
+def _around(
+    found: Found, potential: SimulatedPotential, settings: Settings
+) -> SplitStudentMixture:
+    r"""Return a mixture around the modes, as wide on each side as the density is.
+
+    Along each axis of a mode's normal approximation, of unit length there,
+
+    .. math::
+        s = \max_t \frac{t}{\sqrt{2 (\log p(m) - \log p(m + t a))}},
+
+    which is 1 of a normal density, and more towards a shelf.
+    """
+    c, guess = potential.coordinates, found.guess
+    k, d = guess.means.shape
+    cov = guess.factors @ np.swapaxes(guess.factors, 1, 2) / WIDER**2
+    values, vectors = np.linalg.eigh(cov)
+    axes = vectors * np.sqrt(np.maximum(values, 1e-24))[:, None]
+    length = np.abs(axes).max(1)  # (k, d), in deviations of the prior
+    far = settings.profiled[:, None, None] / np.maximum(length, 1e-12)
+    near = np.ones((3, k, d)) * np.array([1.0, 2.0, 4.0])[:, None, None]
+    steps = np.sort(np.concatenate([near, far]), axis=0)
+    sides = np.stack([-steps, steps])  # (2, s, k, d)
+    places = guess.means[:, None] + np.swapaxes(axes, 1, 2) * sides[..., None]
+    at = np.concatenate([guess.means, places.reshape(-1, d)])
+    at = np.clip(at, c.low, c.high)
+    log_p = potential.log_prior(at) + potential.log_likelihood(at)
+    peak, log_p = log_p[:k, None], log_p[k:].reshape(sides.shape)
+    fall = np.maximum(peak - log_p, 1e-2)
+    # Beyond a valley there are other modes.
+    within = np.maximum.accumulate(fall, axis=1) < settings.valley
+    within = np.concatenate([np.ones_like(within[:, :1]), within[:, 1:]], 1)
+    width = np.where(within, np.abs(sides) / np.sqrt(2 * fall), 0.0).max(1)
+    width = np.clip(width, 1.0, np.maximum(1 / np.maximum(length, 1e-12), 1.0))
+    left, right = wider(settings.laplace_wider, d) * width
+    freedom = max(settings.freedom, float(d))
+    return SplitStudentMixture(guess.means, axes, left, right, guess.weights, freedom)
+
+
+def _as_pool(
+    particles: Bridged,
+    potential: SimulatedPotential,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> Pool:
+    """Return particles as draws of a mixture that is fitted to them."""
+    n = len(particles.u)
+    own = fitted(particles.u, np.full(n, 1 / n), settings.num_components, settings, rng)
+    # As many as there are, with the weights that their evidence asks for.
+    log_prior = potential.log_prior(particles.u)
+    log_own = log_prior + particles.log_likelihood - particles.log_evidence
+    return Pool(
+        particles.u,
+        log_prior,
+        particles.log_likelihood,
+        log_own + np.log(n),
+        log_own,
+        np.ones(n, dtype=bool),
+        n,
+        [(n, own)],
+        len(potential.likelihood),
+    )
+
+
+def _particles(
+    potential: SimulatedPotential,
+    found: Found,
+    free: NDArray[np.bool_],
+    rng: np.random.Generator,
+    settings: Settings,
+) -> Bridged | None:
+    """Return particles of all parameters; only those that trials inform are moved."""
+    c, guess, axes = potential.coordinates, found.guess, np.flatnonzero(~free)
+    cov = guess.factors @ np.swapaxes(guess.factors, 1, 2)
+    factors = np.linalg.cholesky(cov[:, axes[:, None], axes])
+    # Tails that bend away from the normal of a mode are out of its own reach.
+    own = NormalMixture(
+        np.concatenate([guess.weights * weight for _, weight in WIDTHS]),
+        np.concatenate([guess.means[:, axes]] * len(WIDTHS)),
+        np.concatenate([factors * width for width, _ in WIDTHS]),
+    )
+    rest = np.zeros((1, c.dim))
+
+    def whole(u: Array) -> Array:
+        full = np.repeat(rest, len(u), 0)
+        full[:, axes] = u
+        return full
+
+    fixed = _log_free(c, free, rng) if free.any() else 0.0
+    num = int(settings.per_parameter * len(axes) * settings.num_effective)
+    moved = bridge(
+        lambda u: c.log_prior(whole(u)) - fixed,
+        lambda u: potential.log_likelihood(whole(u)),
+        own,
+        rng,
+        num_particles=max(num, settings.fewest_particles),
+        most=settings.budget(len(axes)) / len(potential.likelihood),
+    )
+    if moved is None:
+        return None
+    u = c.sample(len(moved.u), rng)
+    u[:, axes] = moved.u
+    rows = c.base.inside(c.to_z(u))
+    return replace(moved, u=u[rows], log_likelihood=moved.log_likelihood[rows])
+
+
+def _free(
+    found: Found, potential: SimulatedPotential, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Return parameters that change no trial and do not depend on others."""
+    c, free = potential.coordinates, ~found.informed
+    none = np.zeros(c.dim, dtype=bool)
+    if not free.any() or free.all():
+        return none
+    drawn, other = (c.sample(NUM_PROBES, rng) for _ in range(2))
+    near, off = (found.guess.sample(NUM_PROBES, rng) for _ in range(2))
+
+    def changes(axes: NDArray[np.bool_]) -> bool:
+        pairs = (drawn, np.where(axes, other, drawn)), (near, np.where(axes, off, near))
+        residuals = (
+            np.abs(potential.residual(a)[0] - potential.residual(b)[0])
+            for a, b in pairs
+        )
+        return any(r.max() > UNCHANGED for r in residuals)
+
+    for axis in np.flatnonzero(free):
+        free[axis] = not changes(np.arange(c.dim) == axis)
+    is_free = free.any() and c.splits_off(free, rng) and not changes(free)
+    return free if is_free else none
+
+
+def _log_free(
+    c: NormalCoordinates, free: NDArray[np.bool_], rng: np.random.Generator
+) -> float:
+    r"""Return the prior's log density of the free coordinates at zero.
+
+    Independent of the others, which stay at zero, it is
+
+    .. math::
+        p_F(0) = p(0) \Big/ \int p(0, u_F)\, du_F .
+    """
+    u = np.zeros((NUM_INTEGRAL, c.dim))
+    u[:, free] = WIDER * rng.standard_normal((len(u), int(free.sum())))
+    square = ((u[:, free] / WIDER) ** 2 + np.log(2 * np.pi * WIDER**2)).sum(1)
+    log_w = c.log_prior(u) + 0.5 * square
+    integral = log_sum_exp(log_w) - np.log(len(u))
+    return float(c.log_prior(np.zeros((1, c.dim)))[0] - integral)

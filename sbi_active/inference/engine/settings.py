@@ -1,0 +1,95 @@
+"""Settings of the engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.inference.engine.search import SearchSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Settings of :func:`.infer`.
+
+    Attributes:
+        num_effective: Effective draws that end importance sampling. The log density of
+            a belief is off by about their number to the power -1/2, in nats.
+        plenty: Times as many are drawn while they are cheap, or half the dimension if
+            that is more: with half of it heavy tails are cut by a tenth.
+        num_simulations: Simulated rows to spend, each at one action; None is no bound.
+            More of more than ``few`` parameters, in proportion.
+        share_of_plenty: Share of these within which draws are cheap, unless the
+            likelihood is rough.
+        num_draws: Draws of a proposal, more of one that is fitted to more than ``few``
+            parameters. Half reaches a narrow posterior in fewer simulations, and fits
+            10 parameters three times as badly.
+        few: Number of parameters beyond which there are more draws.
+        max_rounds: Proposals at most.
+        fewest: Effective draws below which the likelihood is tempered.
+        few_tempered: Rounds of this beyond which the likelihood is called rough.
+        broad: Effective draws that shape the wide share of a proposal.
+        share_of_wide: That share.
+        share_if_rough: That share where the likelihood is rough.
+        num_components: Components of a proposal at least; one a mode.
+        efficient: Share of a proposal's draws that are effective, with which it is good
+            enough: more is drawn from it in place of fitting another.
+        max_fits: Fits to the whole likelihood at most, unless the last is half as
+            efficient as the best.
+        wider: Factor of the draws' widths in a proposal of one parameter; less of more.
+        jitter: Noise of repeated draws that a proposal is fitted to, in deviations.
+        freedom: Degrees of freedom of a proposal, or the dimension if that is more:
+            tails of 5 in 20 dimensions would take most draws.
+        laplace_wider: Factor of the modes' widths in the first proposal, likewise.
+        profiled: Distances from a mode, in deviations of the prior, at which widths to
+            each side are measured.
+        valley: Fall of the log density, in nats, beyond which they are not.
+        negligible: Nats below the best draw beyond which a draw counts for nothing.
+        largest_shape: Largest shape of the weights' tail that is trusted.
+        per_parameter: Particles a parameter of sequential Monte Carlo, in effective
+            draws.
+        fewest_particles: Particles at least.
+        num_near: Draws at which a search begins after a further trial.
+        search: Settings of the search.
+    """
+
+    num_effective: float = 200.0
+    plenty: float = 6.0
+    num_simulations: int | None = None
+    share_of_plenty: float = 0.6
+    num_draws: int = 500
+    few: int = 4
+    max_rounds: int = 40
+    fewest: float = 60.0
+    few_tempered: int = 5
+    broad: float = 150.0
+    share_of_wide: float = 0.25
+    share_if_rough: float = 0.5
+    num_components: int = 8
+    efficient: float = 0.3
+    max_fits: int = 4
+    wider: float = 1.4
+    jitter: float = 0.1
+    freedom: float = 5.0
+    laplace_wider: float = 1.4
+    profiled: NDArray[Any] = field(default_factory=lambda: np.array([0.5, 1.0, 2.0]))
+    valley: float = 8.0
+    negligible: float = 25.0
+    largest_shape: float = 0.7
+    per_parameter: float = 0.8
+    fewest_particles: int = 400
+    num_near: int = 5
+    search: SearchSettings = field(default_factory=SearchSettings)
+
+    def draws_of_fit(self, dim: int) -> int:
+        """Return the draws that a proposal for so many parameters is fitted to."""
+        return int(self.num_draws * max(1.0, dim / self.few))
+
+    def budget(self, dim: int) -> float:
+        """Return the rows to spend on so many parameters."""
+        if self.num_simulations is None:
+            return float("inf")
+        return self.num_simulations * max(1.0, dim / self.few)
