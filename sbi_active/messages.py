@@ -49,6 +49,7 @@ ANCHORS = {
     "few effective draws": "few-draws",
     "effective draws: the posterior is not": "not-linear",
     "particles are effective": "few-draws",
+    "few draws outweigh all others": "heavy-tail",
     "of the moves of the particles were accepted": "particles-stuck",
     "the best mode was found by one of": "one-search",
     "differs by": "order-matters",

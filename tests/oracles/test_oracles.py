@@ -26,8 +26,9 @@ from tests.oracles.ways import WAYS, trials_of
 #: What takes less than two seconds a run.
 QUICK = {
     "refine": (
-        *("linear_1_1", "linear_3_10", "linear_20_200", "numerical", "compartments_3"),
-        *("banana", "edge", "student", "invalid"),
+        *("linear_1_1", "linear_3_10", "linear_20_4", "linear_20_200", "numerical"),
+        *("compartments_3", "compartments_6", "decay", "eight_modes", "banana", "jump"),
+        *("edge", "student", "missing", "invalid"),
     ),
     "refine, noise drawn": ("linear_3_10", "edge", "hard_edged"),
     "close_loop, bare model": tuple(
@@ -119,7 +120,7 @@ def test_the_way_gives_the_answer(problem, way):
 
 
 def test_a_parameter_that_no_trial_informs_changes_nothing():
-    """Six parameters, and the same six beside one: two routes, one posterior."""
+    """Six parameters, and the same six beside one: one posterior."""
     own = PROBLEMS["linear_6_40"]()
 
     def mean(theta: Any, action: Any) -> Any:

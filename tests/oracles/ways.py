@@ -88,7 +88,14 @@ def found(belief: Any) -> Found:
     theta = belief.sample(torch.Size([NUM_DRAWS])).double().numpy()
     says = belief.diagnostics.trustworthy
     says = None if says is None else bool(says)
-    return Found(theta=theta, trustworthy=says, kind=type(belief).__name__)
+    known = belief.diagnostics.figures
+    return Found(
+        theta=theta,
+        log_evidence=known.get("log_evidence"),
+        error=known.get("log_evidence_error", 0.0),
+        trustworthy=says,
+        kind=type(belief).__name__,
+    )
 
 
 # --------------------------------------------------------------- beliefs of trials

@@ -215,7 +215,7 @@ def importance_sample(
     """
     own, start = settings, potential.num_simulations
     budget, fewest = own.budget(potential.dim), own.draws_of_fit(potential.dim)
-    best, latched, tries, tempered = 0.0, 0.0, 0, 0
+    best, latched, tries, tempered, heavy = 0.0, 0.0, 0, 0, 0
     proposal = pool.proposals[-1][1] if pool.num_final else None
     for _ in range(own.max_rounds):
         spent = potential.num_simulations - start
@@ -227,14 +227,20 @@ def importance_sample(
         wanted = own.num_effective
         if spent < own.share_of_plenty * budget and not is_rough:
             wanted *= max(own.plenty, 0.5 * potential.dim)
-        if power == 1 and effective >= wanted or not len(pool.u) or spent >= budget:
+        if not len(pool.u) or spent >= budget:
             break
+        is_heavy = False
+        if power == 1 and effective >= wanted:
+            is_heavy = pareto_shape(pool.log_weight[pool.is_final]) > own.largest_shape
+            if not is_heavy or heavy == own.max_heavy:
+                break
+            heavy += 1  # draws that outweigh others show where to draw more
         efficiency = effective / max(pool.num_final, 1)
         is_good = power == 1 and efficiency >= own.efficient
         # It no longer gets better by being fitted again.
         is_good |= tries >= own.max_fits and efficiency >= 0.5 * best
         is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
-        if proposal is not None and is_good and efficiency > 0:
+        if proposal is not None and is_good and efficiency > 0 and not is_heavy:
             rows = (own.num_effective - effective) / efficiency * pool.num_trials
             if num_past and rows > budget - spent:
                 break  # modes serve better than draws of fewer trials

@@ -3,9 +3,9 @@
 1. Gauss-Newton searches find the modes and their widths.
 2. Importance sampling from a mixture around these and the prior, which is fitted to the
    draws again and again; where too few count, the likelihood is tempered.
-3. Where enough draws are effective and the tail of their weights is light, that is the
-   posterior. Otherwise particles are led from the modes to it by sequential Monte
-   Carlo, whose cost grows little with the number of parameters.
+3. Where enough draws are effective, that is the posterior; another proposal is fitted
+   while few of them outweigh all others. Otherwise particles are led from the modes to
+   it by sequential Monte Carlo, whose cost grows little with the number of parameters.
 """
 
 from __future__ import annotations
@@ -130,14 +130,11 @@ def infer(
     effective = pool.effective_sample_size
     is_enough = effective >= settings.num_effective and not free.any()
     particles = None
-    is_enough &= shape <= settings.largest_shape
     # After a further trial the modes are not all, and the draws may know others.
     if found is not None and past is None and not is_enough:
         particles = _particles(potential, found, free, rng, settings)
     if particles is not None and (
-        free.any()
-        or shape > settings.largest_shape
-        or particles.effective_sample_size > effective
+        free.any() or particles.effective_sample_size > effective
     ):
         n = len(particles.u)
         return Fit(

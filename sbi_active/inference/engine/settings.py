@@ -48,7 +48,9 @@ class Settings:
             each side are measured.
         valley: Fall of the log density, in nats, beyond which they are not.
         negligible: Nats below the best draw beyond which a draw counts for nothing.
-        largest_shape: Largest shape of the weights' tail that is trusted.
+        largest_shape: Largest shape of the weights' tail that is trusted: beyond .7
+            their mean hardly settles (Vehtari et al., JMLR 2024).
+        max_heavy: Times at most that another proposal is fitted for a heavier tail.
         per_parameter: Particles a parameter of sequential Monte Carlo, in effective
             draws.
         fewest_particles: Particles at least.
@@ -79,6 +81,7 @@ class Settings:
     valley: float = 8.0
     negligible: float = 25.0
     largest_shape: float = 0.7
+    max_heavy: int = 3
     per_parameter: float = 0.8
     fewest_particles: int = 400
     num_near: int = 5
