@@ -1,6 +1,6 @@
 """Shift that each effect makes of the cube's position, on a table without end.
 
-    python benchmarks/box_collision/shifts.py
+    python -m benchmarks box_collision.shifts
 
 Writes ``shifts.csv`` beside itself: a row an effect, strength and parameter set, with
 the shift in mm of x and of y at 3, 5 and 7 m/s. It takes about five CPU seconds.

@@ -1,6 +1,6 @@
 """Simulations per CPU second beside a bare loop over the same steps.
 
-    OMP_NUM_THREADS=1 python benchmarks/box_collision/speed.py
+    OMP_NUM_THREADS=1 python -m benchmarks box_collision.speed
 
 Both run on the same rows, in turns: theta from the prior and speeds from the grid. The
 bare loop sets the parameters and calls ``mj_step`` once a row, for the number of steps

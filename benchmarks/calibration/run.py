@@ -86,7 +86,7 @@ class Settings:
         problem: Names of the problems.
         kind: Kind of cases; all by default.
         first: Number of the first case.
-        seeds: Seeds, from the first to before the second.
+        seeds: Number of seeds.
         summary: Whether to run nothing, and print the table of the rows.
     """
 

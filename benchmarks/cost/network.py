@@ -63,7 +63,7 @@ class Settings:
     """What is run.
 
     Args:
-        seeds: Seeds, from the first to before the second.
+        seeds: Number of seeds.
         rounds: Number of rounds.
     """
 

@@ -1,6 +1,6 @@
 """CPU time of a round of the default loop beside stock sbi on the same rows.
 
-    python benchmarks/cost/run.py
+    python -m benchmarks cost
 
 Both run in this process on one thread: NPE_C(prior) with sbi's defaults, trained on
 5,000 rows of the numerical task with x and the action as its condition; and one round
@@ -63,7 +63,7 @@ def main() -> None:
     theirs = stock["cpu_s"]
     ours = sum(r["cpu_s"] for r in default) / len(default)
     result = {
-        "command": "python benchmarks/cost/run.py",
+        "command": "python -m benchmarks cost",
         "date": date.today().isoformat(),
         "rows": NUM_ROWS,
         "default_round": default,

@@ -76,7 +76,7 @@ class Settings:
     Args:
         case: Number of the case.
         world: Name of the world.
-        kind: Kind of cases; all by default.
+        kind: Kind of cases.
         trials: Number of trials.
         draws: Number of draws.
     """

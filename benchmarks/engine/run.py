@@ -1,6 +1,6 @@
 """What the engine costs, what a second worker gains, and a night of faults.
 
-    python benchmarks/engine/run.py
+    python -m benchmarks engine
 
 Other work on the machine comes and goes, so the variants run in turn, in an order that
 is drawn anew for each repetition, and a ratio is the median of the ratios within a
@@ -21,9 +21,7 @@ import json
 import os
 import platform
 import random
-import shlex
 import signal
-import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -271,7 +269,7 @@ def main(arguments: Settings) -> None:
     repetitions = arguments.repetitions
     torch.set_num_threads(1)
     result: dict[str, Any] = {
-        "command": shlex.join(["python", "benchmarks/engine/run.py", *sys.argv[1:]]),
+        "command": f"python -m benchmarks engine --repetitions {repetitions}",
         "date": datetime.now().isoformat(timespec="minutes"),
         "machine": machine(),
         "load_average_at_start": os.getloadavg()[0],

@@ -191,7 +191,7 @@ def main(
     """Run what is asked for and is not there yet, and print the table.
 
     Args:
-        seeds: Seeds, from the first to before the second.
+        seeds: Number of seeds.
         out: File of the results.
         only: Names, or parts of names, that are run; all by default.
     """

@@ -1,6 +1,6 @@
 """Expected information gain beside the exact value: error, regret and CPU time.
 
-    python benchmarks/information_gain/run.py
+    python -m benchmarks information_gain
 
 Rounds 1 and 2 of the numerical task (round 2 from the exact posterior after one trial
 at xi = -5), and round 1 of the oscillator (against nested Monte Carlo with the known
@@ -112,7 +112,7 @@ def main(
     """Run what is asked for and is not there yet, and print the table.
 
     Args:
-        seeds: Seeds, from the first to before the second (numerical task).
+        seeds: Number of seeds (numerical task).
         oscillator_seeds: Number of seeds of the oscillator.
     """
     torch.set_num_threads(1)

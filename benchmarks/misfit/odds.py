@@ -150,8 +150,8 @@ class Settings:
     """What is run.
 
     Args:
-        group: Group of worlds; all by default.
-        kind: Kind of cases; all by default.
+        group: Group of worlds.
+        kind: Kind of cases.
         first: Number of the first case.
         cases: Number of cases.
         out: File of the results.

@@ -88,7 +88,7 @@ class Settings:
         first: Number of the first case.
         cases: Number of cases.
         summary: Whether to run nothing, and print the table of the rows.
-        truth: Way to a truth (print cases, run nothing).
+        truth: Whether to print the cases, and run nothing.
     """
 
     group: Annotated[str | None, GROUPS] = None

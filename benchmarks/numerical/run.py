@@ -1,9 +1,9 @@
 """Campaigns on tasks with exact inference, beside the paper and the exact limit.
 
-    python benchmarks/numerical/run.py                       # theta_true = (-3, 1)
-    python benchmarks/numerical/run.py --truth random --trials 40 --settings default
-    python benchmarks/numerical/run.py --task sinh --settings default --methods asbi
-    python benchmarks/numerical/run.py --task oscillator --settings default default_500
+    python -m benchmarks numerical                       # theta_true = (-3, 1)
+    python -m benchmarks numerical --truth random --trials 40 --settings default
+    python -m benchmarks numerical --task sinh --settings default --methods asbi
+    python -m benchmarks numerical --task oscillator --settings default default_500
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 setting, in benchmarks/numerical/results; the table is printed at the end.
@@ -76,7 +76,7 @@ class Settings:
 
     Args:
         task: Name of the task.
-        truth: Way to a truth.
+        truth: Truth of every campaign, the paper's or a draw of the prior.
         trials: Number of trials.
         rounds: Number of rounds.
         methods: Names of methods.

@@ -1,7 +1,7 @@
 """Run sbi's own tests with NPE_C and with ASBI in its place, and compare.
 
     python -m pip install pyro-ppl pymc pytest-harvest pytest-mock torchtestcase
-    python benchmarks/sbi_suite/run.py
+    python -m benchmarks sbi_suite
 
 The tests come from the source distribution of the sbi that is installed, fetched by
 pip. Every test file that touches NPE_C runs, without those marked slow, gpu or mcmc.
@@ -93,7 +93,7 @@ def main(arguments: Settings) -> None:
         if original.get(name) != swapped.get(name)
     }
     result = {
-        "command": "python benchmarks/sbi_suite/run.py",
+        "command": "python -m benchmarks sbi_suite",
         "date": date.today().isoformat(),
         "sbi": version("sbi"),
         "files": files,

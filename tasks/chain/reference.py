@@ -21,7 +21,7 @@ from sbi_active.tasks.chain.model import NOISE_SD, mean
 
 __all__ = ["ChainReference"]
 
-FORGOTTEN, SETTLED = 0.3, 0.01  # of where particles were, a step and at the end
+FORGOTTEN = 0.01  # correlation with where particles were, after the moves of a step
 MAX_MOVES = 200
 NUM_WEIGHTED, WIDER = 20_000, 1.2  # draws of the normal fit, its covariance's factor
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import pytest
 
-from benchmarks.__main__ import benchmarks, main, module_of, parser_of
+from benchmarks.__main__ import HERE, benchmarks, main, module_of, parser_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -141,3 +141,15 @@ def test_it_runs_as_a_process():
         check=True,
     )
     assert "| compartments_10 |" in done.stdout
+
+
+def test_every_command_that_is_written_down_names_a_benchmark():
+    files = [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *HERE.rglob("*.py")]
+    for path in files:
+        if "_build" in path.parts or "api" in path.parts:
+            continue
+        text = path.read_text(encoding="utf-8")
+        for name in re.findall(r"python -m\s+benchmarks ([a-z][\w.]*)", text):
+            assert module_of(name), path
+        for script in re.findall(r"python benchmarks/(\S+\.py)", text):
+            assert "__main__" in (HERE / script).read_text(), (path, script)

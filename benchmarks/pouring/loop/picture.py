@@ -122,7 +122,7 @@ def main(
     Args:
         folder: Folder to write to.
         bank: Folder of pours.
-        kind: Kind of cases; all by default.
+        kind: Kind of cases.
         case: Number of the case.
         action: Number of the action, of the world's.
     """

@@ -99,11 +99,8 @@ def refine_declared(
         table = MeanTable(simulator, settings.workers)
     spent = table.num_simulations, table.num_missing
     declared = SimulatedLikelihood(table, action, x)
-    potential, contradiction, fit = (
-        SimulatedPotential(declared, coordinates),
-        None,
-        None,
-    )
+    potential = SimulatedPotential(declared, coordinates)
+    contradiction, fit = None, None
     own = _engine_settings(settings, len(action))
     if before is not None:
         fit = _gone_on(before.pool, potential, settings, own, rng)
@@ -125,7 +122,10 @@ def refine_declared(
     belief.diagnostics = known.extended(
         num_simulations=num_simulations, num_missing=num_missing
     )
-    belief.histories = DeclaredRecord((action, x), coordinates, table, fit.pool)
+    pool = fit.pool
+    if contradiction is not None:  # its likelihood is of another noise
+        pool = Pool.empty(potential.dim, len(action))
+    belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
     if num_missing:
         warn(
             f"{num_missing} of {num_simulations} simulations of the refinement are "
@@ -196,7 +196,7 @@ def _searched(
 ) -> tuple[SimulatedPotential, Found | None, Contradiction | None]:
     """Return the modes, of a noise that is inflated where trials contradict."""
     declared, c = potential.likelihood, potential.coordinates
-    points = None if near is None else near[: len(near) and 2]
+    points = None if near is None else near[:2]
     found, contradiction = search(potential, rng, points, own.search), None
     for _ in range(MAX_INFLATIONS):
         if found is None:

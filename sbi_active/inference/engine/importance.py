@@ -172,7 +172,9 @@ class Pool:
             The draws, and their log likelihood of the earlier trials, shape (n,).
         """
         log_weight = self.log_mixture_weight
-        rows = np.flatnonzero(log_weight > log_weight.max() - settings.negligible)
+        rows = np.flatnonzero(
+            log_weight > log_weight.max(initial=-np.inf) - settings.negligible
+        )
         new = potential.log_likelihood(self.u[rows], first=self.num_trials)
         rows, new = rows[np.isfinite(new)], new[np.isfinite(new)]
         pool = Pool(

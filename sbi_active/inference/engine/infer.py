@@ -58,7 +58,7 @@ class Fit:
         effective_sample_size: Number of draws that count.
         tail_shape: Shape of the tail of the weights; NaN of particles.
         method: What gave the draws, "importance" or "smc".
-        is_rough: Whether the likelihood had to be tempered.
+        is_rough: Whether the likelihood had to be tempered often.
         free: Parameters that keep their prior, shape (d,).
         found: What the search found; None where it got nowhere.
         particles: What moved them; None of importance sampling.
@@ -99,11 +99,16 @@ def infer(
         near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.
         settings: Numbers of draws, and what decides between the ways.
     """
-    free = np.zeros(potential.dim, dtype=bool)
+    none = np.zeros(potential.dim, dtype=bool)
     if past is None:
+        free = none if found is None else _free(found, potential, rng)
+        if found is not None and free.any():
+            moved = _particles(potential, found, free, rng, settings)
+            if moved is not None:
+                return _of_particles(moved, potential, found, free, rng, settings)
         num_past = 0
         pool = Pool.empty(potential.dim, len(potential.likelihood))
-        free = _begin(pool, potential, rng, found, near, settings)
+        _begin(pool, potential, rng, found, near, settings)
         log_past = np.zeros(len(pool.u))
     else:
         num_past = past.num_trials
@@ -114,44 +119,21 @@ def infer(
             added = potential.log_likelihood(pool.u[before:], last=num_past)
             log_past = np.concatenate([log_past, added])
     num_modes = 0 if found is None else len(found.modes)
-    rough = False
-    if not free.any():
-        rough = importance_sample(
-            pool,
-            potential,
-            rng,
-            log_past=log_past,
-            num_past=num_past,
-            num_components=max(settings.num_components, num_modes),
-            settings=settings,
-        )
-    final = pool.is_final
-    shape = pareto_shape(pool.log_weight[final]) if final.any() else np.inf
-    effective = pool.effective_sample_size
-    is_enough = effective >= settings.num_effective and not free.any()
-    particles = None
+    rough = importance_sample(
+        pool,
+        potential,
+        rng,
+        log_past=log_past,
+        num_past=num_past,
+        num_components=max(settings.num_components, num_modes),
+        settings=settings,
+    )
+    final, effective = pool.is_final, pool.effective_sample_size
     # After a further trial the modes are not all, and the draws may know others.
-    if found is not None and past is None and not is_enough:
-        particles = _particles(potential, found, free, rng, settings)
-    if particles is not None and (
-        free.any() or particles.effective_sample_size > effective
-    ):
-        n = len(particles.u)
-        return Fit(
-            u=particles.u,
-            weight=np.full(n, 1 / n),
-            log_likelihood=particles.log_likelihood,
-            log_evidence=particles.log_evidence,
-            standard_error=particles.standard_error,
-            effective_sample_size=particles.effective_sample_size,
-            tail_shape=np.nan,
-            method="smc",
-            is_rough=rough,
-            free=free,
-            found=found,
-            particles=particles,
-            pool=_as_pool(particles, potential, settings, rng),
-        )
+    if found is not None and past is None and effective < settings.num_effective:
+        moved = _particles(potential, found, none, rng, settings)
+        if moved is not None and moved.effective_sample_size > effective:
+            return _of_particles(moved, potential, found, none, rng, settings)
     num = max(pool.num_final, 1)
     return Fit(
         u=pool.u[final],
@@ -160,13 +142,40 @@ def infer(
         log_evidence=pool.log_evidence,
         standard_error=float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0))),
         effective_sample_size=effective,
-        tail_shape=shape,
+        tail_shape=pareto_shape(pool.log_weight[final]) if final.any() else np.inf,
         method="importance",
         is_rough=rough,
-        free=np.zeros_like(free),
+        free=none,
         found=found,
         particles=None,
         pool=pool,
+    )
+
+
+def _of_particles(
+    moved: Bridged,
+    potential: SimulatedPotential,
+    found: Found,
+    free: NDArray[np.bool_],
+    rng: np.random.Generator,
+    settings: Settings,
+) -> Fit:
+    """Return the posterior that particles were led to."""
+    n = len(moved.u)
+    return Fit(
+        u=moved.u,
+        weight=np.full(n, 1 / n),
+        log_likelihood=moved.log_likelihood,
+        log_evidence=moved.log_evidence,
+        standard_error=moved.standard_error,
+        effective_sample_size=moved.effective_sample_size,
+        tail_shape=np.nan,
+        method="smc",
+        is_rough=False,
+        free=free,
+        found=found,
+        particles=moved,
+        pool=_as_pool(moved, potential, settings, rng),
     )
 
 
@@ -177,25 +186,21 @@ def _begin(
     found: Found | None,
     near: Array | None,
     settings: Settings,
-) -> NDArray[np.bool_]:
-    """Add the first draws to a pool; return the parameters that keep their prior."""
+) -> None:
+    """Add draws of the prior and around the modes; more where these do not count."""
     prior = PriorDraws(potential.coordinates)
     if found is not None:
-        free = _free(found, potential, rng)
-        if free.any():
-            return free
         pool.add(prior, found.screened, potential)  # simulated for the search already
         pool.restart()
         first = _around(found, potential, settings)
         pool.add(first, first.sample(settings.num_draws, rng), potential)
         if pool.effective_sample_size >= settings.fewest:
-            return free
+            return
     if near is not None and len(near) > 2 * potential.dim:
         own = fitted(near, np.full(len(near), 1 / len(near)), 2, settings, rng)
         pool.add(own, own.sample(settings.num_draws, rng), potential)
     num = int(1.5 * settings.num_draws)
     pool.add(prior, prior.sample(num, rng), potential)
-    return np.zeros(potential.dim, dtype=bool)
 
 
 def _go_on(

@@ -169,4 +169,6 @@ def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
             f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; stack "
             "the trials along axis 0"
         )
-    return action.float().cpu(), x.double().cpu().reshape(len(x), *x.shape[1:] or (1,))
+    # Copies: a record keeps them, whatever becomes of the caller's.
+    x = x.double().cpu().clone().reshape(len(x), *x.shape[1:] or (1,))
+    return action.float().cpu().clone(), x

@@ -262,3 +262,41 @@ def test_only_declared_noise_beside_a_function_is_exact(model: SimulatorModel):
         lambda t, a: t[:, :1] + torch.randn(len(t), 1), noise=GaussianNoise(SD)
     )
     assert not declares_noise(random, theta, action)
+
+
+def test_an_inflated_likelihood_is_not_gone_on_from():
+    model = SimulatorModel(smooth, noise=GaussianNoise(SD))
+    x = observe(model, 0)
+    apart = torch.cat([x[:1], x[:1] + 100 * SD, x[1:]])
+    action = ACTION[[0, 0, 1, 2]]
+    first = refine(model, BOX, action[:3], apart[:3], settings=FEW, seed=0)
+    assert isinstance(first, SimulatedBelief)
+    assert first.diagnostics.noise_inflation > 10
+    assert not len(first.histories.pool.u)
+    past = first.histories
+    second = refine(model, BOX, action, apart, past=past, settings=FEW, seed=1)
+    assert second.diagnostics.noise_inflation > 10
+
+
+def test_the_caller_s_arrays_are_copied(model: SimulatorModel):
+    action, x = ACTION.clone(), observe(model, 0)
+    belief = refine(model, BOX, action, x, settings=FEW, seed=0)
+    theta = BOX.sample((20,))
+    before = belief.log_prob(theta)
+    action += 1
+    x += 1
+    assert torch.equal(belief.log_prob(theta), before)
+
+
+def test_uninformed_parameters_without_particles_are_sampled_with_the_others():
+    """A budget that is too small for particles is no lack of a likelihood."""
+
+    def mean(theta: Tensor, action: Tensor) -> Tensor:
+        return theta[:, :2] * action
+
+    prior = BoxUniform(-torch.ones(5), torch.ones(5))
+    simulator = SimulatorModel(mean, noise=GaussianNoise(0.1))
+    x = torch.full((1, 2), 0.3)
+    settings = RefinementOptions(num_histories=200)
+    belief = refine(simulator, prior, torch.ones(1, 1), x, settings=settings, seed=0)
+    assert bool(belief.sample((10,)).isfinite().all())
