@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
-from sbi_active.inference.engine import Fit, SimulatedPotential
+from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
 from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
 from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
 
 COARSE = 60.0  # effective draws, below which a warning is due
-HEAVY = 0.7  # shape of the weights' tail beyond which their mean does not settle
 MOVING = 0.02  # share of moves accepted, below which particles are stuck
 REMEMBERED = 0.3  # correlation of particles with where they began that is too much
 NUM_CHECKED = 200  # draws that tail probabilities rest on
@@ -79,7 +78,7 @@ def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
     }
     if fit.particles is None:
         shape = fit.tail_shape
-        found["light_tails"] = Assumption(shape <= HEAVY, shape)
+        found["light_tails"] = Assumption(shape <= Settings().largest_shape, shape)
         words["light_tails"] = (
             f"few draws outweigh all others (tail shape {shape:.2g}), so that the "
             "belief may miss where they are from; raise num_histories"

@@ -169,14 +169,14 @@ def _gone_on(
     rng: np.random.Generator,
 ) -> Fit | None:
     """Return the posterior from draws of the earlier trials; None where it fails."""
-    pool, _ = past.with_trials(potential, own)
+    pool = past.with_trials(potential, own)
     if not len(pool.u):
         return None
     weight = normalized(pool.log_mixture_weight)
     rows = [weight.argmax(), *systematic(weight, own.num_near - 1, rng.random())]
     again = replace(own.search, num_screened=0)
     found = search(potential, rng, pool.u[rows], again)
-    fit = infer(potential, rng, past=past, found=found, settings=own)
+    fit = infer(potential, rng, past=pool, found=found, settings=own)
     if fit.effective_sample_size < own.num_effective:
         return None
     if fit.tail_shape > own.largest_shape:

@@ -80,6 +80,8 @@ class Pool:
         num_final: Draws of their proposal, also those that do not count.
         proposals: Pairs of the number of draws and the proposal.
         num_trials: Number of trials in the likelihood.
+        log_past: Log likelihood of the first trials, which is not tempered, shape (n,).
+        num_past: Number of these, for which there were draws before.
     """
 
     u: Array
@@ -91,6 +93,8 @@ class Pool:
     num_final: int = 0
     proposals: list[tuple[int, Proposal]] = field(default_factory=list)
     num_trials: int = 0
+    log_past: Array = field(default_factory=lambda: np.zeros(0))
+    num_past: int = 0
 
     @staticmethod
     def empty(dim: int, num_trials: int) -> Pool:
@@ -156,20 +160,18 @@ class Pool:
         self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
         self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
         self.log_own = np.concatenate([self.log_own, proposal.log_prob(u)])
+        # Of what counts every trial has been simulated; this only looks it up.
+        log_past = potential.log_likelihood(u, last=self.num_past)
+        self.log_past = np.concatenate([self.log_past, log_past])
         self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
         self.num_final += len(drawn)
 
-    def with_trials(
-        self, potential: SimulatedPotential, settings: Settings
-    ) -> tuple[Pool, Array]:
+    def with_trials(self, potential: SimulatedPotential, settings: Settings) -> Pool:
         """Return the draws that count with the likelihood of further trials.
 
         Args:
             potential: Potential of these trials and further ones.
             settings: How far below the best a draw is left out.
-
-        Returns:
-            The draws, and their log likelihood of the earlier trials, shape (n,).
         """
         log_weight = self.log_mixture_weight
         rows = np.flatnonzero(
@@ -177,7 +179,7 @@ class Pool:
         )
         new = potential.log_likelihood(self.u[rows], first=self.num_trials)
         rows, new = rows[np.isfinite(new)], new[np.isfinite(new)]
-        pool = Pool(
+        return Pool(
             self.u[rows],
             self.log_prior[rows],
             self.log_likelihood[rows] + new,
@@ -186,8 +188,9 @@ class Pool:
             np.zeros(len(rows), dtype=bool),
             proposals=[*self.proposals],
             num_trials=len(potential.likelihood),
+            log_past=self.log_likelihood[rows],
+            num_past=self.num_trials,
         )
-        return pool, self.log_likelihood[rows]
 
 
 def importance_sample(
@@ -195,8 +198,6 @@ def importance_sample(
     potential: SimulatedPotential,
     rng: np.random.Generator,
     *,
-    log_past: Array,
-    num_past: int,
     num_components: int,
     settings: Settings,
 ) -> bool:
@@ -209,9 +210,6 @@ def importance_sample(
         pool: Draws to begin with.
         potential: Potential of all trials.
         rng: Source of the draws.
-        log_past: Log likelihood of the first trials at the draws, shape (n,), which is
-            not tempered.
-        num_past: Number of these trials.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
     """
@@ -222,8 +220,8 @@ def importance_sample(
     for _ in range(own.max_rounds):
         spent = potential.num_simulations - start
         is_rough = tempered > own.few_tempered
-        log_new = pool.log_likelihood - log_past
-        log_rest = pool.log_prior + log_past - pool.log_mixture
+        log_new = pool.log_likelihood - pool.log_past
+        log_rest = pool.log_prior + pool.log_past - pool.log_mixture
         power = _largest_power(log_rest, log_new, own.fewest)
         effective = pool.effective_sample_size
         wanted = own.num_effective
@@ -244,7 +242,7 @@ def importance_sample(
         is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
         if proposal is not None and is_good and efficiency > 0 and not is_heavy:
             rows = (own.num_effective - effective) / efficiency * pool.num_trials
-            if num_past and rows > budget - spent:
+            if pool.num_past and rows > budget - spent:
                 break  # modes serve better than draws of fewer trials
             latched = latched or efficiency
             lacking = 1.1 * (wanted - effective) / efficiency
@@ -262,11 +260,7 @@ def importance_sample(
             wide = fitted(pool.u, _flattened(pool, own), 2, own, rng)
             proposal = Defended(proposal, wide, share)
         floor = float(pool.log_likelihood.max()) - own.negligible / power
-        before = len(pool.u)
         pool.add(proposal, proposal.sample(size, rng), potential, floor)
-        # Of what counts every trial has been simulated; this only looks it up.
-        added = potential.log_likelihood(pool.u[before:], last=num_past)
-        log_past = np.concatenate([log_past, added])
     return tempered > own.few_tempered
 
 

@@ -95,7 +95,8 @@ def infer(
         potential: Log density of the parameters given all trials.
         rng: Source of the draws.
         found: Modes of the potential; None where a search got nowhere.
-        past: Draws for the first of these trials, to go on from.
+        past: Draws for the first of these trials, with the likelihood of all, to which
+            are added.
         near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.
         settings: Numbers of draws, and what decides between the ways.
     """
@@ -106,25 +107,17 @@ def infer(
             moved = _particles(potential, found, free, rng, settings)
             if moved is not None:
                 return _of_particles(moved, potential, found, free, rng, settings)
-        num_past = 0
         pool = Pool.empty(potential.dim, len(potential.likelihood))
         _begin(pool, potential, rng, found, near, settings)
-        log_past = np.zeros(len(pool.u))
     else:
-        num_past = past.num_trials
-        pool, log_past = past.with_trials(potential, settings)
+        pool = past
         if found is not None:
-            before = len(pool.u)
             _go_on(pool, potential, rng, found, settings)
-            added = potential.log_likelihood(pool.u[before:], last=num_past)
-            log_past = np.concatenate([log_past, added])
     num_modes = 0 if found is None else len(found.modes)
     rough = importance_sample(
         pool,
         potential,
         rng,
-        log_past=log_past,
-        num_past=num_past,
         num_components=max(settings.num_components, num_modes),
         settings=settings,
     )
@@ -237,8 +230,8 @@ def _around(
     values, vectors = np.linalg.eigh(cov)
     axes = vectors * np.sqrt(np.maximum(values, 1e-24))[:, None]
     length = np.abs(axes).max(1)  # (k, d), in deviations of the prior
-    far = settings.profiled[:, None, None] / np.maximum(length, 1e-12)
-    near = np.ones((3, k, d)) * np.array([1.0, 2.0, 4.0])[:, None, None]
+    far = np.multiply.outer(settings.profiled, 1 / np.maximum(length, 1e-12))
+    near = np.multiply.outer(settings.profiled_near, np.ones((k, d)))
     steps = np.sort(np.concatenate([near, far]), axis=0)
     sides = np.stack([-steps, steps])  # (2, s, k, d)
     places = guess.means[:, None] + np.swapaxes(axes, 1, 2) * sides[..., None]
@@ -279,6 +272,7 @@ def _as_pool(
         n,
         [(n, own)],
         len(potential.likelihood),
+        np.zeros(n),
     )
 
 

@@ -89,7 +89,8 @@ def sampled(model: SimulatorModel, x: Tensor, count: int, seed: int = 0, past=No
     if past is None:
         found = search(potential, rng)
         return potential, infer(potential, rng, found=found, settings=settings)
-    fit = infer(potential, rng, past=past[1].pool, settings=settings)
+    pool = past[1].pool.with_trials(potential, settings)
+    fit = infer(potential, rng, past=pool, settings=settings)
     return potential, fit
 
 
