@@ -33,7 +33,7 @@ from sbi_active.inference.engine import (
     search,
 )
 from sbi_active.inference.engine.importance import Pool
-from sbi_active.inference.engine.search import STEP, unchanged
+from sbi_active.inference.engine.potential import STEP, unchanged
 from sbi_active.inference.engine.simulated_likelihood import (
     MeanTable,
     SimulatedLikelihood,

@@ -3,8 +3,17 @@
 ``infer`` knows a potential and nothing of campaigns or verdicts.
 """
 
-from sbi_active.inference.engine.infer import Fit, Settings, infer
-from sbi_active.inference.engine.potential import SimulatedPotential
+from sbi_active.inference.engine.infer import Fit, Settings, WeightedDraws, infer
+from sbi_active.inference.engine.potential import Potential, SimulatedPotential
 from sbi_active.inference.engine.search import Found, search
 
-__all__ = ["Fit", "Found", "Settings", "SimulatedPotential", "infer", "search"]
+__all__ = [
+    "Fit",
+    "Found",
+    "Potential",
+    "Settings",
+    "SimulatedPotential",
+    "WeightedDraws",
+    "infer",
+    "search",
+]

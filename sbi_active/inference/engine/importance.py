@@ -20,7 +20,9 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,9 +30,8 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import genpareto
 
-from sbi_active.inference.engine.potential import SimulatedPotential
+from sbi_active.inference.engine.potential import Potential, SimulatedPotential
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -52,18 +53,18 @@ class PriorDraws(Proposal):
     """The prior as a proposal.
 
     Attributes:
-        coordinates: Coordinates of the prior.
+        potential: Potential that knows the prior.
     """
 
-    coordinates: NormalCoordinates
+    potential: Potential
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return draws, shape (n, d)."""
-        return self.coordinates.sample(num_samples, rng)
+        return self.potential.sample_prior(num_samples, rng)
 
     def log_prob(self, z: Array) -> Array:
         """Return log densities, shape (n,)."""
-        return self.coordinates.log_prior(z)
+        return self.potential.log_prior(z)
 
 
 @dataclass
@@ -81,7 +82,7 @@ class Pool:
         proposals: Pairs of the number of draws and the proposal.
         num_trials: Number of trials in the likelihood.
         log_past: Log likelihood of the first trials, which is not tempered, shape (n,).
-        num_past: Number of these, for which there were draws before.
+        past: Log likelihood of these as a function; None where all trials are new.
     """
 
     u: Array
@@ -94,7 +95,7 @@ class Pool:
     proposals: list[tuple[int, Proposal]] = field(default_factory=list)
     num_trials: int = 0
     log_past: Array = field(default_factory=lambda: np.zeros(0))
-    num_past: int = 0
+    past: Callable[[Array], Array] | None = None
 
     @staticmethod
     def empty(dim: int, num_trials: int) -> Pool:
@@ -126,6 +127,12 @@ class Pool:
         r""":math:`(\sum w_i)^2 / \sum w_i^2` of the posterior's draws."""
         return effective_sample_size(self.log_weight)
 
+    @property
+    def standard_error(self) -> float:
+        """Standard error of log_evidence."""
+        effective, num = self.effective_sample_size, max(self.num_final, 1)
+        return float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0)))
+
     def restart(self) -> None:
         """Rest the posterior on draws to come."""
         self.is_final, self.num_final = np.zeros_like(self.is_final), 0
@@ -134,7 +141,7 @@ class Pool:
         self,
         proposal: Proposal,
         drawn: Array,
-        potential: SimulatedPotential,
+        potential: Potential,
         floor: float = -np.inf,
     ) -> None:
         """Simulate draws of a proposal, shape (n, d), and weigh all.
@@ -161,7 +168,7 @@ class Pool:
         self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
         self.log_own = np.concatenate([self.log_own, proposal.log_prob(u)])
         # Of what counts every trial has been simulated; this only looks it up.
-        log_past = potential.log_likelihood(u, last=self.num_past)
+        log_past = np.zeros(len(u)) if self.past is None else self.past(u)
         self.log_past = np.concatenate([self.log_past, log_past])
         self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
         self.num_final += len(drawn)
@@ -187,19 +194,20 @@ class Pool:
             self.log_own[rows],
             np.zeros(len(rows), dtype=bool),
             proposals=[*self.proposals],
-            num_trials=len(potential.likelihood),
+            num_trials=potential.num_trials,
             log_past=self.log_likelihood[rows],
-            num_past=self.num_trials,
+            past=partial(potential.log_likelihood, last=self.num_trials),
         )
 
 
 def importance_sample(
     pool: Pool,
-    potential: SimulatedPotential,
+    potential: Potential,
     rng: np.random.Generator,
     *,
     num_components: int,
     settings: Settings,
+    rivaled: float = -np.inf,
 ) -> bool:
     """Add draws to a pool until enough are effective; return whether it is rough.
 
@@ -212,6 +220,7 @@ def importance_sample(
         rng: Source of the draws.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
+        rivaled: Log evidence of a better model.
     """
     own, start = settings, potential.num_simulations
     budget, fewest = own.budget(potential.dim), own.draws_of_fit(potential.dim)
@@ -227,6 +236,8 @@ def importance_sample(
         wanted = own.num_effective
         if spent < own.share_of_plenty * budget and not is_rough:
             wanted *= max(own.plenty, 0.5 * potential.dim)
+        if _at_most(pool) < rivaled - own.behind:
+            wanted = min(wanted, own.num_behind)
         if not len(pool.u) or spent >= budget:
             break
         is_heavy = False
@@ -242,7 +253,7 @@ def importance_sample(
         is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
         if proposal is not None and is_good and efficiency > 0 and not is_heavy:
             rows = (own.num_effective - effective) / efficiency * pool.num_trials
-            if pool.num_past and rows > budget - spent:
+            if pool.past is not None and rows > budget - spent:
                 break  # modes serve better than draws of fewer trials
             latched = latched or efficiency
             lacking = 1.1 * (wanted - effective) / efficiency
@@ -318,6 +329,11 @@ def pareto_shape(log_weight: Array) -> float:
         return -np.inf  # all alike
     shape, _, _ = genpareto.fit(excess / excess.mean(), floc=0)
     return float(shape)
+
+
+def _at_most(pool: Pool) -> float:
+    """Return the log evidence with twice its standard error, nats."""
+    return pool.log_evidence + 2 * pool.standard_error if pool.num_final else np.inf
 
 
 def _flattened(pool: Pool, settings: Settings) -> Array:

@@ -6,6 +6,8 @@
 3. Where enough draws are effective, that is the posterior; another proposal is fitted
    while few of them outweigh all others. Otherwise particles are led from the modes to
    it by sequential Monte Carlo, whose cost grows little with the number of parameters.
+
+A model far behind another is known well enough by the Laplace approximation.
 """
 
 from __future__ import annotations
@@ -24,10 +26,9 @@ from sbi_active.inference.engine.importance import (
     pareto_shape,
     wider,
 )
-from sbi_active.inference.engine.potential import SimulatedPotential
+from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.inference.sampling.smc import Bridged, bridge
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -46,18 +47,37 @@ NUM_PROBES = 16  # draws at which uninformed parameters are changed
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
-    """The posterior of a potential.
+class WeightedDraws:
+    """Weighted draws of a posterior, with its evidence.
 
     Attributes:
         u: Draws in the potential's coordinates, shape (n, d).
         weight: Their weights, which sum to 1, shape (n,).
-        log_likelihood: Log likelihood of each, shape (n,).
         log_evidence: Log of the integral of prior times likelihood, nats.
         standard_error: Standard error of log_evidence, nats.
         effective_sample_size: Number of draws that count.
+        method: What gave the draws, "importance", "smc" or "laplace".
+    """
+
+    u: Array
+    weight: Array
+    log_evidence: float
+    standard_error: float
+    effective_sample_size: float
+    method: str
+
+    def draws(self, num: int, rng: np.random.Generator) -> Array:
+        """Return equally weighted draws, shape (num, d)."""
+        return self.u[rng.choice(len(self.u), num, p=self.weight)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(WeightedDraws):
+    """The posterior of a potential.
+
+    Attributes:
+        log_likelihood: Log likelihood of each draw, shape (n,).
         tail_shape: Shape of the tail of the weights; NaN of particles.
-        method: What gave the draws, "importance" or "smc".
         is_rough: Whether the likelihood had to be tempered often.
         free: Parameters that keep their prior, shape (d,).
         found: What the search found; None where it got nowhere.
@@ -65,14 +85,8 @@ class Fit:
         pool: Draws to go on from after a further trial.
     """
 
-    u: Array
-    weight: Array
     log_likelihood: Array
-    log_evidence: float
-    standard_error: float
-    effective_sample_size: float
     tail_shape: float
-    method: str
     is_rough: bool
     free: NDArray[np.bool_]
     found: Found | None
@@ -81,12 +95,13 @@ class Fit:
 
 
 def infer(
-    potential: SimulatedPotential,
+    potential: Potential,
     rng: np.random.Generator,
     *,
     found: Found | None = None,
     past: Pool | None = None,
     near: Array | None = None,
+    rivaled: float = -np.inf,
     settings: Settings = Settings(),  # noqa: B008  (frozen)
 ) -> Fit:
     """Return the posterior of a potential.
@@ -98,16 +113,22 @@ def infer(
         past: Draws for the first of these trials, with the likelihood of all, to which
             are added.
         near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.
+        rivaled: Log evidence of a better model: one that is far behind it need not be
+            known as well.
         settings: Numbers of draws, and what decides between the ways.
     """
     none = np.zeros(potential.dim, dtype=bool)
+    if found is not None and past is None:
+        fit = _if_far_behind(potential, found, rivaled, rng, settings)
+        if fit is not None:
+            return fit
     if past is None:
         free = none if found is None else _free(found, potential, rng)
         if found is not None and free.any():
             moved = _particles(potential, found, free, rng, settings)
             if moved is not None:
                 return _of_particles(moved, potential, found, free, rng, settings)
-        pool = Pool.empty(potential.dim, len(potential.likelihood))
+        pool = Pool.empty(potential.dim, potential.num_trials)
         _begin(pool, potential, rng, found, near, settings)
     else:
         pool = past
@@ -120,20 +141,22 @@ def infer(
         rng,
         num_components=max(settings.num_components, num_modes),
         settings=settings,
+        rivaled=rivaled,
     )
     final, effective = pool.is_final, pool.effective_sample_size
     # After a further trial the modes are not all, and the draws may know others.
-    if found is not None and past is None and effective < settings.num_effective:
+    is_new = found is not None and past is None
+    matters = pool.log_evidence + 2 * pool.standard_error >= rivaled - settings.behind
+    if is_new and matters and effective < settings.num_effective:
         moved = _particles(potential, found, none, rng, settings)
         if moved is not None and moved.effective_sample_size > effective:
             return _of_particles(moved, potential, found, none, rng, settings)
-    num = max(pool.num_final, 1)
     return Fit(
         u=pool.u[final],
         weight=normalized(pool.log_weight[final]) if final.any() else np.zeros(0),
         log_likelihood=pool.log_likelihood[final],
         log_evidence=pool.log_evidence,
-        standard_error=float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0))),
+        standard_error=pool.standard_error,
         effective_sample_size=effective,
         tail_shape=pareto_shape(pool.log_weight[final]) if final.any() else np.inf,
         method="importance",
@@ -145,9 +168,61 @@ def infer(
     )
 
 
+def _if_far_behind(
+    potential: Potential,
+    found: Found,
+    rivaled: float,
+    rng: np.random.Generator,
+    settings: Settings,
+) -> Fit | None:
+    r"""Return Laplace's evidence where it decides nothing, the mode first of the draws.
+
+    .. math::
+        \log Z \approx \log \sum_k p(x | u_k)\, p(u_k)\, \sqrt{|2 \pi \Sigma_k|}
+
+    None unless even the largest likelihood, of which an evidence is an average, is
+    below the rival's, and this far below. Draws are not simulated.
+
+    References:
+        Kass & Raftery, Journal of the American Statistical Association 90 (1995).
+    """
+    modes, dim = found.modes, potential.dim
+    if not (np.isfinite(rivaled) and potential.searched.all()):
+        return None  # the error's own coordinates are where they were
+    log_likelihood = potential.log_likelihood(modes)
+    if not log_likelihood.max() < rivaled:
+        return None
+    factors = found.guess.factors[: len(modes)] / WIDER
+    volume = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
+    mass = log_likelihood + potential.log_prior(modes) + volume
+    log_z = float(log_sum_exp(mass) + 0.5 * dim * np.log(2 * np.pi))
+    if not -np.inf < log_z < rivaled - settings.far_behind:
+        return None
+    c, none = potential.coordinates, np.zeros(dim, dtype=bool)
+    normal = rng.standard_normal((settings.num_draws, dim))
+    u = np.clip(modes[0] + normal @ factors[0].T, c.low, c.high)
+    # A bound itself may round to beyond.
+    u = np.concatenate([modes[:1], u[np.isfinite(potential.log_prior(u))]])
+    return Fit(
+        u=u,
+        weight=np.full(len(u), 1 / len(u)),
+        log_likelihood=np.full(len(u), log_likelihood[0]),
+        log_evidence=log_z,
+        standard_error=0.0,
+        effective_sample_size=float(len(u)),
+        tail_shape=np.nan,
+        method="laplace",
+        is_rough=False,
+        free=none,
+        found=found,
+        particles=None,
+        pool=Pool.empty(dim, potential.num_trials),
+    )
+
+
 def _of_particles(
     moved: Bridged,
-    potential: SimulatedPotential,
+    potential: Potential,
     found: Found,
     free: NDArray[np.bool_],
     rng: np.random.Generator,
@@ -174,14 +249,14 @@ def _of_particles(
 
 def _begin(
     pool: Pool,
-    potential: SimulatedPotential,
+    potential: Potential,
     rng: np.random.Generator,
     found: Found | None,
     near: Array | None,
     settings: Settings,
 ) -> None:
     """Add draws of the prior and around the modes; more where these do not count."""
-    prior = PriorDraws(potential.coordinates)
+    prior = PriorDraws(potential)
     if found is not None:
         pool.add(prior, found.screened, potential)  # simulated for the search already
         pool.restart()
@@ -198,7 +273,7 @@ def _begin(
 
 def _go_on(
     pool: Pool,
-    potential: SimulatedPotential,
+    potential: Potential,
     rng: np.random.Generator,
     found: Found,
     settings: Settings,
@@ -213,11 +288,12 @@ def _go_on(
 
 
 def _around(
-    found: Found, potential: SimulatedPotential, settings: Settings
+    found: Found, potential: Potential, settings: Settings
 ) -> SplitStudentMixture:
     r"""Return a mixture around the modes, as wide on each side as the density is.
 
-    Along each axis of a mode's normal approximation, of unit length there,
+    Along each axis of a mode's normal approximation, of unit length there, within
+    bounds,
 
     .. math::
         s = \max_t \frac{t}{\sqrt{2 (\log p(m) - \log p(m + t a))}},
@@ -225,26 +301,30 @@ def _around(
     which is 1 of a normal density, and more towards a shelf.
     """
     c, guess = potential.coordinates, found.guess
-    k, d = guess.means.shape
+    k, d = found.modes.shape
     cov = guess.factors @ np.swapaxes(guess.factors, 1, 2) / WIDER**2
     values, vectors = np.linalg.eigh(cov)
     axes = vectors * np.sqrt(np.maximum(values, 1e-24))[:, None]
     length = np.abs(axes).max(1)  # (k, d), in deviations of the prior
-    far = np.multiply.outer(settings.profiled, 1 / np.maximum(length, 1e-12))
+    far = np.multiply.outer(settings.profiled, 1 / np.maximum(length[:k], 1e-12))
     near = np.multiply.outer(settings.profiled_near, np.ones((k, d)))
     steps = np.sort(np.concatenate([near, far]), axis=0)
     sides = np.stack([-steps, steps])  # (2, s, k, d)
-    places = guess.means[:, None] + np.swapaxes(axes, 1, 2) * sides[..., None]
-    at = np.concatenate([guess.means, places.reshape(-1, d)])
+    places = found.modes[:, None] + np.swapaxes(axes[:k], 1, 2) * sides[..., None]
+    at = np.concatenate([found.modes, places.reshape(-1, d)])
+    is_inside = ((at >= c.low) & (at <= c.high)).all(1)
     at = np.clip(at, c.low, c.high)
     log_p = potential.log_prior(at) + potential.log_likelihood(at)
     peak, log_p = log_p[:k, None], log_p[k:].reshape(sides.shape)
     fall = np.maximum(peak - log_p, 1e-2)
     # Beyond a valley there are other modes.
     within = np.maximum.accumulate(fall, axis=1) < settings.valley
+    within &= is_inside[k:].reshape(sides.shape)
     within = np.concatenate([np.ones_like(within[:, :1]), within[:, 1:]], 1)
     width = np.where(within, np.abs(sides) / np.sqrt(2 * fall), 0.0).max(1)
-    width = np.clip(width, 1.0, np.maximum(1 / np.maximum(length, 1e-12), 1.0))
+    width = np.clip(width, 1.0, np.maximum(1 / np.maximum(length[:k], 1e-12), 1.0))
+    others = np.ones((2, len(axes) - k, d))  # of another error, are no modes
+    width = np.concatenate([width, others], 1)
     left, right = wider(settings.laplace_wider, d) * width
     freedom = max(settings.freedom, float(d))
     return SplitStudentMixture(guess.means, axes, left, right, guess.weights, freedom)
@@ -252,7 +332,7 @@ def _around(
 
 def _as_pool(
     particles: Bridged,
-    potential: SimulatedPotential,
+    potential: Potential,
     settings: Settings,
     rng: np.random.Generator,
 ) -> Pool:
@@ -271,20 +351,20 @@ def _as_pool(
         np.ones(n, dtype=bool),
         n,
         [(n, own)],
-        len(potential.likelihood),
+        potential.num_trials,
         np.zeros(n),
     )
 
 
 def _particles(
-    potential: SimulatedPotential,
+    potential: Potential,
     found: Found,
     free: NDArray[np.bool_],
     rng: np.random.Generator,
     settings: Settings,
 ) -> Bridged | None:
     """Return particles of all parameters; only those that trials inform are moved."""
-    c, guess, axes = potential.coordinates, found.guess, np.flatnonzero(~free)
+    guess, axes = found.guess, np.flatnonzero(~free)
     cov = guess.factors @ np.swapaxes(guess.factors, 1, 2)
     factors = np.linalg.cholesky(cov[:, axes[:, None], axes])
     # Tails that bend away from the normal of a mode are out of its own reach.
@@ -293,40 +373,42 @@ def _particles(
         np.concatenate([guess.means[:, axes]] * len(WIDTHS)),
         np.concatenate([factors * width for width, _ in WIDTHS]),
     )
-    rest = np.zeros((1, c.dim))
+    rest = np.zeros((1, potential.dim))
 
     def whole(u: Array) -> Array:
         full = np.repeat(rest, len(u), 0)
         full[:, axes] = u
         return full
 
-    fixed = _log_free(c, free, rng) if free.any() else 0.0
+    fixed = _log_free(potential, free, rng) if free.any() else 0.0
     num = int(settings.per_parameter * len(axes) * settings.num_effective)
     moved = bridge(
-        lambda u: c.log_prior(whole(u)) - fixed,
+        lambda u: potential.log_prior(whole(u)) - fixed,
         lambda u: potential.log_likelihood(whole(u)),
         own,
         rng,
         num_particles=max(num, settings.fewest_particles),
-        most=settings.budget(len(axes)) / len(potential.likelihood),
+        most=settings.budget(len(axes)) / potential.num_trials,
     )
     if moved is None:
         return None
-    u = c.sample(len(moved.u), rng)
-    u[:, axes] = moved.u
-    rows = c.base.inside(c.to_z(u))
+    u = moved.u
+    if free.any():
+        u = potential.sample_prior(len(moved.u), rng)
+        u[:, axes] = moved.u
+    rows = np.isfinite(potential.log_prior(u))
     return replace(moved, u=u[rows], log_likelihood=moved.log_likelihood[rows])
 
 
 def _free(
-    found: Found, potential: SimulatedPotential, rng: np.random.Generator
+    found: Found, potential: Potential, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
     """Return parameters that change no trial and do not depend on others."""
-    c, free = potential.coordinates, ~found.informed
-    none = np.zeros(c.dim, dtype=bool)
+    free = ~found.informed
+    none = np.zeros(potential.dim, dtype=bool)
     if not free.any() or free.all():
         return none
-    drawn, other = (c.sample(NUM_PROBES, rng) for _ in range(2))
+    drawn, other = (potential.sample_prior(NUM_PROBES, rng) for _ in range(2))
     near, off = (found.guess.sample(NUM_PROBES, rng) for _ in range(2))
 
     def changes(axes: NDArray[np.bool_]) -> bool:
@@ -338,13 +420,13 @@ def _free(
         return any(r.max() > UNCHANGED for r in residuals)
 
     for axis in np.flatnonzero(free):
-        free[axis] = not changes(np.arange(c.dim) == axis)
-    is_free = free.any() and c.splits_off(free, rng) and not changes(free)
+        free[axis] = not changes(np.arange(potential.dim) == axis)
+    is_free = free.any() and potential.splits_off(free, rng) and not changes(free)
     return free if is_free else none
 
 
 def _log_free(
-    c: NormalCoordinates, free: NDArray[np.bool_], rng: np.random.Generator
+    potential: Potential, free: NDArray[np.bool_], rng: np.random.Generator
 ) -> float:
     r"""Return the prior's log density of the free coordinates at zero.
 
@@ -353,9 +435,9 @@ def _log_free(
     .. math::
         p_F(0) = p(0) \Big/ \int p(0, u_F)\, du_F .
     """
-    u = np.zeros((NUM_INTEGRAL, c.dim))
+    u = np.zeros((NUM_INTEGRAL, potential.dim))
     u[:, free] = WIDER * rng.standard_normal((len(u), int(free.sum())))
     square = ((u[:, free] / WIDER) ** 2 + np.log(2 * np.pi * WIDER**2)).sum(1)
-    log_w = c.log_prior(u) + 0.5 * square
+    log_w = potential.log_prior(u) + 0.5 * square
     integral = log_sum_exp(log_w) - np.log(len(u))
-    return float(c.log_prior(np.zeros((1, c.dim)))[0] - integral)
+    return float(potential.log_prior(u[:1] * 0)[0] - integral)

@@ -8,14 +8,14 @@ in coordinates u in which the prior is nearly standard normal and has no edges.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
-from sbi_active.inference.sampling.least_squares import Whitener
+from sbi_active.inference.sampling.least_squares import LeastSquares, Whitener
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.simulation.noise.whitening import whitened
 
@@ -23,6 +23,64 @@ Array = NDArray[Any]
 
 #: Bound on a whitened residual, which keeps sums of squares finite.
 LARGEST = 1e6
+STEP = 3e-3  # of differences, in deviations of the prior
+
+
+class Potential(LeastSquares, Protocol):
+    """A log density that ``search`` and ``infer`` ask of.
+
+    Beside the sum of squares, of an error that may have unknowns:
+
+    Attributes:
+        step: Step of finite differences, in coordinates.
+        num_trials: Number of trials in the likelihood.
+        num_observed: Number of observed numbers of all trials.
+    """
+
+    step: float
+    num_trials: int
+    num_observed: int
+
+    @property
+    def num_simulations(self) -> int:
+        """Rows simulated so far, each at one action."""
+        ...
+
+    def sample_prior(self, num: int, rng: np.random.Generator) -> Array:
+        """Return draws of the prior, shape (num, dim)."""
+        ...
+
+    def simulated(self, u: Array) -> Array:
+        """Return the places within the prior that are simulated for u, (k, dim)."""
+        ...
+
+    def log_prior(self, u: Array) -> Array:
+        """Return the log density of u under the prior, shape (n,)."""
+        ...
+
+    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+        """Return log likelihoods, shape (n,); -inf allowed of those below a floor."""
+        ...
+
+    def whitener(self, u: Array | None = None) -> Whitener:
+        """Return what whitens residuals, by the likeliest error at u, shape (1, dim).
+
+        The same object where nothing of the error is unknown; None begins a search.
+        """
+        ...
+
+    def regimes(self, u: Array) -> list[Whitener]:
+        """Return what whitens residuals where the error leaves other widths."""
+        ...
+
+    def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
+        """Return whether the prior is a product over some axes and all others."""
+        ...
+
+
+def unchanged(residual: Array) -> Array:
+    """Return residuals as they are: they are whitened already."""
+    return residual
 
 
 class SimulatedPotential:
@@ -35,7 +93,9 @@ class SimulatedPotential:
     Attributes:
         dim: Number of parameters.
         searched: Coordinates that a search may move, shape (d,).
-        num_observed: Observed numbers of all trials.
+        step: Step of finite differences.
+        num_trials: Number of trials.
+        num_observed: Number of observed numbers of all trials.
     """
 
     def __init__(
@@ -44,6 +104,7 @@ class SimulatedPotential:
         self.likelihood, self.coordinates = likelihood, coordinates
         self.dim = coordinates.dim
         self.searched = np.ones(self.dim, dtype=bool)
+        self.step, self.num_trials = STEP, len(likelihood)
         self.num_observed = int(likelihood.x.isfinite().sum())
         self._spread: Array | None = None
 
@@ -51,6 +112,22 @@ class SimulatedPotential:
     def num_simulations(self) -> int:
         """Rows simulated so far, each at one action."""
         return self.likelihood.table.num_simulations
+
+    def sample_prior(self, num: int, rng: np.random.Generator) -> Array:
+        """Return draws of the prior, shape (n, d)."""
+        return self.coordinates.sample(num, rng)
+
+    def whitener(self, u: Array | None = None) -> Whitener:
+        """Return what whitens residuals: nothing of the error is unknown."""
+        return unchanged
+
+    def regimes(self, u: Array) -> list[Whitener]:
+        """Return nothing: no other error is possible."""
+        return []
+
+    def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
+        """Return whether the prior is a product over some axes and all others."""
+        return self.coordinates.splits_off(axes, rng)
 
     def simulated(self, u: Array) -> Array:
         """Return the places that are simulated for u, in single precision, (n, d).

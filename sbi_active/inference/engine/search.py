@@ -5,33 +5,26 @@ r"""Modes of a potential and their widths, by Gauss-Newton steps from many start
     + \tfrac12 \| u \|^2,
 
 A derivative costs a simulation a parameter; no cost grows faster with their number.
+Where the error has unknowns, C is what the best place so far makes most probable.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sbi_active.inference.sampling.least_squares import LeastSquares, descend
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
-from sbi_active.inference.sampling.student_mixture import NormalMixture
+from sbi_active.inference.engine.potential import Potential
+from sbi_active.inference.sampling.least_squares import Whitener, descend, floored
+from sbi_active.inference.sampling.student_mixture import NormalMixture, lower_factors
 
 Array = NDArray[Any]
 
-STEP = 3e-3  # of differences, in deviations of the prior
 WIDER = 1.1  # than the Laplace approximation
 FAINT = 0.1  # derivative, which rounding may give, below which more is asked
-
-
-class Searched(LeastSquares, Protocol):
-    """What can be searched."""
-
-    coordinates: NormalCoordinates  # pyright: ignore[reportIncompatibleMethodOverride]
-    num_observed: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +46,9 @@ class SearchSettings:
         same: Fall of the cost, in nats times 2, within which two searches found the
             same mode.
         negligible: Rise of the cost beyond which a mode holds no mass.
+        phases: Times at most that an unknown error is estimated anew.
+        later: Steps of a search after that.
+        progress: Fall of the cost that is worth another phase.
     """
 
     num_screened: int = 192
@@ -63,6 +59,9 @@ class SearchSettings:
     iterations: int = 12
     same: float = 2.0
     negligible: float = 40.0
+    phases: int = 10
+    later: int = 4
+    progress: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,8 @@ class Found:
     """What a search found.
 
     Attributes:
-        guess: A normal component a mode, weighted by its mass.
+        guess: A normal component a mode, weighted by its mass; behind these, one an
+            error that leaves other widths.
         modes: Best first, shape (k, d).
         informed: Coordinates that move some trial at a mode or draw, shape (d,).
         num_found: Searches that ended at the best mode.
@@ -87,7 +87,7 @@ class Found:
 
 
 def search(
-    problem: Searched,
+    problem: Potential,
     rng: np.random.Generator,
     near: Array | None = None,
     settings: SearchSettings = SearchSettings(),  # noqa: B008  (frozen)
@@ -111,42 +111,52 @@ def search(
     References:
         Boender & Rinnooy Kan, Mathematical Programming 37 (1987).
     """
-    own, c = settings, problem.coordinates
-    every, costs, looked, num = [], [], [], 0
+    own, c, dim = settings, problem.coordinates, problem.dim
+    whiten, looked, num, u = problem.whitener(), [], 0, np.empty((0, dim))
+
+    def start_at(places: Array) -> Array:
+        return np.clip(np.where(problem.searched, places, c.center), c.low, c.high)
+
     while True:
-        drawn = c.sample(own.num_screened * 2 ** len(looked), rng)
+        drawn = problem.sample_prior(own.num_screened * 2 ** len(looked), rng)
         looked.append(drawn)
-        u = np.clip(drawn, c.low, c.high)
-        if len(u):
-            cost = (problem.residual(u)[0] ** 2).sum(1) + (u**2).sum(1)
-            u = u[np.argsort(cost)[: own.num_starts]]
+        starts = start_at(drawn)
+        if len(starts):
+            cost = _cost(problem, starts, whiten)
+            starts = starts[np.argsort(cost)[: own.num_starts]]
         if near is not None and num == 0:
-            u = np.concatenate([np.clip(near, c.low, c.high), u])
-        num += len(u)
-        u, cost = descend(problem, u, unchanged, STEP, own.iterations)
-        every.append(u)
-        costs.append(cost)
-        u, cost = np.concatenate(every), np.concatenate(costs)
+            starts = np.concatenate([start_at(near), starts])
+        num += len(starts)
+        ends, _ = descend(problem, starts, whiten, problem.step, own.iterations)
+        u = np.concatenate([u, ends])
+        u, cost, whiten = _settled(problem, u, whiten, own)
         if not np.isfinite(cost.min()):
             return None
-        modes, counts, jac = _apart(problem, u, cost, own)
+        modes, counts, precision, jac = _apart(problem, u, cost, whiten, own)
         ended = sum(counts)
         expected = len(modes) * (ended - 1) / max(ended - len(modes) - 2, 1e-9)
-        square = float((problem.residual(u[[cost.argmin()]])[0] ** 2).sum())
-        is_found = chi2.sf(square, problem.num_observed) > own.explained
+        square = float((whiten(problem.residual(u[modes[:1]])[0]) ** 2).sum())
+        is_found = chi2.sf(square, problem.num_observed) >= own.explained
         is_found &= (cost < cost.min() + own.same).sum() >= own.num_found
         is_found &= ended > len(modes) + 2 and expected < len(modes) + 0.5
         if is_found or num >= own.max_starts or not own.num_screened:
             break
-    precision = np.einsum("nij,nik->njk", jac, jac) + np.eye(c.dim)
-    cov = np.linalg.inv(precision[modes])
     log_mass = -0.5 * cost[modes] - 0.5 * np.linalg.slogdet(precision[modes])[1]
     mass = np.exp(log_mass - log_mass.max())
     # A mode that is worth little is still visited.
     mass = 0.9 * mass / mass.sum() + 0.1 / len(mass)
-    factors = WIDER * np.linalg.cholesky(cov)
+    means, precisions = [u[modes]], [precision[modes]]
+    for other in problem.regimes(u[modes[:1]]):
+        at, _ = descend(
+            problem, u[modes[:1]], other, problem.step, own.later, secant=True
+        )
+        means.append(at)
+        precisions.append(laplace_precision(problem, at, other)[0])
+    num_other = len(means) - 1
+    mass = np.append(len(modes) * mass, np.ones(num_other)) / (len(modes) + num_other)
+    factors = WIDER * lower_factors(np.linalg.inv(np.concatenate(precisions)))
     return Found(
-        NormalMixture(mass, u[modes], factors),
+        NormalMixture(mass, np.concatenate(means), factors),
         u[modes],
         np.abs(jac).max((0, 1)) > FAINT,
         int((cost < cost.min() + own.same).sum()),
@@ -155,12 +165,53 @@ def search(
     )
 
 
+def laplace_precision(
+    problem: Potential, u: Array, whiten: Whitener
+) -> tuple[Array, Array]:
+    """Return precisions (n, d, d) of normal approximations, and derivatives (n, N, d).
+
+    Args:
+        problem: The sum of squares.
+        u: Places, shape (n, d).
+        whiten: What whitens residuals.
+    """
+    _, jac = problem.jacobian(u, whiten, problem.step)
+    # Never wider than the prior: a flat direction has its variance.
+    return np.einsum("nij,nik->njk", jac, jac) + np.diag(floored(problem)), jac
+
+
+def _cost(problem: Potential, u: Array, whiten: Whitener) -> Array:
+    """Return sums of squares with that of the prior, shape (n,)."""
+    c = problem.coordinates
+    prior = ((u - c.center) ** 2 * c.precision).sum(1)
+    return (whiten(problem.residual(u)[0]) ** 2).sum(1) + prior
+
+
+def _settled(
+    problem: Potential, u: Array, whiten: Whitener, settings: SearchSettings
+) -> tuple[Array, Array, Whitener]:
+    """Return places, their cost, and the error that the best makes most probable."""
+    cost = _cost(problem, u, whiten)
+    for _ in range(settings.phases):
+        now = problem.whitener(u[[cost.argmin()]])
+        if now is whiten:
+            break
+        whiten, before = now, float(_cost(problem, u, now).min())
+        u, cost = descend(problem, u, whiten, problem.step, settings.later)
+        if before - cost.min() < settings.progress:
+            break
+    return u, cost, whiten
+
+
 def _apart(
-    problem: Searched, u: Array, cost: Array, settings: SearchSettings
-) -> tuple[list[int], list[int], Array]:
-    """Return modes apart from one another, searches at each, and all derivatives."""
-    _, jac = problem.jacobian(u, unchanged, STEP)
-    precision = np.einsum("nij,nik->njk", jac, jac) + np.eye(problem.dim)
+    problem: Potential,
+    u: Array,
+    cost: Array,
+    whiten: Whitener,
+    settings: SearchSettings,
+) -> tuple[list[int], list[int], Array, Array]:
+    """Return modes apart from one another, searches at each, precisions, slopes."""
+    precision, jac = laplace_precision(problem, u, whiten)
     modes, counts = [], []
     for i in np.argsort(cost):
         if cost[i] >= cost.min() + settings.negligible:
@@ -173,9 +224,4 @@ def _apart(
         else:
             modes.append(int(i))
             counts.append(1)
-    return modes, counts, jac
-
-
-def unchanged(residual: Array) -> Array:
-    """Return residuals as they are: they are whitened already."""
-    return residual
+    return modes, counts, precision, jac

@@ -16,6 +16,11 @@ class Settings:
             a belief is off by about their number to the power -1/2, in nats.
         plenty: Times as many are drawn while they are cheap, or half the dimension if
             that is more: with half of it heavy tails are cut by a tenth.
+        behind: Nats below a better model's evidence beyond which fewer draws do: at
+            half, a model that has a tenth of its weight is known less well.
+        num_behind: Effective draws that end the sampling of such a model.
+        far_behind: Nats below it beyond which Laplace's evidence does, where no
+            likelihood reaches it; infinite of a response that jumps.
         num_simulations: Simulated rows to spend, each at one action; None is no bound.
             More of more than ``few`` parameters, in proportion.
         share_of_plenty: Share of these within which draws are cheap, unless the
@@ -58,6 +63,9 @@ class Settings:
 
     num_effective: float = 200.0
     plenty: float = 6.0
+    behind: float = 5.0
+    num_behind: float = 20.0
+    far_behind: float = 10.0
     num_simulations: int | None = None
     share_of_plenty: float = 0.6
     num_draws: int = 500

@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 from typing_extensions import override
 
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp, systematic
 
 Array = NDArray[Any]
 
 #: Degrees of freedom: tails above any Gaussian's, and a covariance that exists.
 FREEDOM = 5.0
+#: Smallest variance of a covariance, as a share of the largest.
+SINGULAR = 1e-12
 
 
 class Proposal(Protocol):
@@ -225,6 +228,25 @@ class Defended(Proposal):
             np.log1p(-self.share) + self.main.log_prob(z),
             np.log(self.share) + self.base.log_prob(z),
         )
+
+
+def lower_factors(cov: Array) -> Array:
+    """Return lower Cholesky factors of covariances, shape (..., dim, dim).
+
+    One that is singular in floating point, as where a few trials are believed to many
+    digits, has its smallest variances raised to 1e-12 of the largest.
+    """
+    try:
+        return np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        pass
+    safe = np.where(np.isfinite(cov).all((-1, -2), keepdims=True), cov, 0.0)
+    values, vectors = eigh(0.5 * (safe + np.swapaxes(safe, -1, -2)))
+    least = np.maximum(SINGULAR * values[..., -1:], SINGULAR**2)
+    root = vectors * np.sqrt(np.maximum(values, least))[..., None, :]
+    upper = np.linalg.qr(np.swapaxes(root, -1, -2), mode="r")
+    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return np.swapaxes(upper * sign[..., None], -1, -2)
 
 
 def log_normal(z: Array, mean: Array, factor: Array) -> Array:

@@ -22,7 +22,7 @@ class Residuals(SimulatedPotential):
             sample=lambda n, rng: rng.standard_normal((n, dim)),
         )
         self.dim, self.searched = dim, np.ones(dim, dtype=bool)
-        self.function, self.num_observed = function, observed
+        self.function, self.num_observed, self.step = function, observed, 3e-3
 
     def residual(self, u):
         return (self.function(u),)
