@@ -43,7 +43,7 @@ def evidence_again(
     """
     fit = rivals.fit(ModelKey((*names,)))
     rival, sample, evidence = fit.rival, fit.sample, fit.evidence
-    weight = sample.weights / sample.weights.sum()
+    weight = sample.weight / sample.weight.sum()
     center = weight @ sample.u
     covariance = WIDER * np.cov(sample.u.T, aweights=weight, ddof=0)
     wide = multivariate_normal(

@@ -110,8 +110,10 @@ class Evidence:
         key: Of the model.
         log_evidence: log Z, nats.
         standard_error: Of log Z, Monte Carlo, nats.
-        effective_sample_size: Of the weights; of tempering the number of particles.
-        engine: "least squares" (with importance sampling) or "tempering".
+        effective_sample_size: Number of draws that count.
+        engine: What gave the evidence: "importance" sampling around least squares,
+            "smc" (sequential Monte Carlo), or of a model far behind "laplace" or
+            "linear".
         num_simulations: Trials simulated.
         names: Of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
@@ -153,7 +155,8 @@ class Detection:
         p_value: Of that chi-square; anti-conservative where noise is estimated.
         level: Below which it is an alarm; 0 where something is unknown of the noise.
         null_log_evidence: By least squares, nats.
-        null_cross_check: The same by tempering; None where no alarm was near.
+        null_cross_check: The same from other starts; None where no alarm was near or
+            these ended in the same place.
         least_chi_square: The smallest of any parameters that were tried; NaN where the
             size of the noise is not declared.
         lower_p_value: Probability of one as small, all parameters taken as determined;

@@ -10,7 +10,6 @@ from torch.distributions import Distribution
 from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.least_squares import ROUGH, find_modes
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.seeding import derive_seed
@@ -51,13 +50,13 @@ def thinned_to_need(
     seed = derive_seed(seed, "thinning")
     rivals = RivalSet(model, prior, fit, nuisances, seed=seed)
     rival = rivals.rival(ModelKey())
-    modes = find_modes(rival, step=rivals.step, seed=seed, search=ROUGH)
+    found = rivals.search(ModelKey())
     left = np.full(fit.x.numel(), np.nan)
-    left[rivals.measurements.position] = rival.residual(modes.u[:1])[0][0]
-    found = suggested_sampling(fit, left.reshape(fit.x.shape), times)
-    if found.every == 1:
-        return trials, found
-    return thinned(trials, found, trials.sample_times if own else times), found
+    left[rivals.measurements.position] = rival.residual(found.modes[:1])[0][0]
+    sampling = suggested_sampling(fit, left.reshape(fit.x.shape), times)
+    if sampling.every == 1:
+        return trials, sampling
+    return thinned(trials, sampling, trials.sample_times if own else times), sampling
 
 
 def in_words(found: Sampling) -> str:

@@ -12,7 +12,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.evidence import OneOutlier, RivalSet, lower_factors
+from sbi_active.criticism.evidence import OneOutlier, RivalSet
 from sbi_active.criticism.report.suspects import (
     of_noise,
     of_trials,
@@ -21,6 +21,7 @@ from sbi_active.criticism.report.suspects import (
 )
 from sbi_active.criticism.rivals import NoiseCell, NoiseGrid
 from sbi_active.criticism.steps import is_left_to_chance, unless_refuted, withdrawn
+from sbi_active.inference.sampling.student_mixture import lower_factors
 from sbi_active.messages import explained
 from tests.criticism.report.reports import evaluation, flat, report, tracing
 

@@ -3,8 +3,7 @@
 Here live optimizers and samplers over rivals. What is concluded lives in ``steps``.
 """
 
-from sbi_active.criticism.evidence.importance import lower_factors
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.rival_set import RivalSet
 
-__all__ = ["OneOutlier", "RivalSet", "lower_factors"]
+__all__ = ["OneOutlier", "RivalSet"]

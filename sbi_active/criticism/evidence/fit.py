@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.importance import Array, ImportanceSample
 from sbi_active.criticism.results import Evidence
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.engine import WeightedDraws
+
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -19,23 +23,25 @@ class Fit:
         rival: The model.
         sample: Of its posterior, weighted.
         evidence: What is recorded of it.
+        best: Where other trials are predicted from, shape (dim,); None takes the draws.
     """
 
     rival: Rival
-    sample: ImportanceSample
+    sample: WeightedDraws
     evidence: Evidence
+    best: Array | None = None
 
     @property
     def likeliest(self) -> Array:
         """The coordinates of the largest weight, shape (1, dim)."""
-        return self.sample.u[[int(np.argmax(self.sample.weights))]]
+        return self.sample.u[[int(np.argmax(self.sample.weight))]]
 
     def weighted(self) -> tuple[Array, Array, Array]:
         """Return draws u (n, dim) with a weight, the weights, and residuals (n, N)."""
-        some = self.sample.weights > 0
+        some = self.sample.weight > 0
         u = self.sample.u[some]
         residual = self.rival.residual(u, penalized=False)[0]
-        return u, self.sample.weights[some], residual
+        return u, self.sample.weight[some], residual
 
 
 @dataclass(frozen=True)

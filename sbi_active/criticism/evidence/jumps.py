@@ -7,9 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.least_squares import find_modes, local_proposal
+from sbi_active.criticism.evidence.settings import THOROUGH
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.engine import search
+from sbi_active.inference.engine.search import laplace_precision
+from sbi_active.inference.sampling.student_mixture import (
+    StudentMixture,
+    lower_factors,
+)
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -24,6 +30,8 @@ SMALL = 0.1
 PER_COEFFICIENT, FEWEST_DRAWS = 3, 64
 #: Each round looks as far around the mode as the noise found by the one before says.
 ROUNDS = 2
+#: Inflation of a covariance that draws are taken with.
+INFLATION = 1.5
 #: Median absolute deviation of a normal variable of unit variance.
 MEDIAN = 0.6745
 
@@ -109,18 +117,21 @@ def local_roughness(rival: Rival, *, step: float, seed: int) -> Array:
     """
     noise = rival.error
     assert isinstance(noise, NoiseGrid)
-    modes = find_modes(rival, step=step, seed=seed)
-    rng = np.random.default_rng(seed)
+    rival.step, rng = step, np.random.default_rng(seed)
     dim, c = rival.dim, rival.coordinates
+    found = search(rival, rng, settings=THOROUGH)
+    assert found is not None  # residuals are bounded
+    best = found.modes[:1]
     num = max(PER_COEFFICIENT * (dim + 1) * (dim + 2) // 2, FEWEST_DRAWS)
     rough = np.zeros(len(rival.simulator.measurements))
     for _ in range(ROUNDS):
         wide = noise.with_extra(rough)
-        whiten = wide.whitener(rival.residual(modes.u[:1])[0][0])
-        u = local_proposal(rival, modes.u[:1], whiten, step).sample(num, rng)
+        whiten = wide.whitener(rival.residual(best)[0][0])
+        cov = INFLATION * np.linalg.inv(laplace_precision(rival, best, whiten)[0])
+        u = StudentMixture(best, lower_factors(cov)).sample(num, rng)
         u = np.clip(u, c.low, c.high)
         mean, _, _ = rival.simulator.predict(*c.split(u))
-        rough = _beside_quadratic(u - modes.u[0], mean)
+        rough = _beside_quadratic(u - best[0], mean)
     return rough
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,28 +16,28 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.fit import FirstLook, Fit
-from sbi_active.criticism.evidence.importance import (
-    ENOUGH,
-    MAX_ROUNDS,
-    ImportanceSample,
-    importance_sample,
-)
-from sbi_active.criticism.evidence.jumps import look_for_jumps
-from sbi_active.criticism.evidence.laplace import laplace_sample
-from sbi_active.criticism.evidence.least_squares import Modes
+from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.predicted_before import predicted_before
-from sbi_active.criticism.evidence.proposals import regressions, ridges
-from sbi_active.criticism.evidence.searches import search
-from sbi_active.criticism.evidence.tempering import temper
+from sbi_active.criticism.evidence.settings import (
+    NESTED,
+    ROUGH,
+    THOROUGH,
+    settings_of,
+)
+from sbi_active.criticism.evidence.starts import NUM_NEAR, starts_near_parents
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.criticism.rivals.trial_simulator import (
+    NUM_REPLICATES,
+    TrialSimulator,
+)
 from sbi_active.criticism.rivals.validity import DISAGREEMENT, UNKNOWN_RATES
+from sbi_active.inference.engine import Found, WeightedDraws, infer, search
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 
@@ -45,25 +46,6 @@ Array = NDArray[Any]
 NUM_DRAWS = 400  # kept of a model; a mean is then known to a 20th of a deviation
 #: Trials from which their order may be what residuals follow.
 FEW_TRIALS = 5
-#: Below this effective sample size importance sampling is not trusted.
-TOO_FEW = 20.0
-#: Nats of a largest likelihood below another's evidence: its own need not be precise.
-HOPELESS = 30.0
-#: Nats by which Laplace's evidence stays below another's, so that nobody samples.
-FAR_BEHIND = 10.0
-#: The same, so that its evidence is worth no tempering.
-UNLIKELY = 10.0
-#: Particles and moves of the first cross-check by tempering, and the standard errors
-#: by which it may exceed the evidence before the full number runs.
-FEW_PARTICLES, FEW_MOVES, TOLERATED = 50, 2, 2.0
-#: Nats by which an evidence is behind another, so that it need not be precise.
-BEHIND = 5.0
-#: The same where each trial has its own unknowns, among which particles are dear.
-SETTLED = 3.0
-#: Effective sample size that is enough where the simulator jumps, and the one below
-#: which importance sampling is not trusted there: tempering, which climbs over the same
-#: jumps, would have to do better.
-ENOUGH_ROUGH, TOO_FEW_ROUGH = 30.0, 8.0
 #: Factors on the declared noise where every model misses by more.
 NUM_FACTORS = 14
 #: Ranges of the action space between two trials whose actions are labels.
@@ -99,7 +81,7 @@ class RivalSet:
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
-        modes: Of some that are not fitted yet.
+        found: Modes of some that are not fitted yet.
         look: What least squares found before; None where nobody looked.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
@@ -136,6 +118,7 @@ class RivalSet:
         reach = FARTHEST * np.hypot(self.spread, self.noise.typical_sd)
         self.measurements = self.measurements.bounded(self.center, reach)
         self.simulator.measurements = self.measurements
+        self.step, self.is_smooth = STEPS[0], True
         self.can_fail = not trials.valid.all() or self.simulator.failed
         self.step, self.is_smooth, self.roughness = look_for_jumps(
             self.rival(ModelKey()), seed=seed
@@ -143,7 +126,7 @@ class RivalSet:
         if self.roughness.any():
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
-        self.modes: dict[ModelKey, Modes] = {}
+        self.found: dict[ModelKey, Found] = {}
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -173,6 +156,7 @@ class RivalSet:
             error=self._error_model(key.error),
             spread=self.spread,
             center=self.center,
+            step=self.step,
             disagreement=(
                 UNKNOWN_RATES
                 if key.error == UNEXPLAINED and self.can_fail
@@ -262,83 +246,69 @@ class RivalSet:
         if key not in self.fits:
             rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
             before = self.simulator.num_simulations
-            sample, engine = self._estimate(rival, seed)
-            self.fits[key] = self._record(rival, sample, engine, before, seed)
+            rng = np.random.default_rng(seed)
+            found = self.found.pop(key, None) or self.search(key)
+            sample = self._inferred(rival, found, rng)
+            self.fits[key] = self._record(rival, sample, before, seed)
         return self.fits[key]
 
-    def tempered(self, key: ModelKey = ModelKey()) -> Evidence:  # noqa: B008
-        """Return the evidence by tempering, and keep it where it is the larger.
+    def search(self, key: ModelKey) -> Found:
+        """Return the modes of a rival, from where smaller ones ended."""
+        rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
+        near = starts_near_parents(self.fits, rival, seed)
+        how = THOROUGH if near is None else NESTED
+        how = how if self.is_smooth else ROUGH
+        found = search(rival, np.random.default_rng(seed), near, how)
+        assert found is not None  # residuals are bounded
+        return found
 
-        A mode that the least-squares search missed is missing from its evidence, and
-        no effective sample size shows it. A few particles do the check; where they say
-        more than the evidence, the full number decides.
+    def search_again(self) -> Found:
+        """Return the bare model's modes from where other models have its parameters.
+
+        What an effect that is there drew the first search away from, the model that has
+        it shows.
         """
-        rival, own = self.fit(key).rival, self.fit(key).evidence
-        seed = derive_seed(self.seed, "tempering", str(key))
-        before = self.simulator.num_simulations
-        sample = self._temper(rival, seed, few=True)
-        either = np.hypot(own.standard_error, sample.standard_error)
-        if not sample.log_evidence < own.log_evidence + TOLERATED * either:
-            sample = self._temper(rival, seed, few=False)
-        other = self._record(rival, sample, "tempering", before, seed)
+        rival, seed = self.rival(ModelKey()), derive_seed(self.seed, "again")
+        others = [other for key, other in self.fits.items() if key != ModelKey()]
+        others.sort(key=lambda other: -other.evidence.log_evidence)
+        near = None
+        if others:
+            z = [
+                other.rival.coordinates.to_z(other.likeliest)[:, : rival.dim]
+                for other in others[:NUM_NEAR]
+            ]
+            near = rival.coordinates.from_z(np.concatenate(z))
+        found = search(rival, np.random.default_rng(seed), near, NESTED)
+        assert found is not None  # residuals are bounded
+        return found
+
+    def fit_again(self) -> Evidence:
+        """Return the bare model's evidence by other modes, kept where it is larger."""
+        found = self.search_again()  # simulated already, where it was looked at
+        own, seed = self.fit().evidence, derive_seed(self.seed, "again, sampled")
+        rival, before = self.rival(ModelKey()), self.simulator.num_simulations
+        sample = self._inferred(rival, found, np.random.default_rng(seed))
+        other = self._record(rival, sample, before, seed)
         both = float(np.hypot(own.standard_error, sample.standard_error))
         if sample.log_evidence > own.log_evidence + 2 * both:
-            self.fits[key] = other
+            self.fits[ModelKey()] = other
         return other.evidence
 
-    def search(self, key: ModelKey) -> Modes:
-        """Return the modes of a rival, from where smaller ones ended."""
-        rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
-        return search(rival, self.fits, self.step, self.is_smooth, seed=seed)
-
-    def _estimate(self, rival: Rival, seed: int) -> tuple[ImportanceSample, str]:
-        modes = self.modes.pop(rival.key, None) or self.search(rival.key)
-        rng = np.random.default_rng(seed)
-        behind, best = self._behind(rival, modes.u), self._best_evidence()
-        if self.is_smooth and rival.key != ModelKey() and behind > 0:
-            sample = laplace_sample(rival, modes, rng)
-            if -np.inf < sample.log_evidence < best - FAR_BEHIND:
-                return sample, "linear"
-        better, enough, too_few = ridges, ENOUGH, TOO_FEW
-        given_up = best - HOPELESS if self.nuisances else -np.inf
-        options: dict[str, Any] = {"dismissed": best - BEHIND, "hopeless": given_up}
-        if not self.is_smooth:
-            better, enough, too_few = regressions, ENOUGH_ROUGH, TOO_FEW_ROUGH
-            options |= {"looks": range(MAX_ROUNDS), "missed": np.inf}
-        sample = importance_sample(
-            rival,
-            modes.proposal,
-            rng=rng,
-            local=better(rival, modes, self.step, rng),
-            enough=1.0 if behind > HOPELESS else enough,
-            **options,
+    def _inferred(
+        self, rival: Rival, found: Found, rng: np.random.Generator
+    ) -> WeightedDraws:
+        is_bare = rival.key == ModelKey()
+        repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
+        settings = settings_of(
+            len(self.trials) * repeats, is_bare=is_bare, is_smooth=self.is_smooth
         )
-        if not behind < UNLIKELY or sample.effective_sample_size >= too_few:
-            return sample, "least squares"
-        most = sample.log_evidence + TOLERATED * sample.standard_error
-        if self.nuisances and most < best - SETTLED:
-            return sample, "least squares"
-        # All particles are dear here, and most often behind.
-        for few in (True, False) if self.nuisances or not self.is_smooth else (False,):
-            other = self._temper(rival, seed, few=few)
-            both = np.hypot(sample.standard_error, other.standard_error)
-            if sample.log_evidence - 2 * both > other.log_evidence:
-                # Particles that lost a ridge do not find it again.
-                return sample, "least squares"
-        return other, "tempering"
-
-    def _temper(self, rival: Rival, seed: int, *, few: bool) -> ImportanceSample:
-        size = {"num_particles": FEW_PARTICLES, "num_moves": FEW_MOVES} if few else {}
-        return temper(rival, seed=seed, **size)
-
-    def _behind(self, rival: Rival, modes: Array) -> float:
-        """Return how far even the largest likelihood is below a known evidence, nats.
-
-        An evidence is an average of likelihoods.
-        """
-        if rival.has_noise_effect:  # whose coordinates the search leaves alone
-            return -np.inf
-        return self._best_evidence() - float(rival.log_likelihood(modes).max())
+        best = -np.inf if is_bare else self._best_evidence()
+        fit = infer(rival, rng, found=found, rivaled=best, settings=settings)
+        if len(fit.u):
+            return fit
+        u = rival.sample_prior(NUM_DRAWS, rng)  # nothing has a likelihood
+        equal = np.full(len(u), 1 / len(u))
+        return replace(fit, u=u, weight=equal, log_likelihood=equal * -np.inf)
 
     def _best_evidence(self) -> float:
         """Return the largest log evidence so far."""
@@ -348,14 +318,13 @@ class RivalSet:
     def _record(
         self,
         rival: Rival,
-        sample: ImportanceSample,
-        engine: str,
+        sample: WeightedDraws,
         before: int,
         seed: int,
     ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
-        best = sample.u[np.argsort(sample.weights)[-NUM_TOP:]]
-        if engine == "linear":
+        best = sample.u[np.argsort(sample.weight)[-NUM_TOP:]]
+        if sample.method == "laplace":
             best = sample.u[:1]  # its mode, before draws that nobody simulated
         own = sum(rival.coordinates.joint.sizes)
         residual = rival.residual(best, penalized=False)[0]
@@ -365,7 +334,7 @@ class RivalSet:
             log_evidence=sample.log_evidence,
             standard_error=sample.standard_error,
             effective_sample_size=sample.effective_sample_size,
-            engine=engine,
+            engine=sample.method,
             num_simulations=self.simulator.num_simulations - before,
             names=self.names_of(rival),
             draws=rival.coordinates.to_z(u)[:, :own],

@@ -52,9 +52,9 @@ def log_evidence(
     rival, sample, evidence = fit.rival, fit.sample, fit.evidence
     if not key.effects or not np.isfinite(evidence.log_evidence):
         return evidence.log_evidence, evidence.standard_error
-    some = sample.weights > 0
+    some = sample.weight > 0
     z = torch.from_numpy(rival.coordinates.to_z(sample.u[some]))
-    log_w = np.log(sample.weights[some])
+    log_w = np.log(sample.weight[some])
     bounded = np.isfinite(rival.coordinates.low) & np.isfinite(rival.coordinates.high)
     for name, place in rival.columns().items():
         if name not in key.effects or bounded[place].any():
@@ -74,7 +74,7 @@ def log_evidence(
         inside = np.isfinite(declared)
         log_w[inside] += mixture[inside] - declared[inside]
     change = log_sum_exp(log_w)
-    num = len(sample.weights)
+    num = len(sample.weight)
     effective = np.exp(2 * change - log_sum_exp(2 * log_w))
     error_of_mean = np.sqrt(max(num / effective - 1, 0.0) / num)
     # Tempered particles have equal weights, which say nothing of the evidence's error.

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.importance import ImportanceSample
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.linear import LinearModel
@@ -34,6 +33,7 @@ from sbi_active.criticism.steps.tracing import (
 )
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
+from sbi_active.inference.engine import WeightedDraws
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.seeding import derive_seed
 
@@ -177,7 +177,14 @@ def keep_draws(
     before = rivals.simulator.num_simulations if key.effects else 0
     u = _drawn(rivals, model, center, cov)
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
-    sample = ImportanceSample(u, equal, log_z, 0.0, float(NUM_DRAWS), best)
+    sample = WeightedDraws(
+        u=u,
+        weight=equal,
+        log_evidence=log_z,
+        standard_error=0.0,
+        effective_sample_size=float(NUM_DRAWS),
+        method="linear",
+    )
     rival = rivals.rival(key)
     evidence = Evidence(
         key=key,
@@ -193,7 +200,7 @@ def keep_draws(
         if best is None
         else rival.coordinates.to_z(best[None])[0, : model.own],
     )
-    rivals.fits[key] = Fit(rival, sample, evidence)
+    rivals.fits[key] = Fit(rival, sample, evidence, best)
     return evidence
 
 

@@ -32,18 +32,20 @@ def _record(report: Contents) -> Section:
     evidences = report.tracing.evidences
     spent = sum(e.num_simulations for e in evidences.values())
     items = [f"evidence cost {spent:,} simulated trials"]
-    tempered = [name for name, e in evidences.items() if e.engine == "tempering"]
+    moved = [name for name, e in evidences.items() if e.engine == "smc"]
     if report.tracing.misfit is not None:
         items.append("evidence by linearized models with a residual process in each")
-    elif len(tempered) < len(evidences):
+    elif len(moved) < len(evidences):
         items.append("evidence by least squares and importance sampling")
-    if tempered:
-        which = ", ".join(sorted(tempered))
-        items.append(f"evidence by tempering, where that did not serve: {which}")
+    if moved:
+        which = ", ".join(sorted(moved))
+        items.append(
+            f"evidence by sequential Monte Carlo, where that did not serve: {which}"
+        )
     if report.detection.null_cross_check is not None:
         items.append(
             f"log evidence of the bare model {report.detection.null_log_evidence:.2f}, "
-            f"by tempering {report.detection.null_cross_check:.2f}"
+            f"from other starts {report.detection.null_cross_check:.2f}"
         )
     if report.digest:
         items.append(

@@ -59,7 +59,7 @@ class ChannelNoise(NoiseGrid):
         log_weights: Array | None = None,
     ) -> None:
         super().__init__(cells, scales=scales, log_weights=log_weights)
-        self.channel, self.factors = channel, factors
+        self.channel, self.factors, self.is_known = channel, factors, False
         total = log_sum_exp(log_factor_prior, axis=1)
         self.log_factor_prior = log_factor_prior - total[:, None]
 

@@ -19,6 +19,9 @@ from sbi_active.support import support_bounds, support_of
 
 Array = NDArray[Any]
 
+#: Distance from a bound, in deviations of the prior, within which densities are those
+#: there.
+ROUNDING = 1e-6
 #: Draws that give a prior's mean and deviation to some 3 %; they only set units.
 NUM_DRAWS = 1_000
 #: A positive number whose prior spans this ratio (5 % to 95 %) is searched in logs.
@@ -135,7 +138,8 @@ class SearchCoordinates:
         density = np.full(len(u), -np.inf)
         if not inside.any():
             return density
-        u = u[inside]
+        # A bound itself may round to beyond.
+        u = np.clip(u[inside], self.low + ROUNDING, self.high - ROUNDING)
         z = torch.from_numpy(self.to_z(u))
         own = sum(self.joint.sizes)
         log_p = self.joint.log_prob(z[:, :own]).double()

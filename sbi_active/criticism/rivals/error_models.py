@@ -27,7 +27,13 @@ LOG_2PI = float(np.log(2 * np.pi))
 
 
 class ErrorModel(ABC):
-    """Density of the residual, observation minus noise-free output."""
+    """Density of the residual, observation minus noise-free output.
+
+    Attributes:
+        is_known: Whether nothing of it is unknown, so that one transform whitens all.
+    """
+
+    is_known = False
 
     @abstractmethod
     def log_likelihood(self, residual: Array) -> Array:
@@ -139,6 +145,7 @@ class NoiseGrid(ErrorModel):
         self.cells = cells
         self.log_prior = np.array([cell.log_weight - total for cell in cells])
         self.scales = np.ones(1) if scales is None else scales
+        self.is_known = len(cells) == len(self.scales) == 1
         self.log_scale_prior = (
             np.full(len(self.scales), -np.log(len(self.scales)))
             if log_weights is None

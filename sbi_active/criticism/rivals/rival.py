@@ -20,6 +20,7 @@ Array = NDArray[Any]
 
 #: Bound on a residual, so that its square is finite.
 LARGEST = 1e100
+STEP = 1e-3  # of finite differences, in deviations of the prior
 
 
 class Rival:
@@ -35,11 +36,14 @@ class Rival:
         spread: Deviation of the prior predictive, shape (N,), which is the density of a
             number where the simulator gives none.
         center: Its mean, shape (N,).
+        step: Step of finite differences, in u.
         disagreement: Probabilities, equally likely, that a trial has no outcome where
             the simulator has one, or vice versa.
 
     Attributes:
         coordinates: Of z.
+        num_trials: Number of trials.
+        num_observed: Number of measured numbers of all trials.
     """
 
     def __init__(
@@ -53,16 +57,19 @@ class Rival:
         error: ErrorModel,
         spread: Array,
         center: Array | None = None,
+        step: float = STEP,
         disagreement: Sequence[float] = (DISAGREEMENT,),
     ) -> None:
         self.key, self.effects = key, (*effects,)
         self.simulator, self.error, self.spread = simulator, error, spread
         self.center = np.zeros(len(spread)) if center is None else center
-        self.disagreement = disagreement
+        self.step, self.disagreement = step, disagreement
+        self.num_trials = len(simulator.trials)
+        self.num_observed = len(simulator.measurements)
         self.coordinates = SearchCoordinates(
             prior, effects, nuisances, len(simulator.trials)
         )
-        self.has_noise_effect = any(e.hook == "noise" for e in effects)
+        self._white = error.start()
 
     @property
     def dim(self) -> int:
@@ -139,8 +146,38 @@ class Rival:
         assert isinstance(noise, NoiseGrid)
         return noise.typical_sd
 
-    def log_likelihood(self, u: Array) -> Array:
-        """Return log p(x | z), shape (n,)."""
+    @property
+    def num_simulations(self) -> int:
+        """Trials simulated so far, for all rivals."""
+        return self.simulator.num_simulations
+
+    def sample_prior(self, num: int, rng: np.random.Generator) -> Array:
+        """Return draws of the prior, shape (num, dim)."""
+        return self.coordinates.sample(num, seed=int(rng.integers(2**62)))
+
+    def simulated(self, u: Array) -> Array:
+        """Return the places (n, dim) that are within the prior."""
+        return u[np.isfinite(self.log_prior(u))]
+
+    def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
+        """Return False: an effect that acts on no trial is a question of interest."""
+        return False
+
+    def whitener(self, u: Array | None = None) -> Whitener:
+        """Return what whitens residuals, by the likeliest error at u, shape (1, dim).
+
+        The same object where the error has nothing unknown, and without u.
+        """
+        if u is None or self.error.is_known:
+            return self._white
+        return self.error.whitener(self.residual(u)[0][0])
+
+    def regimes(self, u: Array) -> list[Whitener]:
+        """Return what whitens residuals where the error leaves other widths."""
+        return self.error.regimes(self.residual(u)[0][0])
+
+    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+        """Return log p(x | z), shape (n,); all trials are simulated at once."""
         residual, log_scale, flags = self.residual(u, penalized=False)
         log_p = self.error.log_likelihood(residual) - log_scale + flags
         return np.where(np.isfinite(log_p), log_p, -np.inf)

@@ -88,11 +88,11 @@ def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
     fit = rivals.fits[key]
     c = fit.rival.coordinates
     own = sum(c.joint.sizes)
-    if fit.sample.best is None:
+    if fit.best is None:
         rng = np.random.default_rng(derive_seed(rivals.seed, "bounds"))
         u = fit.sample.draws(NUM_DRAWS, rng)
     else:  # where draws are as wide as misfit asks, some reach any bound
-        u = fit.sample.best[None]
+        u = fit.best[None]
     side = c.sides(u[:, :own])
     # An effect that vanishes at a bound is a weak one, and no prior is too narrow.
     nulls = [e.null_phi(1).double().numpy()[0] for e in fit.rival.effects]
@@ -118,8 +118,8 @@ def _explained(rivals: RivalSet, key: ModelKey) -> tuple[Whitener, float]:
 
 def _start(rivals: RivalSet, key: ModelKey) -> Array:
     """Return the coordinates that a model predicts from, (d,)."""
-    sample = rivals.fits[key].sample
-    return rivals.fits[key].likeliest[0] if sample.best is None else sample.best
+    fit = rivals.fits[key]
+    return fit.likeliest[0] if fit.best is None else fit.best
 
 
 def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.rival_set import HOPELESS, RivalSet
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import CATCH_ALLS, NONE, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
@@ -23,6 +23,8 @@ BEAM = 3
 MAX_EFFECTS = 4  # a choice: at most in one model
 #: All sets of one effect more are together this much less probable, nats.
 COST = float(np.log(3.0))
+#: Nats behind the best set that fits, from which a set is not added to.
+HOPELESS = 30.0
 #: Draws of an effect that are tried on the residual before the effect is fitted.
 NUM_TRIED = 8
 #: Deviations of the chi-square beyond which a set is far from a fit.

@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import chi2
 
-from sbi_active.criticism.evidence.least_squares import NESTED, find_modes
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, Detection, ModelKey
 from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.inference.sampling.weights import log_sum_exp
-from sbi_active.seeding import derive_seed
 
 #: Log Bayes factor of an alarm: under the bare model's prior predictive it is exceeded,
 #: at any stopping time, with a probability of at most 1/20.
@@ -49,7 +47,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     Before an alarm, the bare model is searched again from where other models have its
     parameters, since a mode that the first search missed would be a false alarm. Where
     the two disagree, derivatives mean little or the evidence has a large error, it is
-    computed again by tempering.
+    sampled again from what the second found.
 
     Args:
         rivals: The models.
@@ -84,8 +82,8 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
     is_alarm = log_b - MARGIN * error > THRESHOLD or p_value < level
     sure = rivals.is_smooth and null.standard_error < SURE
-    if is_alarm and not (sure and _found_twice(rivals)):
-        check = rivals.tempered().log_evidence
+    if is_alarm and not (sure and (_is_found(rivals) or is_found_again(rivals))):
+        check = rivals.fit_again().log_evidence
         null = rivals.fit().evidence
         log_b, error = bayes_factor(others, log_evidence(rivals))
         p_value = float(chi2.sf(null.best_chi_square, freedom))
@@ -107,14 +105,12 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     )
 
 
-def _found_twice(rivals: RivalSet) -> bool:
-    """Return whether another search ended where the bare model was sampled."""
-    if rivals.look is not None:
-        own = rivals.fit().evidence.best_chi_square
-        return own < rivals.look.null_chi_square + 2 * THRESHOLD
-    if rivals.nuisances:
+def _is_found(rivals: RivalSet) -> bool:
+    """Return whether an earlier look ended where the bare model was sampled."""
+    if rivals.look is None:
         return False
-    return is_found_again(rivals)
+    own = rivals.fit().evidence.best_chi_square
+    return own < rivals.look.null_chi_square + 2 * THRESHOLD
 
 
 def promise(rivals: RivalSet, key: ModelKey) -> float:
@@ -129,36 +125,20 @@ def promise(rivals: RivalSet, key: ModelKey) -> float:
     if key in rivals.fits:
         return np.inf
     rival = rivals.rival(key)
-    modes = rivals.modes[key] = rivals.search(key)
-    return float((rival.log_prior(modes.u) + rival.log_likelihood(modes.u)).max())
+    if key not in rivals.found:
+        rivals.found[key] = rivals.search(key)
+    at = rivals.found[key].modes
+    return float((rival.log_prior(at) + rival.log_likelihood(at)).max())
 
 
 def is_found_again(rivals: RivalSet) -> bool:
-    """Return whether another search ends where the bare model was sampled.
-
-    It starts where other models have its parameters: what an effect that is there had
-    drawn the first search away from, the model that has it shows.
-
-    Args:
-        rivals: All models, of which some are fitted.
-    """
-    fit, seed = rivals.fit(), derive_seed(rivals.seed, "again")
-    rival = fit.rival
-    others = [other for key, other in rivals.fits.items() if key != ModelKey()]
-    others.sort(key=lambda other: -other.evidence.log_evidence)
-    near = None
-    if others:
-        z = [
-            other.rival.coordinates.to_z(other.likeliest)[:, : rival.dim]
-            for other in others[: NESTED.num_near]
-        ]
-        near = rival.coordinates.from_z(np.concatenate(z))
-    modes = find_modes(rival, step=rivals.step, seed=seed, near=near, search=NESTED)
-    own, again = (
-        float((rival.log_prior(u) + rival.log_likelihood(u)).max())
-        for u in (fit.sample.u, modes.u)
+    """Return whether another search ends where the bare model was sampled."""
+    fit = rivals.fit()
+    own, other = (
+        float((fit.rival.log_prior(u) + fit.rival.log_likelihood(u)).max())
+        for u in (fit.sample.u, rivals.search_again().modes)
     )
-    return again < own + NO_MORE
+    return other < own + NO_MORE
 
 
 def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
@@ -206,7 +186,7 @@ def num_determined(rivals: RivalSet) -> float:
         MacKay, Neural Computation 4, 1992, 415-447 (the evidence framework).
     """
     sample = rivals.fit().sample
-    weights = sample.weights / sample.weights.sum()
+    weights = sample.weight
     center = sample.u - weights @ sample.u
     variances = np.linalg.eigvalsh((weights[:, None] * center).T @ center)
     return float(np.clip(1 - variances, 0.0, None).sum())

@@ -62,7 +62,7 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
     """
     own = rivals.fit(key).rival
     log_b = log_evidence(rivals, key)[0] - log_evidence(rivals)[0]
-    if own.has_noise_effect or rivals.simulator.is_stochastic or log_b < THRESHOLD:
+    if not own.searched.all() or rivals.simulator.is_stochastic or log_b < THRESHOLD:
         return ()
     bare = _change(rivals, ModelKey())
     without = log_b + _change(rivals, key, enough=bare - log_b + THRESHOLD) - bare

@@ -91,7 +91,8 @@ def predict(
         seed: Of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
     """
-    rival, sample = rivals.fit(key).rival, rivals.fit(key).sample
+    fit = rivals.fit(key)
+    rival, sample = fit.rival, fit.sample
     seed = rivals.seed if seed is None else seed
     rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
     u = sample.draws(num_draws, rng)
@@ -115,8 +116,8 @@ def predict(
     source = rivals.simulator if known else simulator
     mean, unit, probability = source.predict(theta, phi)
     at_best = None
-    if trials is not None and sample.best is not None and not rivals.nuisances:
-        at = rival.coordinates.split(sample.best[None])
+    if trials is not None and fit.best is not None and not rivals.nuisances:
+        at = rival.coordinates.split(fit.best[None])
         at_best = simulator.predict(*at)[0][0]
         at_best = np.where(np.isfinite(at_best), at_best, mean.mean(0))
     noise = rivals.noise_of(m)

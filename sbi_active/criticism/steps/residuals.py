@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.importance import INFLATION, lower_factors
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.steps.predictive import Prediction, predict
 from sbi_active.inference.sampling.least_squares import floored
-from sbi_active.inference.sampling.student_mixture import StudentMixture
+from sbi_active.inference.sampling.student_mixture import (
+    StudentMixture,
+    lower_factors,
+)
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
@@ -23,6 +25,8 @@ Array = NDArray[Any]
 #: Draws of the prior, more where nothing but these and the posterior's can be had, and
 #: of the posterior, which are simulated already.
 NUM_PRIOR, NUM_ROUGH, NUM_POSTERIOR = 200, 500, 500
+#: Inflation of a covariance, so that a proposal's tails are the heavier.
+INFLATION = 1.5
 #: Posteriors between the two, and draws of each.
 NUM_BETWEEN, NUM_EACH = 4, 50
 

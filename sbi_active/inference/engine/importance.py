@@ -31,6 +31,8 @@ from scipy.special import logsumexp
 from scipy.stats import genpareto
 
 from sbi_active.inference.engine.potential import Potential, SimulatedPotential
+from sbi_active.inference.engine.ridges import along_ridges, reweighted
+from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.population import GaussianMixture
 from sbi_active.inference.sampling.student_mixture import (
@@ -133,6 +135,11 @@ class Pool:
         effective, num = self.effective_sample_size, max(self.num_final, 1)
         return float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0)))
 
+    @property
+    def at_most(self) -> float:
+        """Log evidence with twice its standard error, nats; inf without draws."""
+        return self.log_evidence + 2 * self.standard_error if self.num_final else np.inf
+
     def restart(self) -> None:
         """Rest the posterior on draws to come."""
         self.is_final, self.num_final = np.zeros_like(self.is_final), 0
@@ -207,6 +214,7 @@ def importance_sample(
     *,
     num_components: int,
     settings: Settings,
+    found: Found | None = None,
     rivaled: float = -np.inf,
 ) -> bool:
     """Add draws to a pool until enough are effective; return whether it is rough.
@@ -220,11 +228,14 @@ def importance_sample(
         rng: Source of the draws.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
+        found: Modes, to propose along ridges from; None where there are none.
         rivaled: Log evidence of a better model.
     """
     own, start = settings, potential.num_simulations
     budget, fewest = own.budget(potential.dim), own.draws_of_fit(potential.dim)
     best, latched, tries, tempered, heavy = 0.0, 0.0, 0, 0, 0
+    ridge: StudentMixture | None = None
+    kept: Proposal | None = None  # the best
     proposal = pool.proposals[-1][1] if pool.num_final else None
     for _ in range(own.max_rounds):
         spent = potential.num_simulations - start
@@ -236,8 +247,7 @@ def importance_sample(
         wanted = own.num_effective
         if spent < own.share_of_plenty * budget and not is_rough:
             wanted *= max(own.plenty, 0.5 * potential.dim)
-        if _at_most(pool) < rivaled - own.behind:
-            wanted = min(wanted, own.num_behind)
+        wanted = own.num_wanted(wanted, pool.at_most - rivaled)
         if not len(pool.u) or spent >= budget:
             break
         is_heavy = False
@@ -248,6 +258,7 @@ def importance_sample(
             heavy += 1  # draws that outweigh others show where to draw more
         efficiency = effective / max(pool.num_final, 1)
         is_good = power == 1 and efficiency >= own.efficient
+        is_good |= own.affords(effective, pool.num_final, wanted)
         # It no longer gets better by being fitted again.
         is_good |= tries >= own.max_fits and efficiency >= 0.5 * best
         is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
@@ -258,7 +269,12 @@ def importance_sample(
             latched = latched or efficiency
             lacking = 1.1 * (wanted - effective) / efficiency
             size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
+        elif kept is not None and tries + tempered >= own.max_fits:
+            pool.restart()  # what was fitted since is worse
+            proposal, latched, size, kept = kept, best, fewest, None
         else:
+            if efficiency > best and effective >= own.seen:
+                kept = proposal
             best, latched = max(best, efficiency), 0.0
             tries += power == 1
             tempered += power < 1
@@ -270,6 +286,15 @@ def importance_sample(
             share = own.share_if_rough if is_rough else own.share_of_wide
             wide = fitted(pool.u, _flattened(pool, own), 2, own, rng)
             proposal = Defended(proposal, wide, share)
+            if found is not None and tries + tempered <= own.num_ridged:
+                # Where few draws count, they may lie across a ridge.
+                full = normalized(pool.log_mixture_weight)
+                if ridge is None and power < 1:
+                    some = pool.u[np.unique(systematic(full, own.num_ridge, 0.5))]
+                    ridge = along_ridges(potential, found, some, rng, own)
+                elif ridge is not None:
+                    ridge = reweighted(ridge, pool.u, full)
+                proposal = proposal if ridge is None else ridge
         floor = float(pool.log_likelihood.max()) - own.negligible / power
         pool.add(proposal, proposal.sample(size, rng), potential, floor)
     return tempered > own.few_tempered
@@ -329,11 +354,6 @@ def pareto_shape(log_weight: Array) -> float:
         return -np.inf  # all alike
     shape, _, _ = genpareto.fit(excess / excess.mean(), floc=0)
     return float(shape)
-
-
-def _at_most(pool: Pool) -> float:
-    """Return the log evidence with twice its standard error, nats."""
-    return pool.log_evidence + 2 * pool.standard_error if pool.num_final else np.inf
 
 
 def _flattened(pool: Pool, settings: Settings) -> Array:

@@ -141,13 +141,16 @@ def infer(
         rng,
         num_components=max(settings.num_components, num_modes),
         settings=settings,
+        found=found,
         rivaled=rivaled,
     )
     final, effective = pool.is_final, pool.effective_sample_size
     # After a further trial the modes are not all, and the draws may know others.
     is_new = found is not None and past is None
-    matters = pool.log_evidence + 2 * pool.standard_error >= rivaled - settings.behind
-    if is_new and matters and effective < settings.num_effective:
+    wanted = settings.num_wanted(settings.num_effective, pool.at_most - rivaled)
+    # An evidence is an average of likelihoods.
+    matters = pool.log_likelihood.max(initial=-np.inf) >= rivaled - settings.behind
+    if is_new and matters and effective < wanted:
         moved = _particles(potential, found, none, rng, settings)
         if moved is not None and moved.effective_sample_size > effective:
             return _of_particles(moved, potential, found, none, rng, settings)
@@ -262,7 +265,10 @@ def _begin(
         pool.restart()
         first = _around(found, potential, settings)
         pool.add(first, first.sample(settings.num_draws, rng), potential)
-        if pool.effective_sample_size >= settings.fewest:
+        effective = pool.effective_sample_size
+        if effective >= settings.fewest or settings.affords(
+            effective, pool.num_final, settings.num_effective
+        ):
             return
     if near is not None and len(near) > 2 * potential.dim:
         own = fitted(near, np.full(len(near), 1 / len(near)), 2, settings, rng)

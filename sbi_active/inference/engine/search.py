@@ -24,6 +24,8 @@ from sbi_active.inference.sampling.student_mixture import NormalMixture, lower_f
 Array = NDArray[Any]
 
 WIDER = 1.1  # than the Laplace approximation
+FAR = 5.0  # sum of squares a number, beyond which a place is far from a fit
+DISTINCT = 0.005  # deviations of the prior, within which two places are one
 FAINT = 0.1  # derivative, which rounding may give, below which more is asked
 
 
@@ -46,8 +48,10 @@ class SearchSettings:
         same: Fall of the cost, in nats times 2, within which two searches found the
             same mode.
         negligible: Rise of the cost beyond which a mode holds no mass.
-        phases: Times at most that an unknown error is estimated anew.
-        later: Steps of a search after that.
+        phases: Times at most that the best searches go on, of an unknown error with
+            what the best place makes most probable.
+        num_kept: Searches that go on.
+        later: Steps of each.
         progress: Fall of the cost that is worth another phase.
     """
 
@@ -59,7 +63,8 @@ class SearchSettings:
     iterations: int = 12
     same: float = 2.0
     negligible: float = 40.0
-    phases: int = 10
+    phases: int = 0
+    num_kept: int = 4
     later: int = 4
     progress: float = 0.5
 
@@ -191,16 +196,27 @@ def _settled(
     problem: Potential, u: Array, whiten: Whitener, settings: SearchSettings
 ) -> tuple[Array, Array, Whitener]:
     """Return places, their cost, and the error that the best makes most probable."""
-    cost = _cost(problem, u, whiten)
-    for _ in range(settings.phases):
-        now = problem.whitener(u[[cost.argmin()]])
-        if now is whiten:
-            break
-        whiten, before = now, float(_cost(problem, u, now).min())
-        u, cost = descend(problem, u, whiten, problem.step, settings.later)
-        if before - cost.min() < settings.progress:
+    own, u, cost, stalls = settings, u.copy(), _cost(problem, u, whiten), 0
+    for _ in range(own.phases):
+        whiten = problem.whitener(u[[cost.argmin()]])
+        cost = _cost(problem, u, whiten)  # where all is simulated already
+        before, rows = cost.min(), _distinct(u, cost)[: own.num_kept]
+        u[rows], cost[rows] = descend(problem, u[rows], whiten, problem.step, own.later)
+        stalls = stalls + 1 if before - cost.min() < own.progress else 0
+        # Far from a fit, a phase may be lost to finding the damping.
+        patience = 3 if cost.min() > FAR * problem.num_observed else 1
+        if stalls >= patience:
             break
     return u, cost, whiten
+
+
+def _distinct(u: Array, cost: Array) -> list[int]:
+    """Return the rows of places that differ from all better ones, best first."""
+    kept: list[int] = []
+    for i in np.argsort(cost):
+        if all(np.abs(u[i] - u[j]).max() > DISTINCT for j in kept):
+            kept.append(int(i))
+    return kept
 
 
 def _apart(

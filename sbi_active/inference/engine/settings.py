@@ -38,6 +38,8 @@ class Settings:
         num_components: Components of a proposal at least; one a mode.
         efficient: Share of a proposal's draws that are effective, with which it is good
             enough: more is drawn from it in place of fitting another.
+        seen: Effective draws from which a proposal's efficiency is believed.
+        affordable: Draws, in ``num_draws``, that are not worth another fit.
         max_fits: Fits to the whole likelihood at most, unless the last is half as
             efficient as the best.
         wider: Factor of the draws' widths in a proposal of one parameter; less of more.
@@ -57,6 +59,11 @@ class Settings:
         per_parameter: Particles a parameter of sequential Monte Carlo, in effective
             draws.
         fewest_particles: Particles at least.
+        num_ridge: Places along a ridge, beside draws that are known. Half leaves gaps
+            in one of two dimensions.
+        num_ridged: Proposals along ridges before others are fitted.
+        reach: Deviations of the prior that they span.
+        returning: Steps that bring them back to the ridge.
         num_near: Draws at which a search begins after a further trial.
         search: Settings of the search.
     """
@@ -78,6 +85,8 @@ class Settings:
     share_if_rough: float = 0.5
     num_components: int = 8
     efficient: float = 0.3
+    seen: float = 8.0
+    affordable: float = 5.0
     max_fits: int = 4
     wider: float = 1.4
     jitter: float = 0.1
@@ -91,8 +100,21 @@ class Settings:
     max_heavy: int = 3
     per_parameter: float = 0.8
     fewest_particles: int = 400
+    num_ridge: int = 32
+    num_ridged: int = 3
+    reach: float = 4.0
+    returning: int = 5
     num_near: int = 5
     search: SearchSettings = field(default_factory=SearchSettings)
+
+    def num_wanted(self, wanted: float, ahead: float) -> float:
+        """Return the effective draws of a model so far ahead of another, in nats."""
+        return min(wanted, self.num_behind) if ahead < -self.behind else wanted
+
+    def affords(self, effective: float, num: int, wanted: float) -> bool:
+        """Return whether a proposal, of whose draws so many count, needs few more."""
+        lacking = (wanted - effective) * num / max(effective, 1e-9)
+        return effective >= self.seen and lacking <= self.affordable * self.num_draws
 
     def draws_of_fit(self, dim: int) -> int:
         """Return the draws that a proposal for so many parameters is fitted to."""

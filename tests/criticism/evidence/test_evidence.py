@@ -58,7 +58,7 @@ MODELS = {
 @pytest.mark.parametrize("names", MODELS)
 def test_importance_sampling_gives_the_evidence(names):
     evidence = rivals().fit(ModelKey(names)).evidence
-    assert evidence.engine == "least squares"
+    assert evidence.engine == "importance"
     assert evidence.standard_error < 0.1
     assert evidence.log_evidence == pytest.approx(
         MODELS[names], abs=4 * evidence.standard_error
@@ -107,7 +107,7 @@ def test_a_draw_that_rounds_to_beyond_its_prior_takes_no_evidence_away():
     some.effects["curve"] = Effect("curve", prior=prior, **own)
     fit = some.fit(key)
     before, _ = log_evidence(some, key)
-    weights = fit.sample.weights
+    weights = fit.sample.weight
     least = np.where(weights > 0, weights, np.inf).argmin()
     fit.sample.u[least, -1] = fit.rival.coordinates.low[-1] - 1e-9
     after, _ = log_evidence(some, key)
@@ -194,7 +194,7 @@ def test_a_curved_ridge_has_the_right_evidence():
     ]
     density = np.exp(np.array(each) - max(each) - 0.5 * (phi / 0.2) ** 2)
     area = np.trapezoid(density, phi) / (0.2 * np.sqrt(2 * np.pi))
-    assert evidence.engine == "least squares"
+    assert evidence.engine == "importance"
     assert evidence.log_evidence == pytest.approx(
         max(each) + np.log(area), abs=4 * evidence.standard_error
     )

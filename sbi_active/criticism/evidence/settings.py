@@ -1,0 +1,65 @@
+"""How much is spent on the evidence of a rival."""
+
+from __future__ import annotations
+
+from sbi_active.inference.engine.search import SearchSettings
+from sbi_active.inference.engine.settings import Settings
+
+#: Searches from draws of the prior alone. A wrong model explains nothing, so that no
+#: number of searches is asked to.
+THOROUGH = SearchSettings(
+    num_screened=128, max_starts=48, explained=0.0, phases=10, num_kept=8
+)
+#: Searches with fits of smaller models to begin at.
+NESTED = SearchSettings(
+    num_screened=32,
+    num_starts=4,
+    max_starts=12,
+    num_found=1,
+    explained=0.0,
+    iterations=6,
+    phases=10,
+)
+#: Searches where the simulator jumps: derivatives lead to the neighborhood of a mode at
+#: most.
+ROUGH = SearchSettings(
+    num_screened=128,
+    num_starts=8,
+    max_starts=8,
+    num_found=1,
+    explained=0.0,
+    iterations=6,
+    phases=2,
+)
+#: Rows of all trials that one model may take.
+MOST = 3_000
+
+
+def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
+    """Return how much is spent on a model.
+
+    The bare model is every comparison's other side, and its posterior is shown; an
+    evidence that is off by a seventh of a nat decides as well as a better one.
+
+    Args:
+        num_trials: Number of simulated trials in a row.
+        is_bare: Whether it is the model without effects.
+        is_smooth: Whether derivatives mean anything; a mode is wider than they say
+            otherwise, and a likelihood higher than at any that was found.
+    """
+    rough = {} if is_smooth else {"laplace_wider": 2.8, "far_behind": float("inf")}
+    if is_bare:
+        return Settings(
+            plenty=4.0,
+            num_simulations=3 * MOST * num_trials,
+            **rough,
+        )
+    return Settings(
+        num_effective=50.0,
+        num_draws=100,
+        fewest=25.0,
+        broad=60.0,
+        share_of_plenty=0.0,
+        num_simulations=MOST * num_trials,
+        **rough,
+    )
