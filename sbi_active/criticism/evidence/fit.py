@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.results import Evidence
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
 
 Array = NDArray[Any]
@@ -33,8 +34,14 @@ class Fit:
 
     @property
     def likeliest(self) -> Array:
-        """The coordinates of the largest weight, shape (1, dim)."""
-        return self.sample.u[[int(np.argmax(self.sample.weight))]]
+        """The mode or the draw of the largest density, shape (1, dim)."""
+        own = self.sample
+        best = own.u[[int(np.argmax(own.weight))]]
+        if not isinstance(own, Sampled) or own.found is None:
+            return best
+        u = np.concatenate([best, own.found.modes[:1]])
+        log_p = self.rival.log_prior(u) + self.rival.log_likelihood(u)
+        return u[[int(np.argmax(log_p))]]
 
     def weighted(self) -> tuple[Array, Array, Array]:
         """Return draws u (n, dim) with a weight, the weights, and residuals (n, N)."""

@@ -58,6 +58,7 @@ def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
         num_effective=50.0,
         num_draws=100,
         fewest=25.0,
+        affordable=5.0,
         broad=60.0,
         share_of_plenty=0.0,
         num_simulations=MOST * num_trials,

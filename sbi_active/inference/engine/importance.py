@@ -49,6 +49,8 @@ from sbi_active.inference.sampling.weights import (
 
 Array = NDArray[Any]
 
+SHRINKS, LEAST = 0.8, 1e-10  # of powers that are tried in turn, and the least of them
+
 
 @dataclass(frozen=True)
 class PriorDraws(Proposal):
@@ -364,10 +366,19 @@ def _flattened(pool: Pool, settings: Settings) -> Array:
 
 
 def _largest_power(log_rest: Array, log_new: Array, needed: float) -> float:
-    """Return the largest power of a likelihood that leaves enough draws effective."""
+    """Return the largest power of a likelihood that leaves enough draws effective.
+
+    Downward from 1: where most draws are near the posterior, a few of the prior
+    outweigh them at lower powers, and fewer are effective there.
+    """
     needed = min(needed, 0.5 * effective_sample_size(log_rest))
 
     def suffices(power: float) -> bool:
         return effective_sample_size(log_rest + power * log_new) >= needed
 
-    return largest_power(suffices)
+    high = 1.0
+    while high > LEAST and not suffices(high):
+        high *= SHRINKS
+    if high == 1 or high <= LEAST:
+        return max(high, LEAST)
+    return largest_power(suffices, start=high, end=min(high / SHRINKS, 1.0))

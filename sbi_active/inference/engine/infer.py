@@ -184,7 +184,8 @@ def _if_far_behind(
         \log Z \approx \log \sum_k p(x | u_k)\, p(u_k)\, \sqrt{|2 \pi \Sigma_k|}
 
     None unless even the largest likelihood, of which an evidence is an average, is
-    below the rival's, and this far below. Draws are not simulated.
+    below the rival's, and this far below. Draws are not simulated, and count as less
+    likely than the mode.
 
     References:
         Kass & Raftery, Journal of the American Statistical Association 90 (1995).
@@ -209,7 +210,7 @@ def _if_far_behind(
     return Fit(
         u=u,
         weight=np.full(len(u), 1 / len(u)),
-        log_likelihood=np.full(len(u), log_likelihood[0]),
+        log_likelihood=np.append(log_likelihood[0], np.full(len(u) - 1, -np.inf)),
         log_evidence=log_z,
         standard_error=0.0,
         effective_sample_size=float(len(u)),

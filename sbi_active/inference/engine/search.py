@@ -65,7 +65,7 @@ class SearchSettings:
     negligible: float = 40.0
     phases: int = 0
     num_kept: int = 4
-    later: int = 4
+    later: int = 10
     progress: float = 0.5
 
 

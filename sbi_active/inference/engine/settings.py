@@ -86,7 +86,7 @@ class Settings:
     num_components: int = 8
     efficient: float = 0.3
     seen: float = 8.0
-    affordable: float = 5.0
+    affordable: float = 0.0
     max_fits: int = 4
     wider: float = 1.4
     jitter: float = 0.1

@@ -137,15 +137,16 @@ def descend(
 
 
 def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) -> Array:
-    """Return the steps of normal equations, (n, dim), along the bounds they stand at.
+    """Return the steps of normal equations, (n, dim), within bounds.
 
-    A coordinate that a step would take beyond its bound is held, and the others are
-    found again: clipped alone, it would leave them where they are right only with it.
+    A coordinate that a step would take beyond its bound is held there, and the others
+    are found again: clipped alone, it would leave them where they are right only with
+    it.
 
     Args:
         system: Shape (n, dim, dim).
         gradient: Shape (n, dim).
-        u: Shape (n, dim).
+        u: Shape (n, dim); a step is subtracted.
         low: Lower bounds, shape (dim,).
         high: Upper bounds.
 
@@ -153,21 +154,23 @@ def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) ->
         Bertsekas, SIAM Journal on Control and Optimization 20 (1982).
     """
     move = np.linalg.solve(system, gradient[..., None])[..., 0]
-    # Of a coordinate at its upper bound, signs turn around.
-    side = (u <= low).astype(float) - (u >= high)
-    for i in np.flatnonzero((side * move > 0).any(1)):
-        held = np.zeros(u.shape[1], dtype=bool)
+    new = u - move
+    for i in np.flatnonzero(((new < low) | (new > high)).any(1)):
+        side = np.zeros(u.shape[1])  # 1 held at its lower bound, -1 at its upper one
         for _ in range(HELD):
-            out = ~held & (side[i] * move[i] > 0)
+            new = u[i] - move[i]
+            out = (side == 0) * ((new < low).astype(float) - (new > high))
             # What is held, and would now be better off inside.
-            pull = side[i] * (gradient[i] - system[i] @ move[i])
-            back = held & (pull < 0) & (not out.any())
-            if not out.any() and not back.any():
+            pull = side * (gradient[i] - system[i] @ move[i])
+            if not out.any() and not (pull < 0).any():
                 break
-            if back.any():
-                back &= pull == pull[back].min()
-            held = (held | out) & ~back
-            move[i] = 0.0
+            if out.any():
+                side = side + out
+            else:
+                side[np.argmin(pull)] = 0.0
+            held = side != 0
+            move[i, held] = (u[i] - np.where(side > 0, low, high))[held]
+            rest = gradient[i, ~held] - system[i][np.ix_(~held, held)] @ move[i, held]
             open_ = np.ix_(~held, ~held)
-            move[i, ~held] = np.linalg.solve(system[i][open_], gradient[i, ~held])
+            move[i, ~held] = np.linalg.solve(system[i][open_], rest)
     return move

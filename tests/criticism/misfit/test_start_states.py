@@ -147,6 +147,6 @@ def test_without_misfit_what_is_far_behind_is_not_sampled():
     tracing = criticism.trace()
     assert (tracing.verdict, tracing.misfit) == ("drag", None)
     assert next(iter(criticism.rivals.fits)) == ModelKey()
-    assert tracing.evidences["unexplained"].engine == "linear"
+    assert tracing.evidences["unexplained"].engine == "laplace"
     assert tracing.evidences["drag"].effective_sample_size >= 50
     assert criticism.detect().null_cross_check is None  # two searches agree

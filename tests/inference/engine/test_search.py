@@ -1,38 +1,16 @@
 """Modes and widths by Gauss-Newton steps, where both are known."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from sbi_active.inference.engine import SimulatedPotential
 from sbi_active.inference.engine.search import WIDER, search
-
-
-class Residuals(SimulatedPotential):
-    """Residuals that are given as a function of u."""
-
-    def __init__(self, function, dim, observed):
-        bound = np.full(dim, 8.0)
-        self.coordinates = SimpleNamespace(
-            dim=dim,
-            precision=np.ones(dim),
-            center=np.zeros(dim),
-            low=-bound,
-            high=bound,
-            sample=lambda n, rng: rng.standard_normal((n, dim)),
-        )
-        self.dim, self.searched = dim, np.ones(dim, dtype=bool)
-        self.function, self.num_observed, self.step = function, observed, 3e-3
-
-    def residual(self, u):
-        return (self.function(u),)
+from tests.inference.engine.potentials import Given
 
 
 def test_a_linear_model_has_one_mode_of_the_posterior_width():
     rng = np.random.default_rng(0)
     matrix, truth = rng.standard_normal((12, 4)) * 5, rng.standard_normal(4)
     x = matrix @ truth + rng.standard_normal(12)
-    found = search(Residuals(lambda u: x - u @ matrix.T, 4, 12), rng)
+    found = search(Given(lambda u: x - u @ matrix.T, 4, 12), rng)
     precision = matrix.T @ matrix + np.eye(4)
     assert found is not None
     assert found.modes.shape == (1, 4)
@@ -49,7 +27,7 @@ def test_a_linear_model_has_one_mode_of_the_posterior_width():
 def test_every_mode_is_found():
     # u^2 is seen: each sign of each coordinate explains it.
     x = np.array([1.0, 0.64, 1.44])
-    residuals = Residuals(lambda u: (x - u**2) / 0.02, 3, 3)
+    residuals = Given(lambda u: (x - u**2) / 0.02, 3, 3)
     found = search(residuals, np.random.default_rng(1))
     assert found is not None
     signs = {tuple(np.sign(mode)) for mode in found.modes}
@@ -58,7 +36,7 @@ def test_every_mode_is_found():
 
 
 def test_fewer_numbers_than_parameters_leave_the_prior_where_nothing_is_known():
-    residuals = Residuals(lambda u: (2.0 - u[:, :1]) / 0.1, 5, 1)
+    residuals = Given(lambda u: (2.0 - u[:, :1]) / 0.1, 5, 1)
     found = search(residuals, np.random.default_rng(2))
     assert found is not None
     np.testing.assert_array_equal(found.informed, [True, *[False] * 4])
@@ -71,6 +49,6 @@ def test_a_lost_simulation_counts_as_a_large_residual():
     def function(u):
         return np.where(u[:, :1] > 1, 1e6, (0.5 - u[:, :1]) / 0.1)
 
-    found = search(Residuals(function, 1, 1), np.random.default_rng(3))
+    found = search(Given(function, 1, 1), np.random.default_rng(3))
     assert found is not None
     assert abs(found.modes[0, 0] - 0.5 * 100 / 101) < 0.01

@@ -12,6 +12,7 @@ from sbi_active.inference.sampling.student_mixture import (
     Defended,
     SplitStudentMixture,
     StudentMixture,
+    lower_factors,
     student_steps,
 )
 
@@ -101,3 +102,20 @@ def test_a_split_mixture_of_equal_sides_is_a_student_mixture():
     split = SplitStudentMixture(MEANS, FACTORS, ones, ones, WEIGHTS)
     mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
     assert split.log_prob(Z) == pytest.approx(mixture.log_prob(Z))
+
+
+def test_lower_factors_are_those_of_cholesky():
+    a = np.random.default_rng(0).normal(size=(3, 4, 4))
+    covariance = a @ np.swapaxes(a, 1, 2)
+    assert (lower_factors(covariance) == np.linalg.cholesky(covariance)).all()
+
+
+def test_a_singular_covariance_has_its_smallest_variances_raised():
+    covariance = np.array([[1.0, 1.0], [1.0, 1.0]])[None] - 1e-16
+    covariance = np.concatenate([covariance, [[[1.0, 2.0], [2.0, 1.0]]]])
+    factor = lower_factors(covariance)
+    assert (np.triu(factor, 1) == 0).all()
+    assert (np.diagonal(factor, axis1=1, axis2=2) > 0).all()
+    assert (factor @ np.swapaxes(factor, 1, 2))[0] == pytest.approx(
+        covariance[0], abs=1e-9
+    )

@@ -1,0 +1,76 @@
+"""Proposals along ridges, and powers of a likelihood that leave draws effective."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from sbi_active.inference.engine import infer, search
+from sbi_active.inference.engine.importance import _largest_power
+from sbi_active.inference.engine.ridges import along_ridges, reweighted
+from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.weights import effective_sample_size
+from tests.inference.engine.potentials import Given
+
+SETTINGS = Settings(num_effective=100, num_draws=200, share_of_plenty=0)
+SD, X, SLOPE = 1e-3, 1.0, 0.4
+
+
+def product():
+    """One number that is the product of a parameter and a gain: a hyperbola."""
+    return Given(lambda u: (X - u[:, :1] * np.exp(SLOPE * u[:, 1:])) / SD, 2, 1, sd=SD)
+
+
+def evidence():
+    """Return the log evidence of an error that is small beside the prior."""
+
+    def density(gain):
+        scale = np.exp(SLOPE * gain)
+        return norm.pdf(gain) * norm.pdf(X / scale) / scale
+
+    return np.log(quad(density, -8, 8)[0])
+
+
+def test_places_stay_on_the_ridge_and_spread_along_it():
+    own, rng = product(), np.random.default_rng(0)
+    found = search(own, rng)
+    mixture = along_ridges(own, found, found.modes, rng, SETTINGS)
+    u = mixture.means
+    assert u[:, 0] * np.exp(SLOPE * u[:, 1]) == pytest.approx(X, abs=0.02)
+    assert np.ptp(u[:, 1]) > 2  # deviations of the prior
+    # None is as wide as the prior.
+    assert np.linalg.svd(mixture.factors, compute_uv=False).max() < 1
+
+
+def test_a_thin_ridge_has_the_right_evidence():
+    own, rng = product(), np.random.default_rng(1)
+    found = infer(own, rng, found=search(own, rng), settings=SETTINGS)
+    assert found.method == "importance"
+    assert found.effective_sample_size >= 100
+    assert found.log_evidence == pytest.approx(evidence(), abs=4 * found.standard_error)
+    assert own.num_rows < 12_000
+
+
+def test_components_get_the_weights_of_their_draws():
+    own, rng = product(), np.random.default_rng(0)
+    found = search(own, rng)
+    mixture = along_ridges(own, found, found.modes, rng, SETTINGS)
+    u = mixture.means[:1] + np.zeros((5, 1))
+    more = reweighted(mixture, u, np.full(5, 0.2))
+    assert more.weights.sum() == pytest.approx(1)
+    likeliest = mixture.means[more.weights.argmax()]
+    assert likeliest == pytest.approx(mixture.means[0], abs=0.01)
+    assert more.weights.min() >= 0.4 / len(mixture.means)
+
+
+def test_the_largest_power_is_found_where_lower_ones_leave_fewer_draws():
+    """A hundred draws at the peak, and those of the prior that outweigh them at .1."""
+    at_peak = np.linspace(-0.5, 0.5, 100)
+    at_peak[:4] += 3.0  # so that at power 1 few are effective
+    log_new = np.concatenate([at_peak, -400.0 - 100.0 * np.arange(200)])
+    log_rest = np.concatenate([np.zeros(100), np.full(200, 60.0)])
+    for power in (0.1, 1.0):
+        assert effective_sample_size(log_rest + power * log_new) < 60
+    power = _largest_power(log_rest, log_new, 60.0)
+    assert 0.4 < power < 1
+    assert effective_sample_size(log_rest + power * log_new) == pytest.approx(60)
