@@ -32,23 +32,12 @@ QUICK = {
     ),
     "refine, noise drawn": ("linear_3_10", "edge", "hard_edged"),
     "close_loop, bare model": tuple(
-        name
-        for name in PROBLEMS
-        if name not in ("compartments_10", "hard_edged", "payload", "jump")
+        name for name in PROBLEMS if name not in ("hard_edged", "payload")
     ),
     "identify": ("decay", "missing"),
 }
-FEW = "the closed loop draws from some hundred effective samples: one engine for all"
 #: What is wrong today, each with the reason; strict, so that a cure shows.
 KNOWN: dict[tuple[str, str], str] = {
-    **{
-        (name, "close_loop, bare model"): FEW
-        for name in (
-            *("linear_6_40", "linear_7_40", "linear_10_4", "linear_20_4"),
-            *("linear_20_200", "oscillator", "compartments_6", "eight_modes"),
-            *("banana",),
-        )
-    },
     ("hard_edged", "refine, noise drawn"): "regression errors are taken as Gaussian",
 }
 

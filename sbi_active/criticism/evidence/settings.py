@@ -56,6 +56,8 @@ def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
         )
     return Settings(
         num_effective=50.0,
+        plenty=1.0,
+        divergence=float("inf"),
         num_draws=100,
         fewest=25.0,
         affordable=5.0,

@@ -178,6 +178,8 @@ class Rival:
 
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
         """Return log p(x | z), shape (n,); all trials are simulated at once."""
+        if not len(u):
+            return np.zeros(0)
         residual, log_scale, flags = self.residual(u, penalized=False)
         log_p = self.error.log_likelihood(residual) - log_scale + flags
         return np.where(np.isfinite(log_p), log_p, -np.inf)

@@ -17,6 +17,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 Array = NDArray[Any]
 
 COARSE = 60.0  # effective draws, below which a warning is due
+TOLERATED = 0.1  # divergence of a normal fit to the draws, nats, likewise
 MOVING = 0.02  # share of moves accepted, below which particles are stuck
 REMEMBERED = 0.3  # correlation of particles with where they began that is too much
 NUM_CHECKED = 200  # draws that tail probabilities rest on
@@ -69,12 +70,13 @@ def diagnose_fit(
 
 def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
     """Return what was taken for granted, and a sentence for each that fails."""
-    effective = fit.effective_sample_size
-    found = {"enough_draws": Assumption(effective >= COARSE, effective)}
+    effective, dim = fit.effective_sample_size, int((~fit.free).sum())
+    needed = max(COARSE, dim * (dim + 3) / (4 * TOLERATED))
+    found = {"enough_draws": Assumption(effective >= needed, effective)}
     words = {
-        "enough_draws": f"the belief rests on {effective:.0f} effective draws, so that "
-        f"its log density is off by about {max(effective, 1e-9) ** -0.5:.2g} nats; "
-        "raise num_histories"
+        "enough_draws": f"the belief rests on {effective:.0f} effective draws, fewer "
+        f"than the {needed:.0f} that {dim} parameters ask for, so that its log density "
+        f"is off by about {max(effective, 1e-9) ** -0.5:.2g} nats; raise num_histories"
     }
     if fit.particles is None:
         shape = fit.tail_shape

@@ -204,6 +204,7 @@ def _searched(
         likelihood, best = potential.likelihood, found.modes[:1]
         residual, jacobian = potential.jacobian(best, unchanged, STEP)
         around = best + AROUND * (found.guess.sample(NUM_AROUND, rng) - best)
+        around = np.clip(around, c.low, c.high)
         now = find_contradiction(
             declared,
             c.to_theta(np.concatenate([best, around])),

@@ -86,13 +86,13 @@ class SimulatedBelief(Belief):
         defensive: float,
     ) -> None:
         super().__init__(prior)
-        self._normal, self._likelihood = potential.coordinates, potential.likelihood
-        self._coordinates = self._normal.base
+        self._likelihood, coordinates = potential.likelihood, potential.coordinates
+        self._coordinates, rng = coordinates.base, np.random.default_rng(0)
+        self._normal = NormalCoordinates(self._coordinates, rng, keeps_edges=False)
         self._defensive, self._log_evidence = defensive, fit.log_evidence
         self.free = fit.free
-        self._z, self._weight = self._normal.to_z(fit.u), fit.weight
-        rng = np.random.default_rng(0)
-        u = fit.u[systematic(self._weight, NUM_FITTED, 0.5)]
+        self._z, self._weight = coordinates.to_z(fit.u), fit.weight
+        u = self._normal.from_z(self._z[systematic(self._weight, NUM_FITTED, 0.5)])
         mixture = GaussianMixture.fit(u, 4, rng)
         self._fitted = NormalMixture(
             np.exp(mixture.log_weight), mixture.mean, mixture.factor

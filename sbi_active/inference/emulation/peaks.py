@@ -60,7 +60,7 @@ def sample_posterior(
         UnexplainedOutcomeError: If nothing has a likelihood.
     """
     c = likelihood.coordinates
-    u = NormalCoordinates(c, rng)
+    u = NormalCoordinates(c, rng, keeps_edges=False)
     fit = GaussianMixture.fit(u.from_z(points), NUM_COMPONENTS, rng)
     wide = np.exp(fit.log_weight), fit.mean, INFLATION**0.5 * fit.factor
     flat = np.ones(1), np.zeros((1, u.dim)), np.eye(u.dim)[None]

@@ -246,9 +246,8 @@ def importance_sample(
         log_rest = pool.log_prior + pool.log_past - pool.log_mixture
         power = _largest_power(log_rest, log_new, own.fewest)
         effective = pool.effective_sample_size
-        wanted = own.num_effective
-        if spent < own.share_of_plenty * budget and not is_rough:
-            wanted *= max(own.plenty, 0.5 * potential.dim)
+        is_cheap = spent < own.share_of_plenty * budget and not is_rough
+        wanted = own.asked(potential.dim, is_cheap=is_cheap)
         wanted = own.num_wanted(wanted, pool.at_most - rivaled)
         if not len(pool.u) or spent >= budget:
             break

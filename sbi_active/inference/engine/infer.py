@@ -147,7 +147,8 @@ def infer(
     final, effective = pool.is_final, pool.effective_sample_size
     # After a further trial the modes are not all, and the draws may know others.
     is_new = found is not None and past is None
-    wanted = settings.num_wanted(settings.num_effective, pool.at_most - rivaled)
+    asked = settings.asked(potential.dim, is_cheap=False)
+    wanted = settings.num_wanted(asked, pool.at_most - rivaled)
     # An evidence is an average of likelihoods.
     matters = pool.log_likelihood.max(initial=-np.inf) >= rivaled - settings.behind
     if is_new and matters and effective < wanted:
@@ -416,7 +417,10 @@ def _free(
     if not free.any() or free.all():
         return none
     drawn, other = (potential.sample_prior(NUM_PROBES, rng) for _ in range(2))
-    near, off = (found.guess.sample(NUM_PROBES, rng) for _ in range(2))
+    c = potential.coordinates
+    near, off = (
+        np.clip(found.guess.sample(NUM_PROBES, rng), c.low, c.high) for _ in range(2)
+    )
 
     def changes(axes: NDArray[np.bool_]) -> bool:
         pairs = (drawn, np.where(axes, other, drawn)), (near, np.where(axes, off, near))

@@ -14,8 +14,11 @@ class Settings:
     Attributes:
         num_effective: Effective draws that end importance sampling. The log density of
             a belief is off by about their number to the power -1/2, in nats.
-        plenty: Times as many are drawn while they are cheap, or half the dimension if
-            that is more: with half of it heavy tails are cut by a tenth.
+        plenty: Times as many are drawn while they are cheap: with half of it heavy
+            tails are cut by a tenth.
+        divergence: Of a normal fit to the draws, in nats, that is asked while they are
+            cheap, and twice that always: n draws of d parameters are d (d + 3) / 4 n
+            off. Half asks for twice as many of 10 parameters and more.
         behind: Nats below a better model's evidence beyond which fewer draws do: at
             half, a model that has a tenth of its weight is known less well.
         num_behind: Effective draws that end the sampling of such a model.
@@ -70,6 +73,7 @@ class Settings:
 
     num_effective: float = 200.0
     plenty: float = 6.0
+    divergence: float = 0.05
     behind: float = 5.0
     num_behind: float = 20.0
     far_behind: float = 10.0
@@ -106,6 +110,13 @@ class Settings:
     returning: int = 5
     num_near: int = 5
     search: SearchSettings = field(default_factory=SearchSettings)
+
+    def asked(self, dim: int, *, is_cheap: bool) -> float:
+        """Return the effective draws that so many parameters ask for."""
+        num = dim * (dim + 3) / (4 * self.divergence)
+        if is_cheap:
+            return max(self.plenty * self.num_effective, num)
+        return max(self.num_effective, num / 2)
 
     def num_wanted(self, wanted: float, ahead: float) -> float:
         """Return the effective draws of a model so far ahead of another, in nats."""

@@ -1,4 +1,4 @@
-"""Coordinates in which a prior is nearly a standard normal, and has no edges."""
+"""Coordinates in which a prior has no mean and unit variance."""
 
 from __future__ import annotations
 
@@ -17,41 +17,59 @@ Array = NDArray[Any]
 NUM_DRAWS = 2_000  # of the prior, behind its moments
 CHANCE = 5.0  # deviations of a correlation of independent draws that count as none
 REACH = 8.0  # bound of a search, in deviations of the prior
+UNIFORM = 3**-0.5  # deviation of a uniform number between -1 and 1
+FLAT_ERROR = UNIFORM * (0.2 / NUM_DRAWS) ** 0.5  # of the deviation of its draws
+INSIDE = 1 - 1e-6  # bound of a search between -1 and 1, which single precision keeps
 
 
 class NormalCoordinates:
-    r"""Maps parameters to u, in which the prior is close to :math:`N(0, I)`.
+    r"""Maps parameters to u, in which the prior has no mean and unit covariance.
 
-    An axis with two bounds goes to the line, where a uniform number is normal, one with
-    one bound to its logarithm, and all are whitened by the prior's moments. Independent
-    uniform, normal and log-normal priors become standard normal but for the noise of
-    these; any other only sets the units of a search.
+    An axis with one bound goes to its logarithm, and all are whitened by the prior's
+    moments. An axis with two bounds that others do not depend on keeps them: what is
+    straight stays so up to the edge, and is cut there. Where axes depend on each other,
+    or on request, they go to the line, where a uniform number is normal: bounds of what
+    is whitened together would be oblique, and a smooth density would be cut.
 
     Args:
         coordinates: Of the prior.
         rng: Source of the draws behind its moments.
+        keeps_edges: Whether axes keep two bounds.
 
     Attributes:
         low: Bounds of a search, shape (d,).
         high: As low.
         center: Mean of the normal that stands for the prior, shape (d,).
-        precision: Its inverse variance, shape (d,).
+        precision: Its inverse variance, shape (d,): 0 of a uniform number, which has
+            its bounds, and up to 1 of one that is narrow between them.
     """
 
-    def __init__(self, coordinates: PriorCoordinates, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        coordinates: PriorCoordinates,
+        rng: np.random.Generator,
+        *,
+        keeps_edges: bool = True,
+    ) -> None:
         self.base, self.dim = coordinates, coordinates.dim
-        self.line = Unbounding(coordinates.bounded)
-        y = self.line.to_line(coordinates.sample_prior(NUM_DRAWS, rng))
-        self._shift, spread = y.mean(0), y.std(0)
-        correlation = np.atleast_2d(np.corrcoef(y.T))
-        correlation[np.abs(correlation) < CHANCE * NUM_DRAWS**-0.5] = 0.0
-        np.fill_diagonal(correlation, 1.0)
-        if np.linalg.eigvalsh(correlation)[0] < 1e-6:
-            correlation = np.atleast_2d(np.corrcoef(y.T)) + 1e-6 * np.eye(self.dim)
+        z, bounded = coordinates.sample_prior(NUM_DRAWS, rng), coordinates.bounded
+        self.line = Unbounding(bounded)
+        correlation = _correlation(self.line.to_line(z))
+        apart = np.abs(correlation - np.eye(self.dim)).max(1) == 0
+        kept = bounded & apart & keeps_edges
+        self.line = Unbounding(bounded & ~kept)
+        y = self.line.to_line(z)
+        shift, spread = y.mean(0), y.std(0)
+        # Those of a uniform number are known.
+        is_flat = kept & (np.abs(spread - UNIFORM) < CHANCE * FLAT_ERROR)
+        self._shift = np.where(is_flat, 0.0, shift)
+        spread = np.where(is_flat, UNIFORM, spread)
         self._factor = spread[:, None] * np.linalg.cholesky(correlation)
         self._log_volume = float(np.log(np.diag(self._factor)).sum())
-        self.low, self.high = np.full(self.dim, -REACH), np.full(self.dim, REACH)
-        self.center, self.precision = np.zeros(self.dim), np.ones(self.dim)
+        low, high = ((end - self._shift) / spread for end in (-INSIDE, INSIDE))
+        self.low, self.high = np.where(kept, low, -REACH), np.where(kept, high, REACH)
+        share = np.maximum(1 - (spread / UNIFORM) ** 2, 0.0)
+        self.center, self.precision = np.zeros(self.dim), np.where(kept, share, 1.0)
 
     def from_z(self, z: Array) -> Array:
         """Return u, shape (n, d), of the prior's coordinates, shape (n, d)."""
@@ -99,3 +117,13 @@ class NormalCoordinates:
             for parts in (mixed, (a, b))
         )
         return bool(torch.allclose(apart, together, rtol=1e-4, atol=1e-3))
+
+
+def _correlation(y: Array) -> Array:
+    """Return correlations of draws (n, d) without those that chance may give."""
+    raw = np.atleast_2d(np.corrcoef(y.T))
+    found = np.where(np.abs(raw) < CHANCE * len(y) ** -0.5, 0.0, raw)
+    np.fill_diagonal(found, 1.0)
+    if np.linalg.eigvalsh(found)[0] < 1e-6:
+        return raw + 1e-6 * np.eye(len(raw))
+    return found

@@ -224,9 +224,7 @@ CASES: dict[str, tuple[Callable[[], Report], Callable[[], Report]]] = {
         usual.report,
     ),
     "evidence uncertain of": (
-        replace(
-            usual, fn=staircase, noise=1e-7, effects=(bias(),), missing=lambda a: 0.0
-        ).report,
+        replace(usual, fn=staircase, noise=1e-3, effects=(bias(),)).report,
         replace(usual, effects=(bias(),), missing=lambda a: 0.0).report,
     ),
     "two estimates of the bare model's evidence differ": (
