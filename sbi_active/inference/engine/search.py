@@ -142,7 +142,7 @@ def search(
         expected = len(modes) * (ended - 1) / max(ended - len(modes) - 2, 1e-9)
         square = float((whiten(problem.residual(u[modes[:1]])[0]) ** 2).sum())
         is_found = chi2.sf(square, problem.num_observed) >= own.explained
-        is_found &= (cost < cost.min() + own.same).sum() >= own.num_found
+        is_found &= (cost - cost.min() < own.same).sum() >= own.num_found
         is_found &= ended > len(modes) + 2 and expected < len(modes) + 0.5
         if is_found or num >= own.max_starts or not own.num_screened:
             break
@@ -164,7 +164,7 @@ def search(
         NormalMixture(mass, np.concatenate(means), factors),
         u[modes],
         np.abs(jac).max((0, 1)) > FAINT,
-        int((cost < cost.min() + own.same).sum()),
+        int((cost - cost.min() < own.same).sum()),
         num,
         np.concatenate(looked),
     )
@@ -230,7 +230,7 @@ def _apart(
     precision, jac = laplace_precision(problem, u, whiten)
     modes, counts = [], []
     for i in np.argsort(cost):
-        if cost[i] >= cost.min() + settings.negligible:
+        if cost[i] - cost.min() >= settings.negligible:
             break
         for place, j in enumerate(modes):
             off = u[i] - u[j]

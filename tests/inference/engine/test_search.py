@@ -52,3 +52,11 @@ def test_a_lost_simulation_counts_as_a_large_residual():
     found = search(Given(function, 1, 1), np.random.default_rng(3))
     assert found is not None
     assert abs(found.modes[0, 0] - 0.5 * 100 / 101) < 0.01
+
+
+def test_where_nothing_fits_there_is_a_best_place():
+    """Beside a sum of squares of 1e18 some nats are lost in the rounding."""
+    own = Given(lambda u: 1e9 + np.stack([u[:, 0], 3 * u[:, 1]], 1), 2, 2)
+    found = search(own, np.random.default_rng(0))
+    assert len(found.modes) >= 1
+    assert np.isfinite(found.guess.factors).all()
