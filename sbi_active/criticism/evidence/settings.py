@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from sbi_active.inference.engine.search import SearchSettings
 from sbi_active.inference.engine.settings import Settings
 
@@ -47,22 +51,19 @@ def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
         is_smooth: Whether derivatives mean anything; a mode is wider than they say
             otherwise, and a likelihood higher than at any that was found.
     """
-    rough = {} if is_smooth else {"laplace_wider": 2.8, "far_behind": float("inf")}
-    if is_bare:
-        return Settings(
-            plenty=4.0,
-            num_simulations=3 * MOST * num_trials,
-            **rough,
+    own = Settings(plenty=4.0, num_simulations=3 * MOST * num_trials)
+    if not is_bare:
+        own = Settings(
+            num_effective=50.0,
+            plenty=1.0,
+            divergence=np.inf,
+            num_draws=100,
+            fewest=25.0,
+            affordable=5.0,
+            broad=60.0,
+            share_of_plenty=0.0,
+            num_simulations=MOST * num_trials,
         )
-    return Settings(
-        num_effective=50.0,
-        plenty=1.0,
-        divergence=float("inf"),
-        num_draws=100,
-        fewest=25.0,
-        affordable=5.0,
-        broad=60.0,
-        share_of_plenty=0.0,
-        num_simulations=MOST * num_trials,
-        **rough,
-    )
+    if is_smooth:
+        return own
+    return replace(own, laplace_wider=2.8, far_behind=np.inf)

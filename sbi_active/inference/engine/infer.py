@@ -146,12 +146,11 @@ def infer(
     )
     final, effective = pool.is_final, pool.effective_sample_size
     # After a further trial the modes are not all, and the draws may know others.
-    is_new = found is not None and past is None
     asked = settings.asked(potential.dim, is_cheap=False)
     wanted = settings.num_wanted(asked, pool.at_most - rivaled)
     # An evidence is an average of likelihoods.
     matters = pool.log_likelihood.max(initial=-np.inf) >= rivaled - settings.behind
-    if is_new and matters and effective < wanted:
+    if found is not None and past is None and matters and effective < wanted:
         moved = _particles(potential, found, none, rng, settings)
         if moved is not None and moved.effective_sample_size > effective:
             return _of_particles(moved, potential, found, none, rng, settings)
@@ -320,7 +319,7 @@ def _around(
     sides = np.stack([-steps, steps])  # (2, s, k, d)
     places = found.modes[:, None] + np.swapaxes(axes[:k], 1, 2) * sides[..., None]
     at = np.concatenate([found.modes, places.reshape(-1, d)])
-    is_inside = ((at >= c.low) & (at <= c.high)).all(1)
+    is_inside = np.all((at >= c.low) & (at <= c.high), axis=1)
     at = np.clip(at, c.low, c.high)
     log_p = potential.log_prior(at) + potential.log_likelihood(at)
     peak, log_p = log_p[:k, None], log_p[k:].reshape(sides.shape)
