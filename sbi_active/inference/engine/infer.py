@@ -141,11 +141,11 @@ def infer(
         rng,
         num_components=max(settings.num_components, num_modes),
         settings=settings,
-        found=found,
+        # After a further trial the modes are not all, and the draws may know others.
+        found=found if past is None else None,
         rivaled=rivaled,
     )
     final, effective = pool.is_final, pool.effective_sample_size
-    # After a further trial the modes are not all, and the draws may know others.
     asked = settings.asked(potential.dim, is_cheap=False)
     wanted = settings.num_wanted(asked, pool.at_most - rivaled)
     # An evidence is an average of likelihoods.
