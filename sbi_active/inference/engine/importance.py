@@ -234,19 +234,16 @@ def importance_sample(
         rivaled: Log evidence of a better model.
     """
     own, start = settings, potential.num_simulations
-    budget, fewest = own.budget(potential.dim), own.draws_of_fit(potential.dim)
-    best, latched, tries, tempered, heavy = 0.0, 0.0, 0, 0, 0
-    ridge: StudentMixture | None = None
-    kept: Proposal | None = None  # the best
+    budget = own.budget(potential.dim)
+    fits = _Fits(pool, potential, found, num_components, own, rng)
     proposal = pool.proposals[-1][1] if pool.num_final else None
+    best, latched, heavy = 0.0, 0.0, 0
+    kept: Proposal | None = None  # the best
     for _ in range(own.max_rounds):
         spent = potential.num_simulations - start
-        is_rough = tempered > own.few_tempered
-        log_new = pool.log_likelihood - pool.log_past
-        log_rest = pool.log_prior + pool.log_past - pool.log_mixture
-        power = _largest_power(log_rest, log_new, own.fewest)
+        power = fits.power()
         effective = pool.effective_sample_size
-        is_cheap = spent < own.share_of_plenty * budget and not is_rough
+        is_cheap = spent < own.share_of_plenty * budget and not fits.is_rough
         wanted = own.asked(potential.dim, is_cheap=is_cheap)
         wanted = own.num_wanted(wanted, pool.at_most - rivaled)
         if not len(pool.u) or spent >= budget:
@@ -261,8 +258,9 @@ def importance_sample(
         is_good = power == 1 and efficiency >= own.efficient
         is_good |= own.affords(effective, pool.num_final, wanted)
         # It no longer gets better by being fitted again.
-        is_good |= tries >= own.max_fits and efficiency >= 0.5 * best
+        is_good |= fits.num_full >= own.max_fits and efficiency >= 0.5 * best
         is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
+        size = own.draws_of_fit(potential.dim)
         if proposal is not None and is_good and efficiency > 0 and not is_heavy:
             rows = (own.num_effective - effective) / efficiency * pool.num_trials
             if pool.past is not None and rows > budget - spent:
@@ -270,35 +268,83 @@ def importance_sample(
             latched = latched or efficiency
             lacking = 1.1 * (wanted - effective) / efficiency
             size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
-        elif kept is not None and tries + tempered >= own.max_fits:
+        elif kept is not None and fits.num >= own.max_fits:
             pool.restart()  # what was fitted since is worse
-            proposal, latched, size, kept = kept, best, fewest, None
+            proposal, latched, kept = kept, best, None
         else:
             if efficiency > best and effective >= own.seen:
                 kept = proposal
             best, latched = max(best, efficiency), 0.0
-            tries += power == 1
-            tempered += power < 1
-            weight, size = normalized(log_rest + power * log_new), fewest
             pool.restart()
-            proposal = fitted(pool.u, weight, num_components, own, rng)
-            # What is dense around the draws alone misses tails, and of a rough
-            # likelihood the peaks between those that were found.
-            share = own.share_if_rough if is_rough else own.share_of_wide
-            wide = fitted(pool.u, _flattened(pool, own), 2, own, rng)
-            proposal = Defended(proposal, wide, share)
-            if found is not None and tries + tempered <= own.num_ridged:
-                # Where few draws count, they may lie across a ridge.
-                full = normalized(pool.log_mixture_weight)
-                if ridge is None and power < 1:
-                    some = pool.u[np.unique(systematic(full, own.num_ridge, 0.5))]
-                    ridge = along_ridges(potential, found, some, rng, own)
-                elif ridge is not None:
-                    ridge = reweighted(ridge, pool.u, full)
-                proposal = proposal if ridge is None else ridge
+            proposal = fits.again(power)
         floor = float(pool.log_likelihood.max()) - own.negligible / power
         pool.add(proposal, proposal.sample(size, rng), potential, floor)
-    return tempered > own.few_tempered
+    return fits.is_rough
+
+
+@dataclass
+class _Fits:
+    """Proposals that are fitted to a pool, one after another.
+
+    Attributes:
+        num_full: Number of those to the whole likelihood.
+        num_tempered: Number of those to a power of it.
+        ridge: The last one along ridges.
+    """
+
+    pool: Pool
+    potential: Potential
+    found: Found | None
+    num_components: int
+    settings: Settings
+    rng: np.random.Generator
+    num_full: int = 0
+    num_tempered: int = 0
+    ridge: StudentMixture | None = None
+
+    @property
+    def num(self) -> int:
+        """Number of fits."""
+        return self.num_full + self.num_tempered
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether the likelihood had to be tempered often."""
+        return self.num_tempered > self.settings.few_tempered
+
+    def power(self) -> float:
+        """Return the largest power of the new likelihood that leaves enough draws."""
+        return _largest_power(*self._logs(), self.settings.fewest)
+
+    def again(self, power: float) -> Proposal:
+        """Return a proposal for a power of the likelihood, fitted to all draws."""
+        pool, own, rng, is_rough = self.pool, self.settings, self.rng, self.is_rough
+        self.num_full += power == 1
+        self.num_tempered += power < 1
+        log_rest, log_new = self._logs()
+        weight = normalized(log_rest + power * log_new)
+        main = fitted(pool.u, weight, self.num_components, own, rng)
+        # What is dense around the draws alone misses tails, and of a rough likelihood
+        # the peaks between those that were found.
+        share = own.share_if_rough if is_rough else own.share_of_wide
+        wide = fitted(pool.u, _flattened(pool, own), 2, own, rng)
+        if self.found is not None and self.num <= own.num_ridged:
+            # Where few draws count, they may lie across a ridge.
+            full = normalized(pool.log_mixture_weight)
+            if self.ridge is not None:
+                self.ridge = reweighted(self.ridge, pool.u, full)
+            elif power < 1:
+                some = pool.u[np.unique(systematic(full, own.num_ridge, 0.5))]
+                self.ridge = along_ridges(self.potential, self.found, some, rng, own)
+            if self.ridge is not None:
+                return self.ridge
+        return Defended(main, wide, share)
+
+    def _logs(self) -> tuple[Array, Array]:
+        """Return log weights without the new likelihood, and that, shapes (n,)."""
+        pool = self.pool
+        log_new = pool.log_likelihood - pool.log_past
+        return pool.log_prior + pool.log_past - pool.log_mixture, log_new
 
 
 def fitted(
