@@ -32,7 +32,7 @@ from sbi_active.inference.engine import (
     infer,
     search,
 )
-from sbi_active.inference.engine.importance import Pool
+from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import STEP, unchanged
 from sbi_active.inference.engine.simulated_likelihood import (
     MeanTable,

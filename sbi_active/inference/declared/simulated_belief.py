@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.engine import Fit, SimulatedPotential
-from sbi_active.inference.engine.importance import Pool
+from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.simulated_likelihood import MeanTable
 from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.inference.sampling.population import GaussianMixture

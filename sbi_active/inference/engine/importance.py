@@ -20,17 +20,15 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 from scipy.stats import genpareto
 
-from sbi_active.inference.engine.potential import Potential, SimulatedPotential
+from sbi_active.inference.engine.pool import Pool
+from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.ridges import along_ridges, reweighted
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
@@ -50,163 +48,6 @@ from sbi_active.inference.sampling.weights import (
 Array = NDArray[Any]
 
 SHRINKS, LEAST = 0.8, 1e-10  # of powers that are tried in turn, and the least of them
-
-
-@dataclass(frozen=True)
-class PriorDraws(Proposal):
-    """The prior as a proposal.
-
-    Attributes:
-        potential: Potential that knows the prior.
-    """
-
-    potential: Potential
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, d)."""
-        return self.potential.sample_prior(num_samples, rng)
-
-    def log_prob(self, z: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        return self.potential.log_prior(z)
-
-
-@dataclass
-class Pool:
-    """Draws of all proposals so far that may still count.
-
-    Attributes:
-        u: Places, shape (n, d).
-        log_prior: Log prior density, shape (n,).
-        log_likelihood: Log likelihood of the trials so far, shape (n,).
-        log_mixture: Log of the sum over proposals, each times its number of draws.
-        log_own: Log density of the proposal that each was drawn from.
-        is_final: Which of them the posterior rests on, shape (n,).
-        num_final: Draws of their proposal, also those that do not count.
-        proposals: Pairs of the number of draws and the proposal.
-        num_trials: Number of trials in the likelihood.
-        log_past: Log likelihood of the first trials, which is not tempered, shape (n,).
-        past: Log likelihood of these as a function; None where all trials are new.
-    """
-
-    u: Array
-    log_prior: Array
-    log_likelihood: Array
-    log_mixture: Array
-    log_own: Array
-    is_final: NDArray[np.bool_]
-    num_final: int = 0
-    proposals: list[tuple[int, Proposal]] = field(default_factory=list)
-    num_trials: int = 0
-    log_past: Array = field(default_factory=lambda: np.zeros(0))
-    past: Callable[[Array], Array] | None = None
-
-    @staticmethod
-    def empty(dim: int, num_trials: int) -> Pool:
-        """Return a pool without draws."""
-        no, none = np.zeros((0, dim)), np.zeros(0)
-        flags = np.zeros(0, dtype=bool)
-        return Pool(no, none, none, none, none, flags, num_trials=num_trials)
-
-    @property
-    def log_mixture_weight(self) -> Array:
-        """Log weights of all draws, to fit the next proposal with, shape (n,)."""
-        return self.log_prior + self.log_likelihood - self.log_mixture
-
-    @property
-    def log_weight(self) -> Array:
-        """Log weights of the posterior, shape (n,); -inf where it does not rest."""
-        log_weight = self.log_prior + self.log_likelihood - self.log_own
-        return np.where(self.is_final, log_weight, -np.inf)
-
-    @property
-    def log_evidence(self) -> float:
-        """Log of the integral of prior times likelihood."""
-        if not self.is_final.any():
-            return -np.inf
-        return float(logsumexp(self.log_weight) - np.log(self.num_final))
-
-    @property
-    def effective_sample_size(self) -> float:
-        r""":math:`(\sum w_i)^2 / \sum w_i^2` of the posterior's draws."""
-        return effective_sample_size(self.log_weight)
-
-    @property
-    def standard_error(self) -> float:
-        """Standard error of log_evidence."""
-        effective, num = self.effective_sample_size, max(self.num_final, 1)
-        return float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0)))
-
-    @property
-    def at_most(self) -> float:
-        """Log evidence with twice its standard error, nats; inf without draws."""
-        return self.log_evidence + 2 * self.standard_error if self.num_final else np.inf
-
-    def restart(self) -> None:
-        """Rest the posterior on draws to come."""
-        self.is_final, self.num_final = np.zeros_like(self.is_final), 0
-
-    def add(
-        self,
-        proposal: Proposal,
-        drawn: Array,
-        potential: Potential,
-        floor: float = -np.inf,
-    ) -> None:
-        """Simulate draws of a proposal, shape (n, d), and weigh all.
-
-        Args:
-            proposal: What they were drawn from.
-            drawn: The draws.
-            potential: Potential of all trials.
-            floor: Log likelihood below which a draw is given up.
-        """
-        u = potential.simulated(drawn)
-        log_likelihood = potential.log_likelihood(u, floor=floor)
-        counts = np.isfinite(log_likelihood)
-        u, log_likelihood = u[counts], log_likelihood[counts]
-        own = np.log(len(drawn)) + proposal.log_prob(self.u)
-        self.log_mixture = np.logaddexp(self.log_mixture, own)
-        self.proposals.append((len(drawn), proposal))
-        log_mixture = np.full(len(u), -np.inf)
-        for num, each in self.proposals if len(u) else []:
-            log_mixture = np.logaddexp(log_mixture, np.log(num) + each.log_prob(u))
-        self.u = np.concatenate([self.u, u])
-        self.log_prior = np.concatenate([self.log_prior, potential.log_prior(u)])
-        self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
-        self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
-        self.log_own = np.concatenate([self.log_own, proposal.log_prob(u)])
-        # Of what counts every trial has been simulated; this only looks it up.
-        log_past = np.zeros(len(u)) if self.past is None else self.past(u)
-        self.log_past = np.concatenate([self.log_past, log_past])
-        self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
-        self.num_final += len(drawn)
-
-    def with_trials(self, potential: SimulatedPotential, settings: Settings) -> Pool:
-        """Return the draws that count with the likelihood of further trials.
-
-        Args:
-            potential: Potential of these trials and further ones.
-            settings: How far below the best a draw is left out.
-        """
-        log_weight = self.log_mixture_weight
-        rows = np.flatnonzero(
-            log_weight > log_weight.max(initial=-np.inf) - settings.negligible
-        )
-        new = potential.log_likelihood(self.u[rows], first=self.num_trials)
-        rows, new = rows[np.isfinite(new)], new[np.isfinite(new)]
-        return Pool(
-            self.u[rows],
-            self.log_prior[rows],
-            self.log_likelihood[rows] + new,
-            self.log_mixture[rows],
-            self.log_own[rows],
-            np.zeros(len(rows), dtype=bool),
-            proposals=[*self.proposals],
-            num_trials=potential.num_trials,
-            log_past=self.log_likelihood[rows],
-            past=partial(potential.log_likelihood, last=self.num_trials),
-        )
 
 
 def importance_sample(

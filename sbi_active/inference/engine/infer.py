@@ -12,86 +12,31 @@ A model far behind another is known well enough by the Laplace approximation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.inference.engine.fit import Fit
 from sbi_active.inference.engine.importance import (
-    Pool,
-    PriorDraws,
     fitted,
     importance_sample,
     pareto_shape,
     wider,
 )
+from sbi_active.inference.engine.particles import fit_of, led_particles, uninformed
+from sbi_active.inference.engine.pool import Pool, PriorDraws
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.smc import Bridged, bridge
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
-    NormalMixture,
     Proposal,
     SplitStudentMixture,
 )
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
 Array = NDArray[Any]
-
-WIDTHS = ((1.0, 0.4), (2.0, 0.3), (3.0, 0.3))  # of the guess, and their weights
-NUM_INTEGRAL = 4_000  # draws, which cost no simulation
-UNCHANGED = 2e-3  # deviations of the noise, which single precision may change
-NUM_PROBES = 16  # draws at which uninformed parameters are changed
-
-
-@dataclass(frozen=True, kw_only=True)
-class WeightedDraws:
-    """Weighted draws of a posterior, with its evidence.
-
-    Attributes:
-        u: Draws in the potential's coordinates, shape (n, d).
-        weight: Their weights, which sum to 1, shape (n,).
-        log_evidence: Log of the integral of prior times likelihood, nats.
-        standard_error: Standard error of log_evidence, nats.
-        effective_sample_size: Number of draws that count.
-        method: What gave the draws, "importance", "smc" or "laplace".
-    """
-
-    u: Array
-    weight: Array
-    log_evidence: float
-    standard_error: float
-    effective_sample_size: float
-    method: str
-
-    def draws(self, num: int, rng: np.random.Generator) -> Array:
-        """Return equally weighted draws, shape (num, d)."""
-        return self.u[rng.choice(len(self.u), num, p=self.weight)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fit(WeightedDraws):
-    """The posterior of a potential.
-
-    Attributes:
-        log_likelihood: Log likelihood of each draw, shape (n,).
-        tail_shape: Shape of the tail of the weights; NaN of particles.
-        is_rough: Whether the likelihood had to be tempered often.
-        free: Parameters that keep their prior, shape (d,).
-        found: What the search found; None where it got nowhere.
-        particles: What moved them; None of importance sampling.
-        pool: Draws to go on from after a further trial.
-    """
-
-    log_likelihood: Array
-    tail_shape: float
-    is_rough: bool
-    free: NDArray[np.bool_]
-    found: Found | None
-    particles: Bridged | None
-    pool: Pool
 
 
 def infer(
@@ -123,11 +68,11 @@ def infer(
         if fit is not None:
             return fit
     if past is None:
-        free = none if found is None else _free(found, potential, rng)
+        free = none if found is None else uninformed(found, potential, rng)
         if found is not None and free.any():
-            moved = _particles(potential, found, free, rng, settings)
+            moved = led_particles(potential, found, free, rng, settings)
             if moved is not None:
-                return _of_particles(moved, potential, found, free, rng, settings)
+                return fit_of(moved, potential, found, free, rng, settings)
         pool = Pool.empty(potential.dim, potential.num_trials)
         _begin(pool, potential, rng, found, near, settings)
     else:
@@ -151,9 +96,9 @@ def infer(
     # An evidence is an average of likelihoods.
     matters = pool.log_likelihood.max(initial=-np.inf) >= rivaled - settings.behind
     if found is not None and past is None and matters and effective < wanted:
-        moved = _particles(potential, found, none, rng, settings)
+        moved = led_particles(potential, found, none, rng, settings)
         if moved is not None and moved.effective_sample_size > effective:
-            return _of_particles(moved, potential, found, none, rng, settings)
+            return fit_of(moved, potential, found, none, rng, settings)
     return Fit(
         u=pool.u[final],
         weight=normalized(pool.log_weight[final]) if final.any() else np.zeros(0),
@@ -221,33 +166,6 @@ def _if_far_behind(
         found=found,
         particles=None,
         pool=Pool.empty(dim, potential.num_trials),
-    )
-
-
-def _of_particles(
-    moved: Bridged,
-    potential: Potential,
-    found: Found,
-    free: NDArray[np.bool_],
-    rng: np.random.Generator,
-    settings: Settings,
-) -> Fit:
-    """Return the posterior that particles were led to."""
-    n = len(moved.u)
-    return Fit(
-        u=moved.u,
-        weight=np.full(n, 1 / n),
-        log_likelihood=moved.log_likelihood,
-        log_evidence=moved.log_evidence,
-        standard_error=moved.standard_error,
-        effective_sample_size=moved.effective_sample_size,
-        tail_shape=np.nan,
-        method="smc",
-        is_rough=False,
-        free=free,
-        found=found,
-        particles=moved,
-        pool=_as_pool(moved, potential, settings, rng),
     )
 
 
@@ -335,119 +253,3 @@ def _around(
     left, right = wider(settings.laplace_wider, d) * width
     freedom = max(settings.freedom, float(d))
     return SplitStudentMixture(guess.means, axes, left, right, guess.weights, freedom)
-
-
-def _as_pool(
-    particles: Bridged,
-    potential: Potential,
-    settings: Settings,
-    rng: np.random.Generator,
-) -> Pool:
-    """Return particles as draws of a mixture that is fitted to them."""
-    n = len(particles.u)
-    own = fitted(particles.u, np.full(n, 1 / n), settings.num_components, settings, rng)
-    # As many as there are, with the weights that their evidence asks for.
-    log_prior = potential.log_prior(particles.u)
-    log_own = log_prior + particles.log_likelihood - particles.log_evidence
-    return Pool(
-        particles.u,
-        log_prior,
-        particles.log_likelihood,
-        log_own + np.log(n),
-        log_own,
-        np.ones(n, dtype=bool),
-        n,
-        [(n, own)],
-        potential.num_trials,
-        np.zeros(n),
-    )
-
-
-def _particles(
-    potential: Potential,
-    found: Found,
-    free: NDArray[np.bool_],
-    rng: np.random.Generator,
-    settings: Settings,
-) -> Bridged | None:
-    """Return particles of all parameters; only those that trials inform are moved."""
-    guess, axes = found.guess, np.flatnonzero(~free)
-    cov = guess.factors @ np.swapaxes(guess.factors, 1, 2)
-    factors = np.linalg.cholesky(cov[:, axes[:, None], axes])
-    # Tails that bend away from the normal of a mode are out of its own reach.
-    own = NormalMixture(
-        np.concatenate([guess.weights * weight for _, weight in WIDTHS]),
-        np.concatenate([guess.means[:, axes]] * len(WIDTHS)),
-        np.concatenate([factors * width for width, _ in WIDTHS]),
-    )
-    rest = np.zeros((1, potential.dim))
-
-    def whole(u: Array) -> Array:
-        full = np.repeat(rest, len(u), 0)
-        full[:, axes] = u
-        return full
-
-    fixed = _log_free(potential, free, rng) if free.any() else 0.0
-    num = int(settings.per_parameter * len(axes) * settings.num_effective)
-    moved = bridge(
-        lambda u: potential.log_prior(whole(u)) - fixed,
-        lambda u: potential.log_likelihood(whole(u)),
-        own,
-        rng,
-        num_particles=max(num, settings.fewest_particles),
-        most=settings.budget(len(axes)) / potential.num_trials,
-    )
-    if moved is None:
-        return None
-    u = moved.u
-    if free.any():
-        u = potential.sample_prior(len(moved.u), rng)
-        u[:, axes] = moved.u
-    rows = np.isfinite(potential.log_prior(u))
-    return replace(moved, u=u[rows], log_likelihood=moved.log_likelihood[rows])
-
-
-def _free(
-    found: Found, potential: Potential, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """Return parameters that change no trial and do not depend on others."""
-    free = ~found.informed
-    none = np.zeros(potential.dim, dtype=bool)
-    if not free.any() or free.all():
-        return none
-    drawn, other = (potential.sample_prior(NUM_PROBES, rng) for _ in range(2))
-    c = potential.coordinates
-    near, off = (
-        np.clip(found.guess.sample(NUM_PROBES, rng), c.low, c.high) for _ in range(2)
-    )
-
-    def changes(axes: NDArray[np.bool_]) -> bool:
-        pairs = (drawn, np.where(axes, other, drawn)), (near, np.where(axes, off, near))
-        residuals = (
-            np.abs(potential.residual(a)[0] - potential.residual(b)[0])
-            for a, b in pairs
-        )
-        return any(r.max() > UNCHANGED for r in residuals)
-
-    for axis in np.flatnonzero(free):
-        free[axis] = not changes(np.arange(potential.dim) == axis)
-    is_free = free.any() and potential.splits_off(free, rng) and not changes(free)
-    return free if is_free else none
-
-
-def _log_free(
-    potential: Potential, free: NDArray[np.bool_], rng: np.random.Generator
-) -> float:
-    r"""Return the prior's log density of the free coordinates at zero.
-
-    Independent of the others, which stay at zero, it is
-
-    .. math::
-        p_F(0) = p(0) \Big/ \int p(0, u_F)\, du_F .
-    """
-    u = np.zeros((NUM_INTEGRAL, potential.dim))
-    u[:, free] = WIDER * rng.standard_normal((len(u), int(free.sum())))
-    square = ((u[:, free] / WIDER) ** 2 + np.log(2 * np.pi * WIDER**2)).sum(1)
-    log_w = potential.log_prior(u) + 0.5 * square
-    integral = log_sum_exp(log_w) - np.log(len(u))
-    return float(potential.log_prior(u[:1] * 0)[0] - integral)
