@@ -104,7 +104,7 @@ def importance_sample(
         size = own.draws_of_fit(potential.dim)
         if proposal is not None and is_good and efficiency > 0 and not is_heavy:
             rows = (own.num_effective - effective) / efficiency * pool.num_trials
-            if pool.past is not None and rows > budget - spent:
+            if pool.num_past and rows > budget - spent:
                 break  # modes serve better than draws of fewer trials
             latched = latched or efficiency
             lacking = 1.1 * (wanted - effective) / efficiency

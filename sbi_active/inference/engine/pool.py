@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,7 +51,7 @@ class Pool:
         proposals: Pairs of the number of draws and the proposal.
         num_trials: Number of trials in the likelihood.
         log_past: Log likelihood of the first trials, which is not tempered, shape (n,).
-        past: Log likelihood of these as a function; None where all trials are new.
+        num_past: Number of these, for which there were draws before.
     """
 
     u: Array
@@ -66,7 +64,7 @@ class Pool:
     proposals: list[tuple[int, Proposal]] = field(default_factory=list)
     num_trials: int = 0
     log_past: Array = field(default_factory=lambda: np.zeros(0))
-    past: Callable[[Array], Array] | None = None
+    num_past: int = 0
 
     @staticmethod
     def empty(dim: int, num_trials: int) -> Pool:
@@ -143,8 +141,11 @@ class Pool:
         self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
         self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
         self.log_own = np.concatenate([self.log_own, proposal.log_prob(u)])
-        # Of what counts every trial has been simulated; this only looks it up.
-        log_past = np.zeros(len(u)) if self.past is None else self.past(u)
+        log_past = np.zeros(len(u))
+        if self.num_past:
+            assert isinstance(potential, SimulatedPotential)  # as in with_trials
+            # Of what counts every trial has been simulated; this only looks it up.
+            log_past = potential.log_likelihood(u, last=self.num_past)
         self.log_past = np.concatenate([self.log_past, log_past])
         self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
         self.num_final += len(drawn)
@@ -172,5 +173,5 @@ class Pool:
             proposals=[*self.proposals],
             num_trials=potential.num_trials,
             log_past=self.log_likelihood[rows],
-            past=partial(potential.log_likelihood, last=self.num_trials),
+            num_past=self.num_trials,
         )
