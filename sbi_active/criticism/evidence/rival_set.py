@@ -38,6 +38,7 @@ from sbi_active.criticism.rivals.trial_simulator import (
 )
 from sbi_active.criticism.rivals.validity import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.inference.engine import Found, WeightedDraws, infer, search
+from sbi_active.inference.engine.search import SearchSettings
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 
@@ -258,9 +259,7 @@ class RivalSet:
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
         how = how if self.is_smooth else ROUGH
-        found = search(rival, np.random.default_rng(seed), near, how)
-        assert found is not None  # residuals are bounded
-        return found
+        return _searched(rival, near, how, seed)
 
     def search_again(self) -> Found:
         """Return the bare model's modes from where other models have its parameters.
@@ -278,9 +277,7 @@ class RivalSet:
                 for other in others[:NUM_NEAR]
             ]
             near = rival.coordinates.from_z(np.concatenate(z))
-        found = search(rival, np.random.default_rng(seed), near, NESTED)
-        assert found is not None  # residuals are bounded
-        return found
+        return _searched(rival, near, NESTED, seed)
 
     def fit_again(self) -> Evidence:
         """Return the bare model's evidence by other modes, kept where it is larger."""
@@ -367,3 +364,11 @@ class RivalSet:
             c = SearchCoordinates(self.prior, (), self.nuisances, len(trials))
             self._predictives[key] = predicted_before(simulator, c, seed=seed)
         return self._predictives[key]
+
+
+def _searched(
+    rival: Rival, near: Array | None, how: SearchSettings, seed: int
+) -> Found:
+    found = search(rival, np.random.default_rng(seed), near, how)
+    assert found is not None  # residuals are bounded
+    return found

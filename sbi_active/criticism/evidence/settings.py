@@ -26,15 +26,7 @@ NESTED = SearchSettings(
 )
 #: Searches where the simulator jumps: derivatives lead to the neighborhood of a mode at
 #: most.
-ROUGH = SearchSettings(
-    num_screened=128,
-    num_starts=8,
-    max_starts=8,
-    num_found=1,
-    explained=0.0,
-    iterations=6,
-    phases=2,
-)
+ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)
 #: Rows of all trials that one model may take.
 MOST = 3_000
 

@@ -46,7 +46,7 @@ class Fit(WeightedDraws):
 
     Attributes:
         log_likelihood: Log likelihood of each draw, shape (n,).
-        tail_shape: Shape of the tail of the weights; NaN of particles.
+        tail_shape: Shape of the tail of the weights; NaN where they are equal.
         is_rough: Whether the likelihood had to be tempered often.
         free: Parameters that keep their prior, shape (d,).
         found: What the search found; None where it got nowhere.
@@ -55,9 +55,9 @@ class Fit(WeightedDraws):
     """
 
     log_likelihood: Array
-    tail_shape: float
-    is_rough: bool
+    tail_shape: float = np.nan
+    is_rough: bool = False
     free: NDArray[np.bool_]
     found: Found | None
-    particles: Bridged | None
+    particles: Bridged | None = None
     pool: Pool

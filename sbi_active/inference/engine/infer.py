@@ -111,7 +111,6 @@ def infer(
         is_rough=rough,
         free=none,
         found=found,
-        particles=None,
         pool=pool,
     )
 
@@ -159,12 +158,9 @@ def _if_far_behind(
         log_evidence=log_z,
         standard_error=0.0,
         effective_sample_size=float(len(u)),
-        tail_shape=np.nan,
         method="laplace",
-        is_rough=False,
         free=none,
         found=found,
-        particles=None,
         pool=Pool.empty(dim, potential.num_trials),
     )
 
