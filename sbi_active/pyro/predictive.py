@@ -9,7 +9,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from sbi_active.inference.sampling.population import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 
 NUM_COMPONENTS = 4  # at most
 

@@ -178,10 +178,3 @@ class PooledLikelihood:
         for trial in self.trials:
             total = total + trial.log_likelihood(z)
         return total
-
-    def log_joint(self, z: Array) -> Array:
-        """Return log prior plus log likelihood, -inf outside the support."""
-        log_joint = self.coordinates.log_prior(z)
-        inside = np.isfinite(log_joint)
-        log_joint[inside] += self.log_likelihood(z[inside])
-        return log_joint

@@ -20,17 +20,19 @@ from sbi_active.inference.emulation.likelihood import (
     TrialLikelihood,
     correlation_root,
 )
-from sbi_active.inference.emulation.peaks import around, sample_posterior
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.process import GaussianProcess, num_features
 from sbi_active.inference.emulation.statistics import learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.engine.importance import fitted
+from sbi_active.inference.engine.learned import CHEAP, LearnedFit, learned_fit
+from sbi_active.inference.engine.pool import PriorDraws
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import Particles
+from sbi_active.inference.sampling.student_mixture import Defended
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -46,6 +48,7 @@ LARGE = 0.2  # nats that a belief is off
 DEFENSIVE = 1e-5
 NUM_OUTER, NUM_INNER = 128, 600  # draws behind the gain of a summary
 REACH = 6.0  # deviations of the belief within which rows are near it
+SHARE_OF_PRIOR = 0.1  # of new rows, so that no place is never looked at
 FLOOR = 1e-4  # deviation at least, in half-widths of the prior
 
 
@@ -109,23 +112,27 @@ class PooledPosterior:
         labels = [self.best_summary(t, reference) for t in trials]
         left = allowance
         for stage in range(NUM_STAGES + 1):
-            fitted = tuple(
+            fits = tuple(
                 self.fit(t, label, reference)
                 for t, label in zip(trials, labels, strict=True)
             )
-            likelihood = PooledLikelihood(self.coordinates, fitted)
-            particles = sample_posterior(likelihood, reference, self.rng)
-            reference = particles.resample(NUM_REFERENCE, self.rng)
-            errors = np.array([one.error(reference) for one in fitted])
+            likelihood = PooledLikelihood(self.coordinates, fits)
+            fit = learned_fit(likelihood, self.rng, near=reference)
+            if fit is None:
+                raise UnexplainedOutcomeError(
+                    "expected outcomes that some parameters may explain; got none with "
+                    "a likelihood; correct the outcome, or leave the trial out"
+                )
+            reference = fit.draws(NUM_REFERENCE, self.rng)
+            errors = np.array([one.error(reference) for one in fits])
             size = min(left, max(FEWEST_ROWS, int(STAGE_SHARE * allowance)))
             size = left if left - size < FEWEST_ROWS else size
             if size < FEWEST_ROWS or errors.sum() < ENOUGH or stage == NUM_STAGES:
                 break
-            where = around(reference, self.coordinates, self.rng)
-            self._simulate(trials, errors, where, size)
+            self._simulate(trials, errors, fit, reference, size)
             left -= size
         spent = len(self.pool) + self.pool.num_missing - at_start - start
-        return self._belief(likelihood, particles, fitted, errors, spent), labels
+        return self._belief(fit, fits, errors, spent), labels
 
     def draws(self, belief: Distribution) -> Array:
         """Return coordinates of draws from a belief, shape (n, d)."""
@@ -231,16 +238,26 @@ class PooledPosterior:
         return TrialOutcome.fit(whole_space(z.shape[1]), 0, z, agrees, pairs)
 
     def _simulate(
-        self, trials: Sequence[PooledTrial], errors: Array, where: Any, size: int
+        self,
+        trials: Sequence[PooledTrial],
+        errors: Array,
+        fit: LearnedFit,
+        reference: Array,
+        size: int,
     ) -> None:
         """Add rows at the trials that know least, where the posterior is."""
+        own, c = CHEAP, fit.potential.coordinates
+        weight = np.full(len(reference), 1 / len(reference))
+        near = fitted(c.from_z(reference), weight, own.num_components, own, self.rng)
+        where = Defended(near, PriorDraws(fit.potential), SHARE_OF_PRIOR)
         counts = self.rng.multinomial(size, (errors + 1e-9) / (errors + 1e-9).sum())
         kept: list[Array] = []
         while sum(map(len, kept)) < size:
-            z = where.sample(2 * size + 20, self.rng)
-            kept.append(self.rng.permutation(z[self.coordinates.inside(z)]))
-        z = np.concatenate(kept)[:size]
-        log_q = where.log_prob(z) - self.coordinates.log_jacobian(z)
+            u = fit.potential.simulated(where.sample(2 * size + 20, self.rng))
+            kept.append(self.rng.permutation(u))
+        u = np.concatenate(kept)[:size]
+        z = c.to_z(u)
+        log_q = where.log_prob(u) + c.log_slope(u) - self.coordinates.log_jacobian(z)
         action = torch.cat(
             [t.action.expand(int(n), -1) for t, n in zip(trials, counts, strict=True)]
         )
@@ -253,20 +270,20 @@ class PooledPosterior:
 
     def _belief(
         self,
-        likelihood: PooledLikelihood,
-        particles: Particles,
-        fitted: Sequence[TrialLikelihood],
+        fit: LearnedFit,
+        fits: Sequence[TrialLikelihood],
         errors: Array,
         spent: int,
     ) -> LearnedBelief:
-        belief = LearnedBelief(self.prior, likelihood, particles, defensive=DEFENSIVE)
-        z = particles.resample(NUM_REFERENCE, self.rng)
-        tails = tuple(_tail(one, z, self.rng) for one in fitted)
+        belief = LearnedBelief(self.prior, fit, defensive=DEFENSIVE)
+        z = fit.draws(NUM_REFERENCE, self.rng)
+        tails = tuple(_tail(one, z, self.rng) for one in fits)
+        effective = float(fit.fit.effective_sample_size)
         error = float(errors.sum())
         found = Diagnostics(
             trustworthy=True,
             num_simulations=spent,
-            effective_sample_size=float(particles.effective_sample_size),
+            effective_sample_size=effective,
             error_nats=error,
             error_nats_if_explained=error,
             tail_probability=min(1.0, len(tails) * min(tails)),
@@ -277,7 +294,7 @@ class PooledPosterior:
                 f"the belief is off by about {error:.2g} nats for want of simulations; "
                 "allow more of them"
             )
-        if particles.effective_sample_size < 100:
+        if effective < 100:
             found = found.warned("few effective draws; allow more simulations")
         belief.diagnostics = found
         return belief

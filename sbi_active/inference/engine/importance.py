@@ -21,18 +21,17 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import genpareto
 
 from sbi_active.inference.engine.pool import Pool
-from sbi_active.inference.engine.potential import Potential
+from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.ridges import along_ridges, reweighted
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.population import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
     Proposal,
@@ -52,7 +51,7 @@ SHRINKS, LEAST = 0.8, 1e-10  # of powers that are tried in turn, and the least o
 
 def importance_sample(
     pool: Pool,
-    potential: Potential,
+    potential: Density,
     rng: np.random.Generator,
     *,
     num_components: int,
@@ -109,7 +108,7 @@ def importance_sample(
             latched = latched or efficiency
             lacking = 1.1 * (wanted - effective) / efficiency
             size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
-        elif kept is not None and fits.num >= own.max_fits:
+        elif kept is not None and fits.num_full >= own.max_fits:
             pool.restart()  # what was fitted since is worse
             proposal, latched, kept = kept, best, None
         else:
@@ -134,7 +133,7 @@ class _Fits:
     """
 
     pool: Pool
-    potential: Potential
+    potential: Density
     found: Found | None
     num_components: int
     settings: Settings
@@ -164,11 +163,8 @@ class _Fits:
         self.num_tempered += power < 1
         log_rest, log_new = self._logs()
         weight = normalized(log_rest + power * log_new)
-        main = fitted(pool.u, weight, self.num_components, own, rng)
-        # What is dense around the draws alone misses tails, and of a rough likelihood
-        # the peaks between those that were found.
         share = own.share_if_rough if is_rough else own.share_of_wide
-        wide = fitted(pool.u, _flattened(pool, own), 2, own, rng)
+        proposal = defended(pool, weight, self.num_components, share, own, rng)
         if self.found is not None and self.num <= own.num_ridged:
             # Where few draws count, they may lie across a ridge.
             full = normalized(pool.log_mixture_weight)
@@ -176,16 +172,36 @@ class _Fits:
                 self.ridge = reweighted(self.ridge, pool.u, full)
             elif power < 1:
                 some = pool.u[np.unique(systematic(full, own.num_ridge, 0.5))]
-                self.ridge = along_ridges(self.potential, self.found, some, rng, own)
+                # What was searched has residuals.
+                searched = cast(Potential, self.potential)
+                self.ridge = along_ridges(searched, self.found, some, rng, own)
             if self.ridge is not None:
                 return self.ridge
-        return Defended(main, wide, share)
+        return proposal
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""
         pool = self.pool
         log_new = pool.log_likelihood - pool.log_past
         return pool.log_prior + pool.log_past - pool.log_mixture, log_new
+
+
+def defended(
+    pool: Pool,
+    weight: Array,
+    num_components: int,
+    share: float,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> Defended:
+    """Return a mixture fitted to weighted draws, with a share of a wider one.
+
+    What is dense around the draws alone misses tails, and of a rough likelihood the
+    peaks between those that were found.
+    """
+    main = fitted(pool.u, weight, num_components, settings, rng)
+    wide = fitted(pool.u, _flattened(pool, settings), 2, settings, rng)
+    return Defended(main, wide, share)
 
 
 def fitted(
@@ -205,9 +221,10 @@ def fitted(
         rng: Source of its starts.
     """
     dim = u.shape[1]
-    num = 2 * settings.draws_of_fit(dim)
+    num = settings.num_fitted(dim)
     effective = 1 / float((weight**2).sum())
-    num_components = int(np.clip(effective / (dim + 1), 1, num_components))
+    # A mean and a covariance have d (d + 3) / 2 numbers.
+    num_components = int(np.clip(4 * effective / (dim * (dim + 3)), 1, num_components))
     some = u[systematic(weight, num, rng.random())]
     some = some + settings.jitter * some.std(0) * rng.standard_normal(some.shape)
     fit = GaussianMixture.fit(some, num_components, rng)
@@ -227,21 +244,33 @@ def wider(factor: float, dim: int) -> float:
 def pareto_shape(log_weight: Array) -> float:
     r"""Return the shape k of the tail of weights, of which moments below 1/k exist.
 
+    Of the excess x over a threshold, taken for generalized Pareto, by the estimate of
+    Zhang and Stephens: k is the mean of :math:`\log(1 - b x)` with b averaged over its
+    likelihood, and is drawn to .5 as by ten further numbers.
+
     Args:
-        log_weight: Shape (n,).
+        log_weight: Log weights, shape (n,).
 
     References:
-        Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 25 (2024).
+        Zhang & Stephens, Technometrics 51 (2009); Vehtari, Simpson, Gelman, Yao &
+        Gabry, JMLR 25 (2024).
     """
     weight = np.sort(normalized(log_weight))
-    num = int(min(0.2 * len(weight), 3 * len(weight) ** 0.5))
-    if num < 5 or weight[-1] <= 0:
+    num = int(np.ceil(min(0.2 * len(weight), 3 * len(weight) ** 0.5)))
+    if num < 5 or num == len(weight) or weight[-1] <= 0:
         return np.inf
-    excess = weight[-num:] - weight[-num - 1]
-    if excess[-1] <= 1e-12 * weight[-1]:
+    x = weight[-num:] - weight[-num - 1]
+    if x[-1] <= 1e-12 * weight[-1]:
         return -np.inf  # all alike
-    shape, _, _ = genpareto.fit(excess / excess.mean(), floc=0)
-    return float(shape)
+    x = np.maximum(x / x.mean(), 1e-12)
+    size = 30 + int(num**0.5)
+    grid = 1 - (size / (np.arange(1, size + 1) - 0.5)) ** 0.5
+    b = 1 / x[-1] + grid / (3 * x[int(num / 4 + 0.5) - 1])
+    k = np.log1p(-b[:, None] * x).mean(1)
+    log_likelihood = num * (np.log(-b / k) - k - 1)
+    b_mean = float(normalized(log_likelihood) @ b)
+    shape = float(np.log1p(-b_mean * x).mean())
+    return (num * shape + 10 * 0.5) / (num + 10)
 
 
 def _flattened(pool: Pool, settings: Settings) -> Array:

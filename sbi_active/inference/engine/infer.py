@@ -12,7 +12,7 @@ A model far behind another is known well enough by the Laplace approximation.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from sbi_active.inference.engine.importance import (
 )
 from sbi_active.inference.engine.particles import fit_of, led_particles, uninformed
 from sbi_active.inference.engine.pool import Pool, PriorDraws
-from sbi_active.inference.engine.potential import Potential
+from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.student_mixture import (
@@ -40,7 +40,7 @@ Array = NDArray[Any]
 
 
 def infer(
-    potential: Potential,
+    potential: Density,
     rng: np.random.Generator,
     *,
     found: Found | None = None,
@@ -52,7 +52,8 @@ def infer(
     """Return the posterior of a potential.
 
     Args:
-        potential: Log density of the parameters given all trials.
+        potential: Log density of the parameters given all trials, with residuals where
+            modes of it were found.
         rng: Source of the draws.
         found: Modes of the potential; None where a search got nowhere.
         past: Draws for the first of these trials, with the likelihood of all, to which
@@ -63,22 +64,23 @@ def infer(
         settings: Numbers of draws, and what decides between the ways.
     """
     none = np.zeros(potential.dim, dtype=bool)
+    searched = cast(Potential, potential)  # where modes were found
     if found is not None and past is None:
-        fit = _if_far_behind(potential, found, rivaled, rng, settings)
+        fit = _if_far_behind(searched, found, rivaled, rng, settings)
         if fit is not None:
             return fit
     if past is None:
-        free = none if found is None else uninformed(found, potential, rng)
+        free = none if found is None else uninformed(found, searched, rng)
         if found is not None and free.any():
-            moved = led_particles(potential, found, free, rng, settings)
+            moved = led_particles(searched, found, free, rng, settings)
             if moved is not None:
-                return fit_of(moved, potential, found, free, rng, settings)
+                return fit_of(moved, searched, found, free, rng, settings)
         pool = Pool.empty(potential.dim, potential.num_trials)
         _begin(pool, potential, rng, found, near, settings)
     else:
         pool = past
         if found is not None:
-            _go_on(pool, potential, rng, found, settings)
+            _go_on(pool, searched, rng, found, settings)
     num_modes = 0 if found is None else len(found.modes)
     rough = importance_sample(
         pool,
@@ -96,9 +98,9 @@ def infer(
     # An evidence is an average of likelihoods.
     matters = pool.log_likelihood.max(initial=-np.inf) >= rivaled - settings.behind
     if found is not None and past is None and matters and effective < wanted:
-        moved = led_particles(potential, found, none, rng, settings)
+        moved = led_particles(searched, found, none, rng, settings)
         if moved is not None and moved.effective_sample_size > effective:
-            return fit_of(moved, potential, found, none, rng, settings)
+            return fit_of(moved, searched, found, none, rng, settings)
     return Fit(
         u=pool.u[final],
         weight=normalized(pool.log_weight[final]) if final.any() else np.zeros(0),
@@ -167,7 +169,7 @@ def _if_far_behind(
 
 def _begin(
     pool: Pool,
-    potential: Potential,
+    potential: Density,
     rng: np.random.Generator,
     found: Found | None,
     near: Array | None,
@@ -178,7 +180,7 @@ def _begin(
     if found is not None:
         pool.add(prior, found.screened, potential)  # simulated for the search already
         pool.restart()
-        first = _around(found, potential, settings)
+        first = _around(found, cast(Potential, potential), settings)
         pool.add(first, first.sample(settings.num_draws, rng), potential)
         effective = pool.effective_sample_size
         if effective >= settings.fewest or settings.affords(
@@ -186,7 +188,8 @@ def _begin(
         ):
             return
     if near is not None and len(near) > 2 * potential.dim:
-        own = fitted(near, np.full(len(near), 1 / len(near)), 2, settings, rng)
+        weight = np.full(len(near), 1 / len(near))
+        own = fitted(near, weight, settings.num_components, settings, rng)
         pool.add(own, own.sample(settings.num_draws, rng), potential)
     num = int(1.5 * settings.num_draws)
     pool.add(prior, prior.sample(num, rng), potential)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from sbi_active.inference.engine.potential import Potential, SimulatedPotential
+from sbi_active.inference.engine.potential import Density, SimulatedPotential
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.weights import effective_sample_size
@@ -22,10 +22,10 @@ class PriorDraws(Proposal):
     """The prior as a proposal.
 
     Attributes:
-        potential: Potential that knows the prior.
+        potential: Density that knows the prior.
     """
 
-    potential: Potential
+    potential: Density
 
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return draws, shape (n, d)."""
@@ -115,7 +115,7 @@ class Pool:
         self,
         proposal: Proposal,
         drawn: Array,
-        potential: Potential,
+        potential: Density,
         floor: float = -np.inf,
     ) -> None:
         """Simulate draws of a proposal, shape (n, d), and weigh all.

@@ -26,20 +26,19 @@ LARGEST = 1e6
 STEP = 3e-3  # of differences, in deviations of the prior
 
 
-class Potential(LeastSquares, Protocol):
-    """A log density that ``search`` and ``infer`` ask of.
-
-    Beside the sum of squares, of an error that may have unknowns:
+class Density(Protocol):
+    """A likelihood of trials and a prior, in coordinates without scale.
 
     Attributes:
-        step: Step of finite differences, in coordinates.
         num_trials: Number of trials in the likelihood.
-        num_observed: Number of observed numbers of all trials.
     """
 
-    step: float
     num_trials: int
-    num_observed: int
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates."""
+        ...
 
     @property
     def num_simulations(self) -> int:
@@ -61,6 +60,18 @@ class Potential(LeastSquares, Protocol):
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
         """Return log likelihoods, shape (n,); -inf allowed of those below a floor."""
         ...
+
+
+class Potential(Density, LeastSquares, Protocol):
+    """A density with residuals, of an error that may have unknowns: it is searched.
+
+    Attributes:
+        step: Step of finite differences, in coordinates.
+        num_observed: Number of observed numbers of all trials.
+    """
+
+    step: float
+    num_observed: int
 
     def whitener(self, u: Array | None = None) -> Whitener:
         """Return what whitens residuals, by the likeliest error at u, shape (1, dim).

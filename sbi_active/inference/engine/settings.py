@@ -32,6 +32,8 @@ class Settings:
             parameters. Half reaches a narrow posterior in fewer simulations, and fits
             10 parameters three times as badly.
         few: Number of parameters beyond which there are more draws.
+        fitted: Draws that a proposal is fitted to, beside those: repeated ones carry
+            their weights. A quarter will do where draws are thousands.
         max_rounds: Proposals at most.
         fewest: Effective draws below which the likelihood is tempered.
         few_tempered: Rounds of this beyond which the likelihood is called rough.
@@ -81,6 +83,7 @@ class Settings:
     share_of_plenty: float = 0.6
     num_draws: int = 500
     few: int = 4
+    fitted: float = 2.0
     max_rounds: int = 40
     fewest: float = 60.0
     few_tempered: int = 5
@@ -127,8 +130,12 @@ class Settings:
         lacking = (wanted - effective) * num / max(effective, 1e-9)
         return effective >= self.seen and lacking <= self.affordable * self.num_draws
 
+    def num_fitted(self, dim: int) -> int:
+        """Return the repeated draws that a proposal is fitted to."""
+        return int(self.fitted * self.draws_of_fit(dim))
+
     def draws_of_fit(self, dim: int) -> int:
-        """Return the draws that a proposal for so many parameters is fitted to."""
+        """Return the draws of a proposal for so many parameters."""
         return int(self.num_draws * max(1.0, dim / self.few))
 
     def budget(self, dim: int) -> float:

@@ -213,13 +213,14 @@ def best_prefix(
     norm = design.norm(dim=0).clamp_min(1e-300)
     ridge = torch.cat([torch.diag(1e-8 * norm), y.new_zeros(p, m)], 1)
     rows = torch.cat([design, y], 1)
-    factor = torch.linalg.qr(torch.cat([rows[~test], ridge]), mode="r").R
+    unseen, seen = rows[test], rows[~test]
+    factor = torch.linalg.qr(torch.cat([seen, ridge]), mode="r").R
     best, beta = torch.full((m,), torch.inf, dtype=y.dtype), y.new_zeros(p, m)
     for size in sizes:
         solution = torch.linalg.solve_triangular(
             factor[:size, :size], factor[:size, p:], upper=True
         )
-        error = (y[test] - design[test, :size] @ solution).abs()
+        error = (unseen[:, p:] - unseen[:, :size] @ solution).abs()
         wild = WILD * error.median(0).values.clamp_min(1e-300)
         error = torch.minimum(error, wild).square().mean(0)
         better = error < 0.999 * best

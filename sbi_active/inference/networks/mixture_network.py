@@ -24,6 +24,7 @@ GLOBAL_LOGIT = -3.0
 #: From where on batched matrices are faster than products and sums, whose room grows
 #: with the square.
 FEW_DIMENSIONS = 12
+ACTIVATIONS = {"silu": nn.SiLU, "relu": nn.ReLU}
 
 
 class MixtureDensityNetwork(ConditionalDensityEstimator):
@@ -55,6 +56,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         scaling: As in :class:`.MixtureDensity`, with all that follow.
         whiten: Of theta.
         baseline: Gaussian posterior that the network corrects.
+        activation: Name of the function between layers.
         hidden_features: Width of each hidden layer.
         num_components: Gaussian components K.
         embedding_net: Of the condition, which is then scaled over all rows, without a
@@ -76,6 +78,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         scaling: Literal["action", "global"] = "action",
         whiten: bool = True,
         baseline: Literal["best", "none", "linear", "curved"] = "best",
+        activation: Literal["silu", "relu"] = "silu",
         hidden_features: Sequence[int] = (128, 128),
         num_components: int = 5,
         embedding_net: nn.Module | None = None,
@@ -110,7 +113,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             width = embedding(seen).shape[1] + len(masked)
         layers: list[nn.Module] = []
         for hidden in hidden_features:
-            layers += [nn.Linear(width, hidden), nn.ReLU()]
+            layers += [nn.Linear(width, hidden), ACTIVATIONS[activation]()]
             width = hidden
         last = nn.Linear(width, num * (1 + 2 * dim + dim * dim))
         super().__init__(
@@ -217,12 +220,14 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             seen, frames = self._see(condition)
             assert frames is not None
             v, log_det = self._local(theta, frames)
+        v, log_det = v[:, self._frame_of], log_det[:, self._frame_of]
         return torch.cat([v.flatten(1), log_det], 1), seen
 
     def _log_density(self, theta: Tensor, condition: Tensor) -> Tensor:
         seen, frames = self._see(condition)
         if frames is not None:
             v, log_det = self._local(theta, frames)
+            v, log_det = v[..., self._frame_of, :], log_det[:, self._frame_of]
             return self._log_local_density(v, log_det, seen)
         u = ((theta - self.theta_mean) / self.theta_scale)[..., None, :]
         constant = self._log_normal_constant + self.theta_scale.log().sum()
@@ -237,7 +242,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return v.to(dtype), log_det.to(dtype)
 
     def _log_local_density(self, v: Tensor, log_det: Tensor, seen: Tensor) -> Tensor:
-        v, log_det = v[..., self._frame_of, :], log_det[:, self._frame_of]
+        """Return log q of each component's own v (..., n, K, d), shape (..., n)."""
         return self._log_mixture(v, seen, log_det) - self._log_normal_constant
 
     @property
@@ -294,9 +299,9 @@ class PreparedLoss(nn.Module):
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
         """Return -log q, shape (n,), for rows of ``network.prepare``."""
-        frames = self.network.num_frames
-        v, log_det = input[:, :-frames], input[:, -frames:]
-        v = v.reshape(len(v), frames, -1)
+        num = self.network._num_components
+        v, log_det = input[:, :-num], input[:, -num:]
+        v = v.reshape(len(v), num, -1)
         return -self.network._log_local_density(v, log_det, condition)
 
 

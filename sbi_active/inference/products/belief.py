@@ -7,16 +7,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.products.product import NUM_COMPONENTS, Product
+from sbi_active.inference.engine.learned import learned_fit
+from sbi_active.inference.products.product import Product
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.regression.regions import PriorProposal
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import (
-    GaussianMixture,
-    StudentProposal,
-    population_monte_carlo,
-)
-from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 
 #: Effective draws below which the normalizer is off by more than a tenth of a nat.
 ENOUGH = 100.0
@@ -28,10 +22,10 @@ def sample_product(
     hint: Tensor | None,
     rng: np.random.Generator,
     *,
-    num_particles: int,
+    num_effective: float,
     defensive: float,
 ) -> LearnedBelief:
-    r"""Return the belief of a product, by annealed importance sampling.
+    r"""Return the belief of a product, sampled by :func:`.infer`.
 
     .. math::
         b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k q(x_k | \theta, \xi_k)
@@ -43,25 +37,23 @@ def sample_product(
         hint: Draws around the posterior, shape (n, theta_dim), such as those of the
             belief before; None begins at the prior.
         rng: Source of randomness.
-        num_particles: Of the importance sample.
+        num_effective: Number of effective draws.
         defensive: Share of the prior in the belief.
     """
-    coordinates: PriorCoordinates = product.coordinates
-    base: Proposal = PriorProposal(coordinates)
-    if hint is not None:
-        mixture = GaussianMixture.fit(coordinates.to_z(hint), NUM_COMPONENTS, rng)
-        base = StudentProposal(mixture, base)
-    particles, num_steps = population_monte_carlo(
-        product.log_joint, base, rng, num_particles=num_particles
-    )
-    belief = LearnedBelief(prior, product, particles, defensive=defensive)
+    near = None if hint is None else product.coordinates.to_z(hint)
+    fit = learned_fit(product, rng, near=near, num_effective=num_effective)
+    if fit is None:
+        raise UnexplainedOutcomeError(
+            "expected outcomes that some parameters may explain; got none with a "
+            "density under the network; correct the outcome, or leave the trial out"
+        )
+    belief = LearnedBelief(prior, fit, defensive=defensive)
     belief.label = "product over trials"
-    effective = particles.effective_sample_size
+    effective = fit.fit.effective_sample_size
     belief.diagnostics = Diagnostics().extended(
         effective_sample_size=effective,
         likelihood="learned",
-        log_normalizer=particles.log_normalizer,
-        num_steps=num_steps,
+        log_normalizer=fit.fit.log_evidence,
     )
     if effective < ENOUGH:
         belief.diagnostics = belief.diagnostics.warned(

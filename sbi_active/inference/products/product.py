@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
@@ -142,10 +142,3 @@ class Product:
             ratio = self._previous.log_prob(theta)
             total = total + (ratio - self.coordinates.prior.log_prob(theta)).double()
         return total
-
-    def log_joint(self, z: Array) -> Array:
-        """Return the log of prior times likelihood, -inf outside the support."""
-        joint = self.coordinates.log_prior(z)
-        inside = np.isfinite(joint)
-        joint[inside] += self.log_likelihood(z[inside])
-        return joint

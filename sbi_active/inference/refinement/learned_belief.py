@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,34 +11,18 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.engine.learned import LearnedFit
 from sbi_active.inference.regression.histories import HistoryRecord
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import Particles
 
 Array = NDArray[Any]
 
 #: Least share of draws that sampling keeps.
 MIN_ACCEPTANCE = 0.03
+#: Draws of the proposal whose largest weight bounds all others.
+NUM_BOUND = 4_000
 #: Times as many draws as that needs, from which they are resampled instead: the
 #: normalizer then rests on weights that fresh draws do not have.
 PATIENCE = 3
-
-
-class LearnedLikelihood(Protocol):
-    """A likelihood of all trials as a function of the prior's coordinates."""
-
-    @property
-    def coordinates(self) -> PriorCoordinates:
-        """Of the prior."""
-        ...
-
-    def log_likelihood(self, z: Array) -> Array:
-        """Return the log likelihood, (n, d) -> (n,)."""
-        ...
-
-    def log_joint(self, z: Array) -> Array:
-        """Return the log of prior times likelihood, -inf outside the support."""
-        ...
 
 
 class LearnedBelief(Belief):
@@ -50,10 +34,10 @@ class LearnedBelief(Belief):
         \prod_k p(x_k | \theta, \xi_k).
 
     Args:
-        prior: The original prior p.
-        surrogate: The prior times the learned likelihood :math:`\hat L`.
-        particles: Importance sample of it, which gives Z and the proposal of draws.
-        defensive: The share :math:`\epsilon`.
+        prior: Original prior p.
+        fit: Posterior of the learned likelihood :math:`\hat L`, which gives Z and the
+            proposal of draws.
+        defensive: Share :math:`\epsilon` of the prior.
 
     Attributes:
         histories: The simulations behind it, to go on from after a further trial.
@@ -65,32 +49,30 @@ class LearnedBelief(Belief):
     def __init__(
         self,
         prior: Distribution,
-        surrogate: LearnedLikelihood,
-        particles: Particles,
+        fit: LearnedFit,
         *,
         defensive: float,
     ) -> None:
         super().__init__(prior)
-        self._surrogate = surrogate
-        self._defensive = defensive
-        self._proposal = particles.proposal
-        self._log_normalizer = particles.log_normalizer
+        self._defensive, self._potential = defensive, fit.potential
+        self._proposal, self._log_normalizer = fit.proposal, fit.fit.log_evidence
         # Draws are kept with probability weight / bound; a bound on all weights that
         # keeps too few is lowered, at the cost of a thinner tail.
-        largest = float(particles.log_weight.max())
+        u = self._proposal.sample(NUM_BOUND, np.random.default_rng(0))
+        largest = float(self._log_weight(u).max())
         self._log_bound = min(largest, self._log_normalizer - np.log(MIN_ACCEPTANCE))
 
     def log_likelihood(self, z: Array) -> Array:
         """Return the learned log likelihood at the prior's coordinates (n, d), (n,)."""
-        return self._surrogate.log_likelihood(z)
+        return self._potential.learned.log_likelihood(z)
 
     def _log_prob(self, theta: Tensor) -> Tensor:
-        coordinates = self._surrogate.coordinates
+        coordinates = self._potential.learned.coordinates
         z = coordinates.to_z(theta)
         log_prior = coordinates.log_prior(z) - coordinates.log_jacobian(z)
         density = np.full(len(z), -np.inf)
         inside = np.isfinite(log_prior)
-        log_likelihood = self._surrogate.log_likelihood(z[inside])
+        log_likelihood = self._potential.learned.log_likelihood(z[inside])
         density[inside] = log_prior[inside] + np.logaddexp(
             np.log1p(-self._defensive) + log_likelihood - self._log_normalizer,
             np.log(self._defensive),
@@ -100,26 +82,33 @@ class LearnedBelief(Belief):
     def _sample(self, num_samples: int) -> Tensor:
         seed = int(torch.randint(2**62, ()))
         rng = np.random.default_rng(seed)
-        coordinates = self._surrogate.coordinates
+        own, coordinates = self._potential, self._potential.coordinates
         num_prior = rng.binomial(num_samples, self._defensive)
-        kept = [coordinates.sample_prior(num_prior, rng)]
+        kept = [own.sample_prior(num_prior, rng)]
         missing = num_samples - num_prior
         acceptance = np.exp(self._log_normalizer - self._log_bound)
         seen: list[tuple[Array, Array]] = []
         left = PATIENCE * (int(1.1 * missing / acceptance) + 20)
         while missing > 0 and left > 0:
-            z = self._proposal.sample(int(1.1 * missing / acceptance) + 20, rng)
-            left -= len(z)
-            log_weight = self._surrogate.log_joint(z) - self._proposal.log_prob(z)
-            accepted = np.log(rng.random(len(z))) < log_weight - self._log_bound
-            kept.append(z[accepted][:missing])
+            u = self._proposal.sample(int(1.1 * missing / acceptance) + 20, rng)
+            left -= len(u)
+            log_weight = self._log_weight(u)
+            accepted = np.log(rng.random(len(u))) < log_weight - self._log_bound
+            kept.append(u[accepted][:missing])
             missing -= len(kept[-1])
-            seen.append((z, log_weight))
+            seen.append((u, log_weight))
         if missing > 0:
-            z, log_weight = (np.concatenate(parts) for parts in zip(*seen, strict=True))
-            kept.append(z[_resampled(log_weight, missing, rng)])
-        z = rng.permutation(np.concatenate(kept))
-        return coordinates.to_theta(z)
+            u, log_weight = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+            kept.append(u[_resampled(log_weight, missing, rng)])
+        return coordinates.to_theta(rng.permutation(np.concatenate(kept)))
+
+    def _log_weight(self, u: Array) -> Array:
+        """Return log of prior times likelihood over proposal, shape (n,)."""
+        log_joint, own = np.full(len(u), -np.inf), self._potential
+        log_prior = own.log_prior(u)
+        inside = np.isfinite(log_prior)
+        log_joint[inside] = log_prior[inside] + own.log_likelihood(u[inside])
+        return log_joint - self._proposal.log_prob(u)
 
 
 def _resampled(log_weight: Array, num: int, rng: np.random.Generator) -> NDArray[Any]:

@@ -17,6 +17,7 @@ from sbi_active.inference.declared.contradiction import (
     compared,
 )
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.engine.learned import LearnedPotential, learned_fit
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
 from sbi_active.inference.refinement.regression_error import SMALL, widened
@@ -27,8 +28,6 @@ from sbi_active.inference.refinement.trust import (
 )
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import (
-    PriorProposal,
-    RegionsProposal,
     around,
     cover,
     whole_space,
@@ -36,19 +35,13 @@ from sbi_active.inference.regression.regions import (
 from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import (
-    StudentProposal,
-    population_monte_carlo,
-)
-from sbi_active.inference.sampling.student_mixture import Proposal
-from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
 Array = NDArray[Any]
 
-MANY = 6  # parameters beyond which each covariance needs more particles
+MANY = 6  # parameters beyond which each covariance needs more draws
 MOST_FORCED = 32  # regions that split misfit, as many as the options allow
 MIN_STAGE = 60  # histories below which another stage adds nothing; more by dimension
 
@@ -86,13 +79,14 @@ class Stages:
             further_noise=further_noise,
         )
         self.regions = [whole_space(self.coordinates.dim)]
+        near: list[Array] = []
         for hint in task.hints:
             with forked_generators(derive_seed(seed, "start")):
                 draws = hint.sample(torch.Size([1_000])).float()
             z = self.coordinates.to_z(draws)
-            self.regions.append(around(z[self.coordinates.inside(z)]))
-        self.base: Proposal = PriorProposal(self.coordinates)
-        self.first: Proposal | None = None
+            near.append(z[self.coordinates.inside(z)])
+            self.regions.append(around(near[-1]))
+        self.near = np.concatenate(near) if near else None
         self.course, self.num_forced = Course(), 1
         self.least = max(MIN_STAGE, 2 * fewest_rows(self.coordinates.dim))
 
@@ -103,7 +97,7 @@ class Stages:
             next_size = self._size()
             is_last = next_size < self.least
             fitted = self._fit(is_cautious=not is_last)
-            stage = self._sample(fitted, self.first)
+            stage = self._sample(fitted, self.near)
             if stage.error > SMALL and self.course.stages:
                 stage = self._with_more(stage)
             self.course.append(stage)
@@ -154,16 +148,13 @@ class Stages:
         self.num_forced = min(many, MOST_FORCED) if self.course.is_stuck else fewer
         limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
         self.regions = cover(
-            stage.particles,
+            stage.draws,
             self.rng,
             min_regions=min(self.num_forced, limit),
             max_regions=min(max(self.settings.max_regions, self.num_forced), limit),
             generous=stage.excess < 3,
         )
-        self.base = RegionsProposal(self.regions)
-        points = stage.particles.resample(800, self.rng)
-        line = _unbounding(self.coordinates)
-        self.first = StudentProposal.fit(points, 6, self.base, self.rng, line)
+        self.near = stage.draws
 
     def _simulate(self, size: int) -> None:
         """Bring the stage's regions to their numbers, past histories first."""
@@ -209,25 +200,17 @@ class Stages:
             "the executed actions, or the prior"
         )
 
-    def _sample(self, surrogate: Surrogate, first: Proposal | None) -> Stage:
+    def _sample(self, surrogate: Surrogate, near: Array | None) -> Stage:
         """Return the stage of a surrogate, its density sampled."""
         many = max(1.0, self.coordinates.dim / MANY)
-        num_components = 6 if len(surrogate.regressions) <= 4 else 10
-        particles, _ = population_monte_carlo(
-            surrogate.log_joint,
-            self.base,
-            self.rng,
-            num_particles=int(many * self.settings.num_particles),
-            first=first,
-            num_components=num_components if many == 1 else num_components // 2,
-            unbounding=_unbounding(self.coordinates),
-        )
-        if not np.isfinite(particles.log_normalizer):
+        num = many * self.settings.effective_particles
+        fit = learned_fit(surrogate, self.rng, near=near, num_effective=num)
+        if fit is None:
             raise UnexplainedOutcomeError(
                 "expected outcomes that some parameters may explain; got none with a "
                 "likelihood; correct the outcome, or leave the trial out"
             )
-        return Stage.of(surrogate, particles, self.settings.defensive, self.rng)
+        return Stage.of(surrogate, fit, self.settings.defensive, self.rng)
 
     def _with_more(self, stage: Stage) -> Stage:
         """Return the stage with simulations from further off, where they are of use."""
@@ -236,7 +219,7 @@ class Stages:
         )
         if surrogate is stage.surrogate:
             return stage
-        wide = self._sample(surrogate, stage.particles.proposal)
+        wide = self._sample(surrogate, stage.draws)
         return replace(wide, error=wide.error + bias)
 
     def _learned(self, stage: Stage, fitted: Surrogate) -> LearnedBelief:
@@ -258,10 +241,10 @@ class Stages:
             replace(fit, residual=empty, standardized=empty)
             for fit in stage.surrogate.regressions
         ]
+        slim_potential = LearnedPotential(Surrogate(self.coordinates, slim))
         belief = LearnedBelief(
             self.task.prior,
-            Surrogate(self.coordinates, slim),
-            stage.particles,
+            replace(stage.fit, potential=slim_potential),
             defensive=self.settings.defensive,
         )
         belief.diagnostics = check_outcomes(diagnostics, fitted, stage.draws, histories)
@@ -275,9 +258,3 @@ class Stages:
                 stacklevel=4,
             )
         return belief
-
-
-def _unbounding(coordinates: PriorCoordinates) -> Unbounding | None:
-    """Return the map to where edges are no concern, which a few edges are not."""
-    is_needed = coordinates.bounded.sum() > MANY
-    return Unbounding(coordinates.bounded) if is_needed else None

@@ -11,13 +11,13 @@ from scipy.stats import kurtosis
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.declared.diagnosing import misplaced
+from sbi_active.inference.engine.learned import LearnedFit
 from sbi_active.inference.refinement.regression_error import (
     SMALL,
     expected_error,
 )
 from sbi_active.inference.refinement.tails import tail_probability
 from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
-from sbi_active.inference.sampling.population import Particles
 
 Array = NDArray[Any]
 
@@ -39,7 +39,7 @@ class Stage:
 
     Attributes:
         surrogate: Fitted at this stage.
-        particles: Importance sample of it.
+        fit: Its posterior.
         defensive: Share of the prior in the density.
         draws: Equally weighted particles, shape (n, d).
         excess: Worst misfit of a region with mass.
@@ -49,7 +49,7 @@ class Stage:
     """
 
     surrogate: Surrogate
-    particles: Particles
+    fit: LearnedFit
     defensive: float
     draws: Array
     excess: float
@@ -60,23 +60,23 @@ class Stage:
     @staticmethod
     def of(
         surrogate: Surrogate,
-        particles: Particles,
+        fit: LearnedFit,
         defensive: float,
         rng: np.random.Generator,
     ) -> Stage:
         """Return the stage of a fitted surrogate and its sample."""
-        draws = particles.resample(1_000, rng)
+        draws = fit.draws(1_000, rng)
         label = surrogate.assign(draws)
         mass = np.bincount(label[label >= 0], minlength=len(surrogate.regressions))
         mass = mass / max(mass.sum(), 1)
         live = [
-            fit.excess
-            for fit, share in zip(surrogate.regressions, mass, strict=True)
+            one.excess
+            for one, share in zip(surrogate.regressions, mass, strict=True)
             if share > LIVE
         ]
         stage = Stage(
             surrogate,
-            particles,
+            fit,
             defensive,
             draws,
             excess=max(live, default=np.inf),
@@ -91,7 +91,7 @@ class Stage:
         log_prior = self.surrogate.coordinates.log_prior(z)
         log_likelihood = self.surrogate.log_likelihood(z)
         return log_prior + np.logaddexp(
-            np.log1p(-self.defensive) + log_likelihood - self.particles.log_normalizer,
+            np.log1p(-self.defensive) + log_likelihood - self.fit.fit.log_evidence,
             np.log(self.defensive),
         )
 
@@ -148,10 +148,7 @@ def diagnose(
     tail, joint = tail_probability(last.surrogate, last.draws, num_trials)
     edge = np.abs(last.draws[:, last.surrogate.coordinates.bounded]) > 0.98
     edge_mass = float(edge.mean(0).max(initial=0.0))
-    effective = min(
-        stage.particles.effective_sample_size / len(stage.particles.z)
-        for stage in course.stages
-    )
+    effective = min(stage.fit.efficiency for stage in course.stages)
     roughness = course.stages[0].surrogate.regressions[0].roughness
     negentropy, is_gaussian = _noise_shape(live, rng)
     is_gaussian &= not _has_hard_edges(course.stages)
@@ -217,7 +214,7 @@ def diagnose(
             for name, (ok, figure, _) in assumptions.items()
         },
         num_simulations=num_simulations,
-        effective_sample_size=float(last.particles.effective_sample_size),
+        effective_sample_size=float(last.fit.fit.effective_sample_size),
         error_nats=last.error,
         error_nats_if_explained=expected_error(
             last.surrogate, last.draws, rng, explained=True

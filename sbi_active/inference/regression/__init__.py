@@ -9,9 +9,7 @@ from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.outcomes import TrialOutcome, outcomes_of
 from sbi_active.inference.regression.regions import (
     SPREAD,
-    PriorProposal,
     Region,
-    RegionsProposal,
     cover,
     nearest_region,
     whole_space,
@@ -26,9 +24,7 @@ __all__ = [
     "Basis",
     "Histories",
     "LocalRegression",
-    "PriorProposal",
     "Region",
-    "RegionsProposal",
     "SPREAD",
     "Surrogate",
     "TrialOutcome",

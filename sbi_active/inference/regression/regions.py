@@ -7,13 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
 from scipy.stats import chi, chi2
-from typing_extensions import override
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import GaussianMixture, Particles
-from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 
 Array = NDArray[Any]
 
@@ -24,7 +21,6 @@ COVERED = 0.9997
 SPREAD = 2.2
 #: Nats a dimension that more clusters must save.
 WORTH = 0.1
-NUM_POINTS = 1_000  # particles to cluster
 
 
 @dataclass(frozen=True)
@@ -55,22 +51,6 @@ class Region:
         if self.whole:
             return np.ones(len(z))
         return np.sqrt((self.scaled(z) ** 2).sum(1))
-
-    @property
-    def log_volume(self) -> float:
-        """Log of the ellipsoid's volume."""
-        d = len(self.center)
-        unit_ball = 0.5 * d * np.log(np.pi) - gammaln(0.5 * d + 1)
-        scale = np.log(np.abs(np.diag(self.factor))).sum()
-        return float(unit_ball + d * np.log(self.radius) + scale)
-
-    def sample_uniform(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return uniform draws from the ellipsoid, shape (n, d)."""
-        d = len(self.center)
-        normal = rng.standard_normal((num_samples, d))
-        direction = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        length = self.radius * rng.random((num_samples, 1)) ** (1 / d)
-        return self.center + (length * direction) @ self.factor.T
 
     def sample_inside(
         self, num_samples: int, coordinates: PriorCoordinates, rng: np.random.Generator
@@ -121,47 +101,8 @@ def nearest_region(regions: list[Region], z: Array) -> NDArray[np.intp]:
     return np.where(distance.min(0) <= 1, nearest, -1)
 
 
-@dataclass(frozen=True)
-class PriorProposal(Proposal):
-    """The prior as a proposal."""
-
-    coordinates: PriorCoordinates
-
-    @override
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        return self.coordinates.sample_prior(num_samples, rng)
-
-    @override
-    def log_prob(self, z: Array) -> Array:
-        return self.coordinates.log_prior(z)
-
-
-@dataclass(frozen=True)
-class RegionsProposal(Proposal):
-    """Equal shares of uniform densities over ellipsoids."""
-
-    regions: list[Region]
-
-    @override
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        share = np.full(len(self.regions), 1 / len(self.regions))
-        count = rng.multinomial(num_samples, share)
-        pairs = zip(self.regions, count, strict=True)
-        return np.concatenate([r.sample_uniform(n, rng) for r, n in pairs])
-
-    @override
-    def log_prob(self, z: Array) -> Array:
-        density = np.stack(
-            [
-                np.where(region.distance(z) <= 1, -region.log_volume, -np.inf)
-                for region in self.regions
-            ]
-        )
-        return logsumexp(density, axis=0) - np.log(len(self.regions))
-
-
 def cover(
-    particles: Particles,
+    points: Array,
     rng: np.random.Generator,
     *,
     min_regions: int,
@@ -175,7 +116,6 @@ def cover(
     cluster; else an ellipsoid just holds its particles, which a surrogate with misfit
     has spread already.
     """
-    points = particles.resample(NUM_POINTS, rng)
     d = points.shape[1]
     counts = sorted(
         {min(max(k, min_regions), max_regions) for k in (1, 2, 3, 4, 6, 8, min_regions)}

@@ -269,13 +269,6 @@ class Surrogate:
                 log_likelihood[rows] = regression.log_likelihood(z[rows], caution)
         return log_likelihood
 
-    def log_joint(self, z: Array) -> Array:
-        """Return log prior plus log likelihood in the coordinates z, shape (n,)."""
-        log_joint = self.coordinates.log_prior(z)
-        rows = np.flatnonzero(np.isfinite(log_joint))
-        log_joint[rows] += self.log_likelihood(z[rows])
-        return log_joint
-
     def assign(self, z: Array) -> NDArray[np.intp]:
         """Return the region of each place, shape (n,); -1 where there is none."""
         return nearest_region([r.region for r in self.regressions], z)

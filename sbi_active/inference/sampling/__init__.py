@@ -4,22 +4,14 @@ Here live tools that know a density and nothing of trials, networks or simulator
 """
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.population import (
-    GaussianMixture,
-    Particles,
-    StudentProposal,
-    population_monte_carlo,
-)
+from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 from sbi_active.inference.sampling.unbounding import Unbounding
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
 __all__ = [
     "GaussianMixture",
-    "Particles",
     "PriorCoordinates",
-    "StudentProposal",
     "Unbounding",
     "log_sum_exp",
     "normalized",
-    "population_monte_carlo",
 ]

@@ -58,12 +58,6 @@ def log_student(
     return constant - log_volume - tail
 
 
-def student_steps(num: int, dim: int, rng: np.random.Generator) -> Array:
-    """Return draws of a t distribution of unit scale, shape (num, dim)."""
-    scale = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, (num, 1)))
-    return scale * rng.standard_normal((num, dim))
-
-
 @dataclass(frozen=True)
 class StudentMixture:
     """Mixture of multivariate t distributions.
@@ -105,7 +99,7 @@ class StudentMixture:
         k = len(self.means)
         weights = np.full(k, 1 / k) if self.weights is None else self.weights
         apart = (z - self.means[:, None]).transpose(0, 2, 1)
-        square = (np.linalg.solve(self.factors, apart) ** 2).sum(1)
+        square = ((np.linalg.inv(self.factors) @ apart) ** 2).sum(1)
         log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
         log_volume = (log_volume - np.log(weights))[:, None]
         return log_student(square, log_volume, z.shape[1], self.freedom)
@@ -155,7 +149,7 @@ class SplitStudentMixture(Proposal):
     def log_prob(self, z: Array) -> Array:
         """Return log densities, shape (n,)."""
         apart = (z - self.means[:, None]).transpose(0, 2, 1)
-        step = np.linalg.solve(self.axes, apart)  # (k, d, n)
+        step = np.linalg.inv(self.axes) @ apart  # (k, d, n)
         scale = np.where(step > 0, self.right[..., None], self.left[..., None])
         volume = np.linalg.slogdet(self.axes)[1][:, None] + np.log(scale).sum(1)
         volume = volume - np.log(self.weights)[:, None]

@@ -268,7 +268,7 @@ class ProductRounds(ActionRounds):
             product,
             hint,
             rng,
-            num_particles=settings.num_particles,
+            num_effective=settings.effective_particles,
             defensive=settings.defensive,
         )
         sampled: Belief = belief

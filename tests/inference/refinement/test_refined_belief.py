@@ -1,12 +1,14 @@
 """Draws from a refined belief."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
 
+from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.refinement import LearnedBelief
-from sbi_active.inference.regression import PriorProposal
-from sbi_active.inference.sampling import Particles, PriorCoordinates
+from sbi_active.inference.sampling import PriorCoordinates
 
 
 def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():
@@ -20,16 +22,11 @@ def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():
         def log_likelihood(self, z):
             return -0.5 * (coordinates.to_theta(z).double().numpy()[:, 0] / 0.3) ** 2
 
-        def log_joint(self, z):
-            return coordinates.log_prior(z) + self.log_likelihood(z)
-
-    rng = np.random.default_rng(0)
-    base = PriorProposal(coordinates)
-    z = base.sample(500, rng)
-    log_weight = Normal().log_joint(z) - base.log_prob(z)
-    log_weight[0] += 30.0  # one draw that no other resembles
-    particles = Particles(z, log_weight, base)
-    belief = LearnedBelief(prior, Normal(), particles, defensive=0.01)
+    fit = learned_fit(Normal(), np.random.default_rng(0))
+    assert fit is not None
+    # As if one draw that no other resembles had most of the weight.
+    far = replace(fit.fit, log_evidence=fit.fit.log_evidence + 24.0)
+    belief = LearnedBelief(prior, replace(fit, fit=far), defensive=0.01)
     draws = belief.sample((2_000,))[:, 0]
     assert len(draws) == 2_000
     # 1 % are of the prior, whose standard deviation is 2.3.

@@ -7,13 +7,15 @@ import pytest
 from scipy.stats import multivariate_t
 
 from benchmarks.location_finding.kernels import KernelMixture
-from sbi_active.inference.sampling.population import GaussianMixture, WidenedMixture
+from sbi_active.inference.sampling.gaussian_mixture import (
+    GaussianMixture,
+    WidenedMixture,
+)
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
     SplitStudentMixture,
     StudentMixture,
     lower_factors,
-    student_steps,
 )
 
 MEANS = np.array([[-3.0, 0.0], [3.0, 1.0]])
@@ -47,11 +49,6 @@ def test_a_widened_mixture_keeps_a_weight_for_every_component():
     gaussian = GaussianMixture(np.log([0.999, 0.001]), MEANS, FACTORS, 0.0)
     expected = density(0.8 * np.array([0.999, 0.001]) + 0.1, inflation=1.4)
     assert WidenedMixture(gaussian).log_prob(Z) == pytest.approx(np.log(expected))
-
-
-def test_steps_have_the_covariance_of_five_degrees_of_freedom():
-    steps = student_steps(400_000, 2, np.random.default_rng(0))
-    assert np.cov(steps.T) == pytest.approx(5 / 3 * np.eye(2), abs=0.03)
 
 
 @pytest.mark.parametrize("kind", [StudentMixture, KernelMixture])

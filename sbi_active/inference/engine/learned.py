@@ -1,0 +1,137 @@
+"""The posterior of a likelihood that was learned: it costs no simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.inference.engine.fit import Fit
+from sbi_active.inference.engine.importance import defended
+from sbi_active.inference.engine.infer import infer
+from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.inference.sampling.weights import normalized
+
+Array = NDArray[Any]
+
+#: Settings of :func:`.infer` where a likelihood is cheap: half of the draws loses
+#: narrow modes beside wide ones, twice takes twice as long.
+CHEAP = Settings(
+    plenty=1.0,
+    num_draws=2_000,
+    fewest=200.0,
+    max_fits=6,
+    efficient=0.4,
+    jitter=0.0,
+    fitted=0.25,
+)
+
+
+class LearnedLikelihood(Protocol):
+    """A likelihood of all trials as a function of the prior's coordinates."""
+
+    @property
+    def coordinates(self) -> PriorCoordinates:
+        """Coordinates of the prior."""
+        ...
+
+    def log_likelihood(self, z: Array) -> Array:
+        """Return the log likelihood, (n, d) -> (n,)."""
+        ...
+
+
+class LearnedPotential:
+    """The prior times a learned likelihood.
+
+    It has no residuals, so that it is not searched, and no edges: draws near a bound
+    would nearly all miss it where parameters are many.
+
+    Args:
+        learned: Learned likelihood of all trials.
+
+    Attributes:
+        dim: Number of parameters.
+        num_trials: Number of likelihoods, which is one.
+    """
+
+    def __init__(self, learned: LearnedLikelihood) -> None:
+        self.learned, self.dim = learned, learned.coordinates.dim
+        self.num_trials, self.num_simulations = 1, 0
+        # The same coordinates at each call.
+        rng = np.random.default_rng(0)
+        self.coordinates = NormalCoordinates(
+            learned.coordinates, rng, keeps_edges=False
+        )
+
+    def sample_prior(self, num: int, rng: np.random.Generator) -> Array:
+        """Return draws of the prior, shape (n, d)."""
+        return self.coordinates.sample(num, rng)
+
+    def simulated(self, u: Array) -> Array:
+        """Return the places within the prior's support, shape (k, d)."""
+        return u[self.coordinates.base.inside(self.coordinates.to_z(u))]
+
+    def log_prior(self, u: Array) -> Array:
+        """Return the log density of u under the prior, shape (n,)."""
+        return self.coordinates.log_prior(u)
+
+    def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
+        """Return learned log likelihoods, shape (n,)."""
+        return self.learned.log_likelihood(self.coordinates.to_z(u))
+
+
+@dataclass(frozen=True)
+class LearnedFit:
+    """The posterior of a learned likelihood.
+
+    Attributes:
+        potential: Prior times learned likelihood.
+        fit: Weighted draws, in the potential's coordinates, and the evidence.
+        proposal: Density fitted to these draws, with wider tails, to propose more from.
+    """
+
+    potential: LearnedPotential
+    fit: Fit
+    proposal: Proposal
+
+    @property
+    def efficiency(self) -> float:
+        """Share of the draws of the last proposal that are effective."""
+        return self.fit.effective_sample_size / max(self.fit.pool.num_final, 1)
+
+    def draws(self, num: int, rng: np.random.Generator) -> Array:
+        """Return the prior's coordinates of equally weighted draws, (num, d)."""
+        return self.potential.coordinates.to_z(self.fit.draws(num, rng))
+
+
+def learned_fit(
+    learned: LearnedLikelihood,
+    rng: np.random.Generator,
+    *,
+    near: Array | None = None,
+    num_effective: float = 3_000.0,
+) -> LearnedFit | None:
+    """Return the posterior of a learned likelihood; None where nothing has any.
+
+    Args:
+        learned: Learned likelihood of all trials.
+        rng: Source of the draws.
+        near: Prior's coordinates of draws of a guess, shape (n, d).
+        num_effective: Number of effective draws to end with; a log density is off by
+            about its inverse root, in nats.
+    """
+    potential = LearnedPotential(learned)
+    own = replace(CHEAP, num_effective=num_effective)
+    places = None if near is None else potential.coordinates.from_z(near)
+    fit = infer(potential, rng, near=places, settings=own)
+    if not np.isfinite(fit.log_evidence):
+        return None
+    weight = normalized(fit.pool.log_weight)
+    share, num = own.share_of_wide, own.num_components
+    proposal = defended(fit.pool, weight, num, share, own, rng)
+    return LearnedFit(potential, fit, proposal)

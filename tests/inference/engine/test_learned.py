@@ -1,0 +1,151 @@
+"""The posterior of a learned likelihood, on densities with known normalizers."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy.special import logsumexp
+
+from sbi_active.inference.engine.importance import pareto_shape
+from sbi_active.inference.engine.learned import LearnedPotential, learned_fit
+from sbi_active.inference.sampling import PriorCoordinates
+
+
+def likelihood_of(dim: int, log_likelihood: Any) -> Any:
+    """Return a likelihood over a box prior between -1 and 1."""
+    prior = BoxUniform(-torch.ones(dim), torch.ones(dim))
+    coordinates = PriorCoordinates(prior, np.random.default_rng(0))
+    return SimpleNamespace(coordinates=coordinates, log_likelihood=log_likelihood)
+
+
+def peaks(centers: np.ndarray, sd: np.ndarray) -> Any:
+    """Return a log density of integral len(centers) in the plane."""
+
+    def log_density(z: np.ndarray) -> np.ndarray:
+        square = (((z[:, None] - centers) / sd) ** 2).sum(-1)
+        log_peak = -0.5 * square - np.log(2 * np.pi * sd.prod())
+        return np.asarray(logsumexp(log_peak, axis=1))
+
+    return log_density
+
+
+@pytest.mark.parametrize(
+    ("centers", "sd"),
+    [
+        ([[0.2, -0.3]], [1e-4, 1e-4]),
+        ([[0.3, 0.0]], [1e-4, 0.2]),
+        ([[-0.7, 0.2], [0.7, -0.2]], [1e-3, 1e-2]),
+        ([[-0.8, 0.2], [-0.3, 0.2], [0.2, 0.2], [0.7, 0.2]], [0.01, 0.1]),
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_finds_narrow_peaks(centers: list, sd: list, seed: int):
+    rng = np.random.default_rng(seed)
+    place, width = np.array(centers), np.array(sd)
+    found = learned_fit(likelihood_of(2, peaks(place, width)), rng)
+    assert found is not None
+    effective = found.fit.effective_sample_size
+    assert effective > 2_900
+    assert found.efficiency > 0.2
+    error = 1 / effective**0.5
+    exact = np.log(len(place)) - 2 * np.log(2)
+    assert found.fit.log_evidence == pytest.approx(exact, abs=4 * error)
+    draws = found.draws(4_000, rng)
+    nearest = ((draws[:, None] - place) ** 2).sum(-1).argmin(1)
+    share = np.bincount(nearest, minlength=len(place)) / 4_000
+    assert abs(share - 1 / len(place)).max() < 4 * error
+
+
+@pytest.mark.parametrize("dim", [9, 12])
+def test_a_density_cut_at_many_edges(dim: int):
+    # A normal density about a corner of the box, 1 in 2^d of which is within.
+    def log_density(z: np.ndarray) -> np.ndarray:
+        log_prob = -0.5 * (((z - 1) / 0.2) ** 2).sum(1) - dim * np.log(0.2)
+        return log_prob - 0.5 * dim * np.log(np.pi / 2)
+
+    own = likelihood_of(dim, log_density)
+    found = learned_fit(own, np.random.default_rng(0), num_effective=1_000)
+    assert found is not None
+    effective = found.fit.effective_sample_size
+    assert effective > 990
+    exact = -dim * np.log(2)
+    assert found.fit.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
+
+
+@pytest.mark.parametrize("width", [1e-1, 1e-2, 1e-3])
+def test_a_slanted_normal_density_of_six_parameters(width: float):
+    dim, center = 6, np.full(6, 0.2)
+    rng = np.random.default_rng(5)
+    root = width * np.linalg.qr(rng.standard_normal((dim, dim)))[0]
+    root = root * np.linspace(0.2, 1.0, dim)
+    log_volume = np.linalg.slogdet(root)[1] + 0.5 * dim * np.log(2 * np.pi)
+
+    def log_density(z: np.ndarray) -> np.ndarray:
+        step = np.linalg.solve(root, (z - center).T)
+        return -0.5 * (step**2).sum(0) - log_volume
+
+    found = learned_fit(likelihood_of(dim, log_density), rng)
+    assert found is not None
+    # An efficiency of a hundredth would say that a tempered proposal was kept.
+    assert found.efficiency > 0.2
+    error = 4 / found.fit.effective_sample_size**0.5
+    assert found.fit.log_evidence == pytest.approx(-dim * np.log(2), abs=error)
+    draws = found.draws(3_000, rng)
+    scaled = np.linalg.solve(root, (draws - center).T)
+    assert abs(scaled.mean(1)).max() < 0.15
+    assert abs(scaled.std(1) - 1).max() < 0.1
+
+
+PLATEAU = -20.0  # log likelihood where nothing is known
+DIM = 4
+
+
+# A needle that nothing points at is for no sampler.
+@pytest.mark.parametrize(
+    ("is_known", "width"), [(True, 0.003), (True, 0.05), (False, 0.05)]
+)
+def test_a_peak_on_a_plateau_is_not_lost(is_known: bool, width: float):
+    rng, center = np.random.default_rng(0), np.array([0.5, -0.2, 0.1, 0.6])
+
+    def log_likelihood(z: np.ndarray) -> np.ndarray:
+        square = ((z - center) ** 2).sum(1) / (2 * width**2)
+        peak = -square - DIM * np.log(width * np.sqrt(2 * np.pi))
+        return np.logaddexp(peak, PLATEAU)
+
+    known = center + 5 * width * rng.standard_normal((400, DIM))
+    own = likelihood_of(DIM, log_likelihood)
+    near = known if is_known else own.coordinates.sample_prior(400, rng)
+    found = learned_fit(own, rng, near=near)
+    assert found is not None
+    assert found.fit.log_evidence == pytest.approx(-DIM * np.log(2), abs=0.1)
+    draws = found.draws(500, rng)
+    assert draws.mean(0) == pytest.approx(center, abs=0.3 * width)
+
+
+def test_nothing_with_a_likelihood_is_no_fit():
+    own = likelihood_of(2, lambda z: np.full(len(z), -np.inf))
+    assert learned_fit(own, np.random.default_rng(0)) is None
+
+
+def test_a_uniform_prior_is_normal_in_the_coordinates():
+    own = LearnedPotential(likelihood_of(2, lambda z: np.zeros(len(z))))
+    u = own.sample_prior(500, np.random.default_rng(0))
+    expected = -0.5 * (u**2).sum(1) - np.log(2 * np.pi)
+    # The moments of 2,000 draws place the coordinates.
+    assert own.log_prior(u) == pytest.approx(expected, abs=0.3)
+    assert np.isfinite(own.log_prior(own.simulated(u))).all()
+
+
+@pytest.mark.parametrize("shape", [0.2, 0.5, 0.7, 1.0])
+def test_pareto_shape_is_that_of_arviz(shape: float):
+    arviz = pytest.importorskip("arviz")
+    rng = np.random.default_rng(int(10 * shape))
+    log_weight = np.log(rng.pareto(1 / shape, 4_000) + 1)
+    other = float(arviz.psislw(log_weight)[1])
+    assert pareto_shape(log_weight) == pytest.approx(other, abs=0.02)
+    assert pareto_shape(log_weight) == pytest.approx(shape, abs=0.25)
