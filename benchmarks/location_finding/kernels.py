@@ -15,7 +15,6 @@ from sbi_active.inference.sampling.student_mixture import (
     Proposal,
     StudentMixture,
     log_student,
-    student_steps,
 )
 
 Array = NDArray[Any]
@@ -36,8 +35,9 @@ class KernelMixture(StudentMixture):
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
         """Return draws, shape (n, d)."""
         which = rng.integers(len(self.means), size=num_samples)
-        steps = student_steps(num_samples, self.means.shape[1], rng)
-        return self.moved(which, steps)
+        normal = rng.standard_normal((num_samples, self.means.shape[1]))
+        square = rng.chisquare(self.freedom, (num_samples, 1)) / self.freedom
+        return self.moved(which, normal / np.sqrt(square))
 
     def log_prob(self, z: Array) -> Array:
         """Return the log density, (n, d) -> (n,)."""

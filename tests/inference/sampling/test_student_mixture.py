@@ -7,10 +7,6 @@ import pytest
 from scipy.stats import multivariate_t
 
 from benchmarks.location_finding.kernels import KernelMixture
-from sbi_active.inference.sampling.gaussian_mixture import (
-    GaussianMixture,
-    WidenedMixture,
-)
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
     SplitStudentMixture,
@@ -43,12 +39,6 @@ def test_kernels_have_the_density_of_a_mixture_of_equal_weights():
     kernels = KernelMixture(MEANS, FACTORS)
     assert kernels.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
     assert kernels.log_prob(Z[:0]).shape == (0,)
-
-
-def test_a_widened_mixture_keeps_a_weight_for_every_component():
-    gaussian = GaussianMixture(np.log([0.999, 0.001]), MEANS, FACTORS, 0.0)
-    expected = density(0.8 * np.array([0.999, 0.001]) + 0.1, inflation=1.4)
-    assert WidenedMixture(gaussian).log_prob(Z) == pytest.approx(np.log(expected))
 
 
 @pytest.mark.parametrize("kind", [StudentMixture, KernelMixture])
