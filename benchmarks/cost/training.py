@@ -2,8 +2,8 @@
 
     python -m benchmarks cost.training
 
-The settings until version 0.9 beside the default ones, in turn, seed by seed, in one
-process on one thread: CPU seconds of a whole round of a campaign and of its training,
+The earlier settings beside the default ones, in turn, seed by seed, in one process on
+one thread: CPU seconds of a whole round of a campaign and of its training,
 and the mean of log q(theta | x, action) over fresh rows, nats, of a network that was
 trained on 5,000 rows of the prior. Seeds below 100 served to set the defaults; these
 are others. Writes training.json beside this file.

@@ -108,6 +108,7 @@ TABLES = {
     "The cost of a round": (
         "table cost/result.json",
         "table cost/network.json",
+        "table cost/training.json",
         "table cost/doors.json --only cpu_s*",
     ),
     "Robust updates": ("chain.robust --summary",),

@@ -24,6 +24,7 @@ from sbi_active.criticism.effects.trial_conditions import (
     has_own_times,
 )
 from sbi_active.criticism.results import CATCH_ALLS, NONE
+from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
@@ -84,6 +85,11 @@ def require_fitting(
     actions: ActionSpace | None,
 ) -> None:
     """Raise where the parts of a loop do not fit together."""
+    if Enumeration.of(prior) is not None:
+        raise ValueError(
+            "expected a prior of continuous parameters; got one with parameters of a "
+            "few values; declare the choice as an Effect, which is compared with none"
+        )
     own = model.parameter_names
     default = [f"theta_{i + 1}" for i in range(prior.event_shape[0])]
     require_distinct(effects, default if own is None else own)

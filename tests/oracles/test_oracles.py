@@ -136,7 +136,6 @@ def test_a_parameter_that_no_trial_informs_changes_nothing():
     assert (np.abs(np.log(sd_7 / sd_6))).max() < 0.15
 
 
-@pytest.mark.xfail(reason="discrete parameters are to be enumerated", strict=True)
 def test_a_discrete_parameter_gets_its_probability():
     own = PROBLEMS["payload"]()
     simulator = own.simulator(is_declared=True)

@@ -33,6 +33,7 @@ from sbi_active.campaign.learning.round_model import RoundModel
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.inference.beliefs.belief import information_gained, named
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.inference.beliefs.identifiability import note_combinations
 from sbi_active.inference.beliefs.priors import require_support, require_width
 from sbi_active.inference.models.posterior import ActionPosterior
@@ -74,7 +75,9 @@ class Learner:
         *,
         x_shape: torch.Size | None = None,
     ) -> None:
-        self.simulator, self.prior = simulator, require_support(prior)
+        enumerates = find_method(state.method).enumerates(state.options)
+        self.simulator = simulator
+        self.prior = require_support(prior, enumerates=enumerates)
         self._actions, self._state = actions, state
         self._names = getattr(simulator, "parameter_names", None)
         require_width(prior, self._names, seed=derive_seed(state.seed, "width"))
@@ -87,11 +90,17 @@ class Learner:
             self.prior, self._state.options
         )
         # Asking for the network must not change the beliefs of a campaign.
-        self._trainer.starts_at_network = self._state.options.network == "each round"
+        self._trainer.starts_at_network = self._trains_each_round
         self._saved: Callable[[], Distribution] | None = None
         self._end_round()
         self._stated: tuple[Distribution, list[str], Distribution] | None = None
         self.simulations: Simulations | None = None
+
+    @property
+    def _trains_each_round(self) -> bool:
+        """Whether a network is trained each round, which has no discrete parameters."""
+        asked = self._state.options.network == "each round"
+        return asked and Enumeration.of(self.prior) is None
 
     @cached_property
     def _has_index(self) -> bool:
@@ -221,7 +230,7 @@ class Learner:
         assert trial.x is not None
         state = self._state
         seed, options = state.seed, state.options
-        every_round = options.network == "each round"
+        every_round = self._trains_each_round
         if not self._has_index and (every_round or not options.refine):
             self.trained(trial.index)
             serves = self._inference.network_serves if options.refine else ("belief",)
@@ -296,9 +305,11 @@ class Learner:
         Args:
             index: Of the trial that is designed.
         """
+        if Enumeration.of(self.prior) is not None:
+            return RoundModel(None)
         options = self._state.options
         can_wait = self._inference.amortized and options.design_on == "fresh"
-        is_due = options.network == "each round" or not can_wait
+        is_due = self._trains_each_round or not can_wait
         return RoundModel(
             lambda: self.trained(index), self.trained(index) if is_due else None
         )

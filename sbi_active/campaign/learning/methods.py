@@ -31,12 +31,19 @@ class Method:
         estimator: What is trained by default.
         faithful: Options of the setting of the method's authors that differ from those
             of :meth:`.CampaignOptions.faithful`.
+        refines: Whether its beliefs are refined, where the options ask for it.
     """
 
     designs: bool
     build: Callable[[Distribution, CampaignOptions], ActiveInference]
     estimator: Any
     faithful: dict[str, Any]
+    refines: bool = False
+
+    def enumerates(self, options: CampaignOptions) -> bool:
+        """Return whether parameters may take a few values: refinement alone can."""
+        few = options.max_simulations is not None
+        return self.refines and options.refine and not few
 
 
 def _asbi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
@@ -83,8 +90,8 @@ _SEQBED = {
 
 #: Name of a method: what it is.
 METHODS = {
-    "asbi": Method(True, _asbi, MixtureDensity(), {}),
-    "nsbi": Method(False, _asbi, MixtureDensity(), {}),
+    "asbi": Method(True, _asbi, MixtureDensity(), {}, refines=True),
+    "nsbi": Method(False, _asbi, MixtureDensity(), {}, refines=True),
     "alhi": Method(True, _alhi, MixtureDensity(), _ALHI),
     "nlhi": Method(False, _alhi, MixtureDensity(), _ALHI),
     "seqbed": Method(True, _seqbed, RatioClassifier(), _SEQBED),

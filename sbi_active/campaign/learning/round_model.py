@@ -14,7 +14,8 @@ class RoundModel:
     """The model of a round, as a designer takes it.
 
     Args:
-        train: Returns the model, trained in this call if needed.
+        train: Returns the model, trained in this call if needed; None where none can
+            be, as of discrete parameters.
         model: The trained model; None leaves it untrained until something asks for one
             of its densities.
 
@@ -22,7 +23,7 @@ class RoundModel:
         was_asked: Whether something did.
     """
 
-    def __init__(self, train: Callable[[], Any], model: Any = None) -> None:
+    def __init__(self, train: Callable[[], Any] | None, model: Any = None) -> None:
         self._train, self._model = train, model
         self.was_asked = False
 
@@ -33,6 +34,8 @@ class RoundModel:
 
     def __getattr__(self, name: str) -> Any:
         is_density = name in DENSITIES
+        if self._train is None:
+            raise AttributeError(name)
         if is_density and self._model is None:
             # Estimates are made without gradients, training is not.
             self._model = isolated(self._train)()

@@ -10,6 +10,7 @@ from sbi.utils.torchutils import set_validate_args
 from torch import Tensor
 from torch.distributions import Distribution, MixtureSameFamily, constraints
 
+from sbi_active.inference.beliefs.enumerated import MOST_VALUES, Enumeration
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, within_support
 
@@ -17,8 +18,14 @@ from sbi_active.support import parts_of, within_support
 FEWEST_STEPS = 64
 
 
-def require_support(prior: Distribution | None) -> Distribution:
+def require_support(
+    prior: Distribution | None, *, enumerates: bool = False
+) -> Distribution:
     """Return the prior, or raise where it has no support to keep a belief in.
+
+    Args:
+        prior: Distribution of the parameters.
+        enumerates: Whether parameters of a few values are welcome.
 
     Raises:
         ValueError: If there is no prior, it is a batch of them, its ``support`` is not
@@ -41,11 +48,13 @@ def require_support(prior: Distribution | None) -> Distribution:
             f"{type(prior).__name__} without one; use sbi.utils.BoxUniform, a torch "
             "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
         )
-    if any(map(is_discrete, parts_of(support))):
+    may_be = enumerates and Enumeration.of(prior) is not None
+    if any(map(is_discrete, parts_of(support))) and not may_be:
         raise ValueError(
             "expected a prior of continuous parameters; got a discrete one, "
-            f"{_shown_prior(prior)}; declare the choice as an Effect, which criticism "
-            "compares, or run a campaign for each value"
+            f"{_shown_prior(prior)}; put parameters of up to {MOST_VALUES} combined "
+            "values beside continuous ones with sbi's MultipleIndependent and the "
+            "method asbi or nsbi, or declare the choice as an Effect"
         )
     if _is_constrained(support):
         raise ValueError(
@@ -123,6 +132,12 @@ def require_width(
         names: Of the parameters, for the error.
         seed: Of some draws.
     """
+    enumeration = Enumeration.of(prior)
+    if enumeration is not None:
+        if names is not None:
+            names = [names[int(k)] for k in enumeration.others]
+        require_width(enumeration.rest, names, seed=seed)
+        return
     with forked_generators(seed):
         draws = prior.sample(torch.Size([256])).reshape(256, -1).float()
     inside = within_support(prior, draws)

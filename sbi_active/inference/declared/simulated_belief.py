@@ -98,6 +98,11 @@ class SimulatedBelief(Belief):
             np.exp(mixture.log_weight), mixture.mean, mixture.factor
         )
 
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of prior times likelihood, nats."""
+        return self._log_evidence
+
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:
         z = self._coordinates.to_z(theta)
         u = self._normal.from_z(z)

@@ -62,6 +62,11 @@ class LearnedBelief(Belief):
         largest = float(self._log_weight(u).max())
         self._log_bound = min(largest, self._log_normalizer - np.log(MIN_ACCEPTANCE))
 
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of prior times learned likelihood, nats."""
+        return self._log_normalizer
+
     def log_likelihood(self, z: Array) -> Array:
         """Return the learned log likelihood at the prior's coordinates (n, d), (n,)."""
         return self._potential.learned.log_likelihood(z)

@@ -13,12 +13,14 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.beliefs.comparison import compare_orders
+from sbi_active.inference.beliefs.enumerated import EnumeratedBelief, Enumeration
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared import SimulatedBelief, refine_declared
 from sbi_active.inference.declared.contradiction import MAX_INFLATIONS, Contradiction
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.declared.simulated_belief import DeclaredRecord
 from sbi_active.inference.refinement.confirmation import by_replicates
+from sbi_active.inference.refinement.enumerating import enumerated
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.stages import Stages, Task
 from sbi_active.inference.regression.histories import HistoryRecord
@@ -36,7 +38,7 @@ def refine(
     past: HistoryRecord | DeclaredRecord | None = None,
     settings: RefinementOptions | None = None,
     seed: int,
-) -> LearnedBelief | SimulatedBelief:
+) -> LearnedBelief | SimulatedBelief | EnumeratedBelief:
     r"""Return the posterior of all trials given the original prior.
 
     Where the simulator is noise-free beside a declared noise, a simulation gives the
@@ -46,7 +48,7 @@ def refine(
     in ellipsoids around what is still plausible: simulate every executed action at each
     parameter set, regress the outcomes on the parameters (:mod:`.surrogate`), sample
     prior times surrogate likelihood without simulations
-    (:func:`.population_monte_carlo`), and put new ellipsoids around the sample. It ends
+    (:func:`.learned_fit`), and put new ellipsoids around the sample. It ends
     when the residuals are pure noise and a stage changes nothing, or when the budget is
     spent.
 
@@ -55,7 +57,8 @@ def refine(
 
     Args:
         simulator: ``simulator(theta, action)``; not kept in the result.
-        prior: The original prior, with a support.
+        prior: The original prior, with a support. Parameters of a few values, beside
+            continuous ones in sbi's ``MultipleIndependent``, are enumerated.
         action: Executed actions, shape (t, action_dim).
         x: Their observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
         start: Where else to look first, for example a chained belief and the belief
@@ -76,7 +79,7 @@ def refine(
 
     References:
         Wood, Nature 2010; Price et al., J. Comp. Graph. Stat. 2018 (synthetic
-        likelihood); Cappe et al., J. Comp. Graph. Stat. 2004 (population Monte Carlo).
+        likelihood).
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -88,9 +91,15 @@ def refine(
         >>> bool((belief.mean - 0.3).abs() < 0.05)
         True
     """
-    prior = require_support(prior)
+    prior = require_support(prior, enumerates=True)
     settings = RefinementOptions() if settings is None else settings
     action, outcome = _trials(action, x)
+    enumeration = Enumeration.of(prior)
+    if enumeration is not None:
+        return enumerated(
+            *(refine, simulator, prior, enumeration, action, outcome, seed),
+            settings=settings,
+        )
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
     task = Task(simulator, prior, action, outcome, [*hints], settings)

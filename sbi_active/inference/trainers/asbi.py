@@ -231,7 +231,7 @@ class ASBI(MixtureRounds, NPE_C):
             start.append(previous)
         belief = refine(
             told.simulator,
-            require_support(self._prior),
+            require_support(self._prior, enumerates=True),
             torch.stack([t.action for t in trials]),
             torch.stack([t.x for t in trials]),
             start=start,
@@ -255,7 +255,7 @@ class ASBI(MixtureRounds, NPE_C):
         if self._trained_round is None or network is None or previous is None:
             return None
         condition = pack(trial.x[None], trial.action[None]).to(self._device)
-        prior = require_support(self._prior)
+        prior = require_support(self._prior, enumerates=True)
         fault = _fault(network, condition, prior)
         if fault:
             if not required:

@@ -61,7 +61,7 @@ class ProductRounds(ActionRounds):
 
     Args:
         args: Of :class:`.ActionRounds`.
-        posterior: How the belief is sampled: "importance", annealed importance
+        posterior: How the belief is sampled: "importance", tempered importance
             sampling; one of sbi's Markov chains, for example "slice_np_vectorized" or
             "nuts_pyro"; or "kde", the paper's: draws of the belief before times the
             last trial's factor, as a kernel density estimate.

@@ -45,7 +45,6 @@ def independent(prior: Distribution) -> Independent:
     [
         (independent(Poisson(3 * TWO)), "continuous parameters; got a discrete one"),
         (independent(Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
-        (PAYLOAD, "got a discrete one, BoxUniform, Bernoulli"),
         (OneHotCategorical(TWO), "got a discrete one, OneHotCategorical"),
         (Dirichlet(TWO), "may vary one by one; got Dirichlet"),
         (Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
@@ -57,6 +56,14 @@ def test_what_is_discrete_or_tied_is_refused(prior, message):
         require_support(prior)
     with pytest.raises(ValueError, match=message):
         campaign(prior)
+
+
+@pytest.mark.parametrize(
+    "options", [{"method": "alhi"}, {"refine": False}, {"max_simulations": 500}]
+)
+def test_what_does_not_refine_refuses_discrete_parameters(options):
+    with pytest.raises(ValueError, match="got a discrete one, BoxUniform, Bernoulli"):
+        campaign(PAYLOAD, **options)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -91,11 +98,6 @@ def test_a_discrete_effect_is_refused():
         Effect.keyword("payload", prior=Bernoulli(0.5))
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=ValueError,
-    reason="discrete parameters are enumerated once one engine infers all beliefs",
-)
 def test_a_payload_on_or_off_has_its_probability():
     def slide(theta, action):
         return action**2 / (2 * 9.81 * theta[:, :1]) * (1 + 0.3 * theta[:, 1:2])
@@ -114,11 +116,12 @@ def scaled(theta, action):
     return theta * action
 
 
-def campaign(prior: Distribution, **options) -> Campaign:
+def campaign(prior: Distribution, method: str = "asbi", **options) -> Campaign:
     return Campaign(
         SimulatorModel(scaled, noise=GaussianNoise(0.2)),
         prior,
         BoxActions([0.5], [2.0]),
+        method=method,
         seed=0,
         options={
             "num_simulations": 300,

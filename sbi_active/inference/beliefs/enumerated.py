@@ -1,0 +1,172 @@
+"""Priors and beliefs some of whose parameters take a few values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import torch
+from sbi.utils import MultipleIndependent
+from torch import Tensor
+from torch.distributions import Distribution, Independent
+from typing_extensions import override
+
+from sbi_active.inference.beliefs.belief import Belief
+
+#: Combinations of values at most: each has a posterior of its own. Half refuses seven
+#: switches, twice takes twice as long.
+MOST_VALUES = 64
+
+
+@dataclass(frozen=True)
+class Enumeration:
+    """A prior as a mixture over the values of its discrete parameters.
+
+    Attributes:
+        places: Columns of theta that are discrete, shape (m,).
+        values: Combinations of their values, shape (k, m).
+        log_prob: Their log prior probabilities, shape (k,).
+        others: Columns of theta that are continuous, shape (d - m,).
+        rest: Prior of these, independent of the discrete ones.
+    """
+
+    places: Tensor
+    values: Tensor
+    log_prob: Tensor
+    others: Tensor
+    rest: Distribution
+
+    @staticmethod
+    def of(prior: Any) -> Enumeration | None:
+        """Return the mixture; None of any other prior than independent parts.
+
+        Some parts must be discrete with finitely many values, and some continuous.
+        """
+        if not isinstance(prior, MultipleIndependent):
+            return None
+        parts = [*prior.dists]
+        sizes = [int(size) for size in prior.dims_per_dist]
+        columns = torch.arange(sum(sizes)).split(sizes)
+        is_discrete = [_values(part) is not None for part in parts]
+        if not any(is_discrete) or all(is_discrete):
+            return None
+        chosen: list[tuple[Tensor, Tensor]] = []
+        for part, size in zip(parts, sizes, strict=True):
+            values = _values(part)
+            if values is not None:
+                rows = torch.tensor([*product(values.tolist(), repeat=size)])
+                chosen.append((rows, part.log_prob(rows).reshape(len(rows), -1).sum(1)))
+        if math.prod(len(rows) for rows, _ in chosen) > MOST_VALUES:
+            return None
+        pairs = [*product(*(zip(*both, strict=True) for both in chosen))]
+        values = torch.stack([torch.cat([row for row, _ in own]) for own in pairs])
+        log_p = torch.stack([torch.stack([p for _, p in own]).sum() for own in pairs])
+        possible = log_p > -torch.inf
+        of = [*zip(parts, columns, is_discrete, strict=True)]
+        continuous = [part for part, _, discrete in of if not discrete]
+        rest = continuous[0]
+        if len(continuous) > 1:
+            rest = MultipleIndependent(continuous, validate_args=False)
+        return Enumeration(
+            torch.cat([c for _, c, discrete in of if discrete]),
+            values[possible],
+            log_p[possible],
+            torch.cat([c for _, c, discrete in of if not discrete]),
+            rest,
+        )
+
+    def filled(self, k: int, theta: Tensor) -> Tensor:
+        """Return parameters (..., d) of continuous ones (..., d - m), combination k."""
+        size = len(self.places) + len(self.others)
+        full = theta.new_empty(*theta.shape[:-1], size)
+        full[..., self.places] = self.values[k].to(theta)
+        full[..., self.others] = theta
+        return full
+
+    def combination(self, theta: Tensor) -> Tensor:
+        """Return the combination of each row (n, d), -1 where it has none, (n,)."""
+        same = (theta[:, None, self.places] == self.values.to(theta)).all(-1)
+        return torch.where(same.any(1), same.float().argmax(1), -1)
+
+
+class EnumeratedBelief(Belief):
+    r"""A mixture over the values of discrete parameters.
+
+    .. math::
+        b(\theta, v) = P(v)\, b_v(\theta), \qquad
+        P(v) \propto p(v) \int p(\theta) \prod_k p(x_k | \theta, v, \xi_k)\, d\theta
+
+    Args:
+        prior: Original prior of all parameters.
+        enumeration: The prior as a mixture.
+        parts: Belief over the continuous parameters of each combination.
+        probability: Probability of each combination, shape (k,).
+
+    Attributes:
+        values: Combinations of the discrete parameters, shape (k, m).
+        probability: Their posterior probabilities, shape (k,).
+    """
+
+    label = "enumerated"
+
+    def __init__(
+        self,
+        prior: Distribution,
+        enumeration: Enumeration,
+        parts: Sequence[Belief],
+        probability: Tensor,
+    ) -> None:
+        super().__init__(prior)
+        self._enumeration, self.parts = enumeration, [*parts]
+        self.values, self.probability = enumeration.values, probability.double()
+
+    def _sample(self, num_samples: int) -> Tensor:
+        return self._mixed(num_samples, lambda part, n: part._sample(n))
+
+    @override
+    def _quick_sample(self, num_samples: int) -> Tensor:
+        return self._mixed(num_samples, lambda part, n: part._quick_sample(n))
+
+    def _mixed(self, num_samples: int, draw: Callable[[Belief, int], Tensor]) -> Tensor:
+        which = torch.multinomial(self.probability, num_samples, replacement=True)
+        drawn = torch.empty(num_samples, *self.event_shape)
+        for k, part in enumerate(self.parts):
+            rows = (which == k).nonzero()[:, 0]
+            if len(rows):
+                own = draw(part, len(rows)).float()
+                drawn[rows] = self._enumeration.filled(k, own)
+        return drawn
+
+    def _log_prob(self, theta: Tensor) -> Tensor:
+        return self._density(theta, lambda part, rows: part.log_prob(rows))
+
+    @override
+    def _smooth_log_prob(self, theta: Tensor) -> Tensor:
+        return self._density(theta, lambda part, rows: part.smooth_log_prob(rows))
+
+    def _density(
+        self, theta: Tensor, log_prob: Callable[[Belief, Tensor], Tensor]
+    ) -> Tensor:
+        which, own = self._enumeration.combination(theta), self._enumeration.others
+        density = torch.full((len(theta),), -torch.inf, dtype=torch.float64)
+        for k, part in enumerate(self.parts):
+            rows = (which == k).nonzero()[:, 0]
+            if len(rows):
+                inside = log_prob(part, theta[rows][:, own]).double()
+                density[rows] = self.probability[k].log() + inside
+        return density
+
+
+def _values(part: Any) -> Tensor | None:
+    """Return the values that each number takes; None of infinitely many."""
+    while isinstance(part, Independent):
+        part = part.base_dist
+    try:
+        if not part.support.is_discrete or not part.has_enumerate_support:
+            return None
+        return part.enumerate_support(expand=False).flatten().float()
+    except NotImplementedError:  # as of batches whose numbers take different values
+        return None
