@@ -30,7 +30,7 @@ beside = ""
     monkeypatch.setattr(readme.table, "__defaults__", (stated,))
     assert main(["table", "readme"]) == 1
     printed = capsys.readouterr()
-    assert printed.out.endswith("| training | 24 | |\n")
+    assert printed.out.endswith("| training | 43 | |\n")
     assert "training: expected ratio at" in printed.err
 
 
