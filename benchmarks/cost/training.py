@@ -6,7 +6,8 @@ The earlier settings beside the default ones, in turn, seed by seed, in one proc
 one thread: CPU seconds of a whole round of a campaign and of its training,
 and the mean of log q(theta | x, action) over fresh rows, nats, of a network that was
 trained on 5,000 rows of the prior. Seeds below 100 served to set the defaults; these
-are others. Writes training.json beside this file.
+are others, though the choice was revised once after ten components had lost on the
+chain here. Writes training.json beside this file.
 """
 
 from __future__ import annotations
