@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import uuid
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -99,16 +100,23 @@ def enumerated(
         assert fault is not None
         raise fault
     mass = torch.tensor(log_mass, dtype=torch.float64)
-    some = Enumeration(
-        enumeration.places,
-        enumeration.values[kept],
-        enumeration.log_prob[kept],
-        enumeration.others,
-        enumeration.rest,
+    is_inflated = torch.tensor([_is_inflated(part) for part in parts])
+    if not bool(is_inflated.all()):
+        # Trials contradict those; evidence under wider noise is no match for the others.
+        mass[is_inflated] = -torch.inf
+    some = replace(
+        enumeration,
+        values=enumeration.values[kept],
+        log_prob=enumeration.log_prob[kept],
     )
     belief = EnumeratedBelief(prior, some, parts, mass.softmax(0))
     belief.diagnostics = _diagnosed(belief, float(mass.logsumexp(0)))
     return belief
+
+
+def _is_inflated(belief: Belief) -> bool:
+    """Return whether trials contradict each other, so that the noise was inflated."""
+    return "noise_inflation" in belief.diagnostics.figures
 
 
 def _diagnosed(belief: EnumeratedBelief, log_evidence: float) -> Diagnostics:

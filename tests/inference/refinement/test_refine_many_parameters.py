@@ -48,6 +48,7 @@ def test_trust_follows_the_error_and_not_the_dimension(num: int, num_histories: 
     divergence, belief = refined(10, num, seed=1, num_histories=num_histories)
     diagnostics = belief.diagnostics
     assert diagnostics.error_nats == pytest.approx(divergence, rel=0.7, abs=0.05)
+    assert diagnostics.trustworthy == (diagnostics.error_nats < 0.1)
     # What is off by more than a tenth of a nat is not to be trusted; the estimate of it
     # errs by a third.
     if not 0.07 < divergence < 0.15:
