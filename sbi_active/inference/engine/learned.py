@@ -19,8 +19,8 @@ from sbi_active.inference.sampling.weights import normalized
 
 Array = NDArray[Any]
 
-#: Settings of :func:`.infer` where a likelihood is cheap. On four modes and on a peak of
-#: six parameters half of the draws, and twice, are as right; twice takes up to 1.5
+#: Settings of :func:`.infer` where a likelihood is cheap. On four modes and on a peak
+#: of six parameters half of the draws, and twice, are as right; twice takes up to 1.5
 #: times as long.
 CHEAP = Settings(
     plenty=1.0,

@@ -102,7 +102,7 @@ def enumerated(
     mass = torch.tensor(log_mass, dtype=torch.float64)
     is_inflated = torch.tensor([_is_inflated(part) for part in parts])
     if not bool(is_inflated.all()):
-        # Trials contradict those; evidence under wider noise is no match for the others.
+        # Evidence under wider noise is not comparable: trials rule these values out.
         mass[is_inflated] = -torch.inf
     some = replace(
         enumeration,
