@@ -25,9 +25,12 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.screening import is_large, linear_models
+from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.missed import beside_misfit
 from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.stand_ins import judged
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit, without
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
@@ -38,9 +41,6 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
-from sbi_active.criticism.screening.by_sensor import BySensor
-from sbi_active.criticism.screening.screening import worth_fitting
-from sbi_active.criticism.screening.stand_ins import judged
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
@@ -178,15 +178,15 @@ class Criticism:
         """Make the models of the trials that are there."""
         model, trials, effects = self._parts
         with stage("a look at the simulator", show_progress=self.show_progress):
-            #: Effects that linear evidence set aside; None where all are fitted.
             parts = model, self.prior, trials.fit, effects
-            self.rivals, self.screening, self._few = worth_fitting(
-                RivalSet(*parts, actions=self.actions, seed=self.seed)
-            )
-        self._fewer = {} if self._few is None else {"num_draws": FEW_DRAWS}
+            self.rivals = RivalSet(*parts, actions=self.actions, seed=self.seed)
+            self.rivals.warm_up = self._warm_up
+            #: Effects that linear evidence set aside; None where all are fitted.
+            self._linear, self.screening = linear_models(self.rivals)
+        self._is_large = is_large(self.rivals.library)
+        self._fewer = {"num_draws": FEW_DRAWS} if self._is_large else {}
         # Each model's held-out errors would take as much as the verdict.
-        self._scored = trials.held_out if self._few is None else None
-        self.rivals.warm_up = self._warm_up
+        self._scored = None if self._is_large else trials.held_out
 
     def misfit(self) -> Misfit | None:
         """Return the models where none explains the trials to the sensor's error.
@@ -195,7 +195,9 @@ class Criticism:
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:
-            self._misfit = find_misfit(self.rivals, self.equivalent(), search=self._few)
+            self._misfit = find_misfit(
+                *(self.rivals, self.equivalent()), search=self._linear
+            )
             if self._misfit is not None and not self.set_aside:
                 self.set_aside = found = self._misfit.outlying()
                 if found:  # they are not to decide what the others say
@@ -204,8 +206,9 @@ class Criticism:
                     self.trials, self._equivalent = without(self.trials, found), None
                     self._look()
                     return self.misfit()
-            if self._few is not None and self._misfit is None:
-                self._by_sensor = BySensor(self._few, self.rivals)
+            if self._linear is not None and self._misfit is None:
+                groups = self.equivalent()
+                self._by_sensor = BySensor(self._linear, self.rivals, groups)
             self._is_searched = True
         return self._misfit
 
@@ -223,7 +226,7 @@ class Criticism:
         It depends on the simulator and the actions, not on what was measured; without
         permitted actions, on those of the trials.
         """
-        if self._few is not None:  # the next action looks for what separates them
+        if self._is_large:  # the next action looks for what separates them
             return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
@@ -254,14 +257,21 @@ class Criticism:
         else:
             detection, groups = self.detect(), self.equivalent()
             if self._by_sensor is not None:
-                tracing = self._by_sensor.traced()
+                tracing = self._by_sensor.traced(
+                    self.actions, compare=not self._is_large
+                )
             else:
                 with self._fitting("verdict, sets of effects fitted"):
                     tracing = trace(
                         self.rivals, detection, groups, actions=self.actions
                     )
             tracing, self._misfit = beside_misfit(
-                tracing, detection, self.rivals, groups, self._scored, search=self._few
+                tracing,
+                detection,
+                self.rivals,
+                groups,
+                self._scored,
+                search=self._linear,
             )
             if self._misfit is not None:
                 self._residuals = None

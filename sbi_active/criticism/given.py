@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.screening.screening import Screening
+from sbi_active.criticism.linear.screening import Screening
 from sbi_active.criticism.thinning import in_words
 
 

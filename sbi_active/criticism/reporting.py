@@ -12,6 +12,7 @@ from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.given import made_given
+from sbi_active.criticism.linear.screening import Screening
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.report.report import Report, build_report
 from sbi_active.criticism.results import (
@@ -22,7 +23,6 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.screening.screening import Screening
 from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.leave_one_out import leave_one_out
 from sbi_active.criticism.steps.missed_trials import outlying_trials

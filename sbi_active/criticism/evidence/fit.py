@@ -25,16 +25,20 @@ class Fit:
         sample: Of its posterior, weighted.
         evidence: What is recorded of it.
         best: Where other trials are predicted from, shape (dim,); None takes the draws.
+        mode: Where it is linear, shape (dim,); None where it was sampled.
     """
 
     rival: Rival
     sample: WeightedDraws
     evidence: Evidence
     best: Array | None = None
+    mode: Array | None = None
 
     @property
     def likeliest(self) -> Array:
         """The mode or the draw of the largest density, shape (1, dim)."""
+        if self.mode is not None:
+            return self.mode[None]
         own = self.sample
         best = own.u[[int(np.argmax(own.weight))]]
         if not isinstance(own, Sampled) or own.found is None:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.processes import Posterior
-from sbi_active.criticism.misfit.search import Search
+from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.steps.evaluation import joined, scores, summary

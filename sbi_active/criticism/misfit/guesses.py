@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sbi_active.criticism.misfit.left_out import leave_out
-from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.rule import predicts_better
-from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.formulas import MARGIN, SAME, TERMS
 from sbi_active.inference.sampling.weights import log_sum_exp

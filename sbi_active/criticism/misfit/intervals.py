@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sbi_active.criticism.misfit.left_out import LeftOut
-from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.processes import WIDTHS, Errors, Posterior, integrated
+from sbi_active.criticism.linear.errors import WIDTHS, Errors, Posterior, integrated
+from sbi_active.criticism.linear.left_out import LeftOut
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.record import traced, with_intervals
 from sbi_active.criticism.misfit.refuted import widened
 from sbi_active.criticism.misfit.rule import PASSES
-from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.results import (
     SCATTER,

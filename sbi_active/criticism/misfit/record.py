@@ -12,9 +12,9 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
+from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.search import Candidate, Search
 from sbi_active.criticism.misfit.guesses import guess_residual
-from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.search import Candidate, Search
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.results import (
     UNEXPLAINED,
@@ -200,7 +200,7 @@ def keep_draws(
         if best is None
         else rival.coordinates.to_z(best[None])[0, : model.own],
     )
-    rivals.fits[key] = Fit(rival, sample, evidence, best)
+    rivals.fits[key] = Fit(rival, sample, evidence, best, model.u)
     return evidence
 
 

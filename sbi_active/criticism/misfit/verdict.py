@@ -18,11 +18,14 @@ from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import FirstLook
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.screening import is_large
+from sbi_active.criticism.linear.search import Candidate, Search
+from sbi_active.criticism.linear.sensor import sensor_error
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance
-from sbi_active.criticism.misfit.left_out import leave_out
-from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.processes import Posterior
 from sbi_active.criticism.misfit.rule import (
     DECISIVE,
     PASSES,
@@ -32,8 +35,6 @@ from sbi_active.criticism.misfit.rule import (
     choose,
     starts,
 )
-from sbi_active.criticism.misfit.search import MAX_EFFECTS, Candidate, Search
-from sbi_active.criticism.misfit.sensor import sensor_error
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
@@ -257,7 +258,6 @@ def find_misfit(
         search: Fits the models, forces of the dictionary among them, whose sets are
             judged elsewhere; None makes one.
     """
-    has_forces = search is not None
     if search is None:
         # Where it is known not to be the sensor's error there is nothing to tell apart.
         sensor = sensor_error(rivals, needs_time=not is_known)
@@ -273,8 +273,8 @@ def find_misfit(
     search.fit_larger()
     if not is_known:
         misses = _misses(search)
-        most = MAX_EFFECTS if misses else 1
-        if (has_forces and not misses) or _is_one_trial(search, most):
+        most = search.settings.max_effects if misses else 1
+        if (is_large(rivals.library) and not misses) or _is_one_trial(search, most):
             return None
 
     standard = standard_errors(search)
@@ -343,18 +343,18 @@ def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
 
 
 def _misses(
-    search: Search, use: NDArray[np.bool_] | None = None, most: int = MAX_EFFECTS
+    search: Search, use: NDArray[np.bool_] | None = None, most: int | None = None
 ) -> bool:
     """Return whether even the best model gains by a residual process.
 
     Args:
         search: Has fitted the models.
         use: Parts of the trials that count; None for all.
-        most: Effects of the models that count.
+        most: Effects of the models that count; None for all.
     """
     best_sensor = best_process = -np.inf
     for key, c in search.found.items():
-        if len(key.effects) > most:
+        if most is not None and len(key.effects) > most:
             continue
         p: Posterior = c.posterior
         if use is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
@@ -29,6 +28,7 @@ NUM_DRAWS = 32
 
 def near_aliases(
     rivals: RivalSet,
+    log_z: Mapping[str, float],
     actions: ActionSpace | None,
     known: Sequence[frozenset[str]] = (),
 ) -> tuple[frozenset[str], ...]:
@@ -44,7 +44,8 @@ def near_aliases(
     They are not equivalent: repeated trials, or stronger data, tell them apart.
 
     Args:
-        rivals: The models, with the evidence of each effect.
+        rivals: The models.
+        log_z: Evidence of each effect alone, nats.
         actions: The permitted ones; None compares on the trials at hand.
         known: Groups that are listed already.
 
@@ -54,8 +55,7 @@ def near_aliases(
     effects = [n for n, e in rivals.effects.items() if e.hook != "noise"]
     if not effects:
         return ()
-    log_z = {name: log_evidence(rivals, ModelKey((name,)))[0] for name in effects}
-    best = max(log_z.values())
+    best = max(log_z[name] for name in effects)
     likely = [name for name in effects if log_z[name] > best - THRESHOLD]
     if len(likely) < 2:
         return ()

@@ -126,11 +126,12 @@ def trace(
         verdict = _verdict(p, equivalent, alarm=detection.alarm)
         if verdict == process and rest > alone:
             beside = found
-    p = _beside_imitations(p)
+    p = beside_imitations(p)
     near = equivalent_effects(rivals, None) if compare else ()
     aliases = ()
     if compare and detection.alarm:
-        aliases = near_aliases(rivals, actions, [*equivalent, *near])
+        singles = {n: log_z[ModelKey((n,))] for n in rivals.effects}
+        aliases = near_aliases(rivals, singles, actions, [*equivalent, *near])
     inclusion = {
         name: sum(share for key, share in p.items() if name in key.effects)
         for name in rivals.effects
@@ -167,7 +168,7 @@ def probabilities_of(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     return {keys[i]: float(p[i]) for i in order}
 
 
-def _beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
+def beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     """Return probabilities where a set may owe its fit to something undeclared.
 
     Along a trajectory two effects imitate a force that nobody declared to the sensor's

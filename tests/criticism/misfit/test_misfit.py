@@ -7,8 +7,8 @@ import torch
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit import find_misfit
-from sbi_active.criticism.misfit.search import Search
 from sbi_active.criticism.report.under_misfit import misfit_line
 from sbi_active.criticism.results import ModelKey
 from sbi_active.simulation import AutocorrelatedNoise
@@ -86,7 +86,9 @@ def test_a_misfit_that_passes_for_the_sensor_is_known_once_nothing_explains_it(
     """As correlated errors do, until a process that follows the action is tried."""
 
     def late(rivals, equivalent, *, is_known=False, search=None):
-        return find_misfit(rivals, equivalent, is_known=True) if is_known else None
+        if not is_known:
+            return None
+        return find_misfit(rivals, equivalent, is_known=True, search=search)
 
     monkeypatch.setattr("sbi_active.criticism.criticism.find_misfit", late)
     found = loop(trials(lag=0.12, hidden=0.15))

@@ -141,12 +141,10 @@ def test_a_warm_up_needs_nuisances():
         Criticism(MODEL, PRIOR, trials()[0], effects=[DRAG], warm_up=0.5)
 
 
-def test_without_misfit_what_is_far_behind_is_not_sampled():
+def test_without_misfit_linear_evidence_names_the_effect():
     own, _ = trials(drag=1.2)
     criticism = loop(own)
     tracing = criticism.trace()
     assert (tracing.verdict, tracing.misfit) == ("drag", None)
-    assert next(iter(criticism.rivals.fits)) == ModelKey()
-    assert tracing.evidences["unexplained"].engine == "laplace"
-    assert tracing.evidences["drag"].effective_sample_size >= 50
-    assert criticism.detect().null_cross_check is None  # two searches agree
+    assert {e.engine for e in tracing.evidences.values()} == {"linear"}
+    assert criticism.rivals.simulator.num_simulations < 20_000

@@ -8,10 +8,10 @@ from scipy.stats import multivariate_normal, norm
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.linear.errors import KERNELS, WIDTHS, Errors, integrated
+from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
-from sbi_active.criticism.misfit.left_out import leave_out
-from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.processes import KERNELS, WIDTHS, Errors, integrated
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.misfit.wider_prior import beyond_bounds
 from sbi_active.criticism.results import Evaluation, Tracing
-from sbi_active.criticism.screening.wider_prior import beyond_bounds
 from sbi_active.criticism.steps.influence import unless_refuted, withdrawn
 
 #: Tail probability of the chi-square below which a model is not adopted, on fitted

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.processes import Grams, Posterior
-from sbi_active.criticism.misfit.search import Search
+from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.combinations import log_prior
 
@@ -18,6 +17,39 @@ Array = NDArray[Any]
 
 #: Effects whose Gram matrices are computed together.
 TOGETHER = 12
+
+
+class Fits(Protocol):
+    """Models that were fitted, and columns of effects beside them."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the effects."""
+        ...
+
+    @property
+    def prior(self) -> dict[str, float]:
+        """Log prior probabilities of "none" and each effect."""
+        ...
+
+    @property
+    def errors(self) -> Errors:
+        """That all models share."""
+        ...
+
+    def model(self, key: ModelKey) -> LinearModel:
+        """Return a fitted model."""
+        ...
+
+    def column(
+        self, base: ModelKey, name: str
+    ) -> tuple[LinearModel, NDArray[np.bool_]]:
+        """Return a model with a further effect where it vanishes, and its columns."""
+        ...
+
+    def rms(self, key: ModelKey, u: Array) -> float:
+        """Return the rms residual of a model anywhere, in sensor deviations."""
+        ...
 
 
 class Library:
@@ -33,18 +65,18 @@ class Library:
 
     def __init__(
         self,
-        search: Search,
+        search: Fits,
         base: ModelKey = ModelKey(),  # noqa: B008  (frozen)
         names: Sequence[str] | None = None,
     ) -> None:
         self.search, self.base = search, base
         every = [n for n in search.names if n not in base.effects]
         self.names = every if names is None else [*names]
-        self.fitted = search.found[base].model
+        self.fitted = search.model(base)
         self._singles: dict[str, LinearModel] = {}
         self._blocks: dict[str, NDArray[np.bool_]] = {}
         for name in self.names:
-            self._singles[name], self._blocks[name] = search.beside(base, name)
+            self._singles[name], self._blocks[name] = search.column(base, name)
         self._grams: Grams | None = None
         self._places: dict[str, NDArray[np.intp]] = {}
         self._found: dict[tuple[str, ...], Posterior] = {}
@@ -58,10 +90,9 @@ class Library:
             dim += width
         self._grams = self.search.errors.grams(self._model(names).rows)
 
-    def column(self, name: str) -> tuple[Array, Array]:
-        """Return phi where an effect's column was taken, and that, (k,) and (N, k)."""
-        model, own = self._singles[name], self._blocks[name]
-        return model.u[own], model.jacobian[:, own]
+    def beside(self, name: str) -> tuple[LinearModel, NDArray[np.bool_]]:
+        """Return the model with one effect where it vanishes, and its columns."""
+        return self._singles[name], self._blocks[name]
 
     def look_at_each(self) -> None:
         """Compute the posterior of each effect alone, several at a time."""

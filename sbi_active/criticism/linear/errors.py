@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
 from sbi_active.criticism.steps.nuisances import is_first_part
 from sbi_active.inference.sampling.eigen import eigh

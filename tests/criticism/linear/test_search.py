@@ -8,8 +8,8 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.misfit.search import Search
-from sbi_active.criticism.misfit.sensor import sensor_error
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.linear.sensor import sensor_error
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS as OSCILLATOR
@@ -81,7 +81,7 @@ def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
     search = Search(loop.rivals, sensor[0], log_priors(loop.effects, ()), sensor[1])
     search.fit_singles()
     part = search.found[ModelKey(("cubic",))].model
-    descend, faint, again = search._descend, search._faint, []
+    descend, faint, again = search._secant, search._faint, []
 
     def lost(rival, u, *arguments, **options):
         if again:
@@ -96,7 +96,7 @@ def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
         assert (u[search.columns(key, parent)] == part.u).all()
         return u
 
-    monkeypatch.setattr(search, "_descend", lost)
+    monkeypatch.setattr(search, "_secant", lost)
     monkeypatch.setattr(search, "_faint", from_its_part)
     both = search.fit_set(ModelKey(("cubic", "friction"))).model
     assert again == [ModelKey(("cubic",))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +11,12 @@ from scipy.stats import chi2
 
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.least_squares import within
 
 Array = NDArray[Any]
 
+#: Share of the squares that is added to them, so that a flat direction is solved for.
+RIDGE = 1e-9
 #: Precision of the Gaussian that stands for a prior between two bounds: wide enough
 #: to leave parameters alone that the trials determine.
 FLAT = 0.3
@@ -68,6 +70,30 @@ class LinearModel:
         freedom = max(len(self.residual) - len(self.u), 1)
         return square, freedom, float(chi2.sf(square, freedom))
 
+    @property
+    def promised(self) -> float:
+        """By how much its linear optimum lowers the sum of squares.
+
+        In sensor variances, with the residual's own size as that of the errors.
+        """
+        scale = max(self.rms, 1.0) ** 2
+        bounded = np.isfinite(self.low) & np.isfinite(self.high)
+        weight = np.where(bounded, 0.0, 1.0) / self.sd**2
+        normal = self.jacobian.T @ self.jacobian / scale + np.diag(weight)
+        normal = normal + np.diag(RIDGE * (1 + np.diag(normal)))
+        off = (self.u - self.center) * weight
+        gradient = self.jacobian.T @ self.residual / scale + off
+        at = self.u[None]
+        step = within(normal[None], gradient[None], at, self.low, self.high)
+        move = np.clip(self.u - step[0], self.low, self.high) - self.u
+
+        def cost(r: Array, u: Array) -> float:
+            prior = (weight * (u - self.center) ** 2).sum()
+            return float((r**2).sum() / scale + prior)
+
+        after = cost(self.residual + self.jacobian @ move, self.u + move)
+        return (cost(self.residual, self.u) - after) * scale
+
     def widened(self, width: float) -> Array:
         """Return the prior's deviations with effects on another scale, shape (d,)."""
         return np.where(self.scaled, width * self.sd, self.sd)
@@ -114,22 +140,22 @@ def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> Line
 
 
 def enlarged(
-    model: LinearModel, rival: Rival, changes: Sequence[tuple[Array, Array]]
+    model: LinearModel,
+    rival: Rival,
+    new: NDArray[np.bool_],
+    values: Array,
+    columns: Array,
 ) -> LinearModel:
-    """Return a model with further effects, at the point where they vanish.
+    """Return a model with further coordinates.
 
     Args:
-        model: Without them.
-        rival: With them, in the order of ``changes`` among its coordinates.
-        changes: Of each effect of the rival that the model lacks, the place of its phi
-            among the rival's coordinates with its value there, shape (2, k), and the
-            derivative of the residual, shape (N, k).
+        model: Linear, without them.
+        rival: With them.
+        new: Which of the rival's coordinates they are, bool, shape (d,).
+        values: Of the new ones, shape (k,).
+        columns: Derivatives of the residual by them, shape (N, k).
     """
-    new = {int(j) for place, _ in changes for j in place[0]}
-    old = [j for j in range(rival.dim) if j not in new]
     u, jacobian = np.empty(rival.dim), np.empty((len(model.residual), rival.dim))
-    u[old], jacobian[:, old] = model.u, model.jacobian
-    for place, columns in changes:
-        at = place[0].astype(int)
-        u[at], jacobian[:, at] = place[1], columns
+    u[~new], jacobian[:, ~new] = model.u, model.jacobian
+    u[new], jacobian[:, new] = values, columns
     return with_prior(rival, u, model.residual, jacobian)

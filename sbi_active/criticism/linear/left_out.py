@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.misfit.linear import LinearModel
-from sbi_active.criticism.misfit.processes import Errors
+from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.inference.sampling.least_squares import within
 
 Array = NDArray[Any]

@@ -10,8 +10,8 @@ from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.misfit.wider_prior import beyond_bounds
 from sbi_active.criticism.results import NONE, UNEXPLAINED
-from sbi_active.criticism.screening.wider_prior import beyond_bounds
 
 SENSOR = 0.005
 SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])

@@ -6,7 +6,7 @@ from torch.distributions import HalfNormal, Normal
 
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.screening.screening import MANY, screen, worth_fitting
+from sbi_active.criticism.linear.screening import MANY, linear_models
 from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, TIMES, trials
 
@@ -43,7 +43,8 @@ def rivals(own, library=LIBRARY):
 def screened():
     models = rivals(trials(lag=0.1, friction=0.1))
     before = models.simulator.num_simulations
-    return screen(models), models.simulator.num_simulations - before
+    _, found = linear_models(models)
+    return found, models.simulator.num_simulations - before
 
 
 def test_members_of_the_true_pair_are_kept(screened):
@@ -53,7 +54,7 @@ def test_members_of_the_true_pair_are_kept(screened):
     assert {*found.kept} | {*found.behind} == {e.name for e in LIBRARY}
     assert not {*found.kept} & {*found.behind}
     assert list(found.behind.values()) == sorted(found.behind.values())
-    assert num < 8_000  # one bare fit and a column each
+    assert num < 8_000  # one bare fit, a column each, and fits of the best
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,9 @@ def test_what_was_set_aside_counts_in_the_prior_and_is_said(large):
 
 
 def test_a_small_library_is_fitted_as_a_whole():
-    assert screen(rivals(trials(), EFFECTS)) is None
+    search, found = linear_models(rivals(trials(), EFFECTS))
+    assert found is None
+    assert search.names == [e.name for e in EFFECTS]
 
 
 @pytest.mark.slow
@@ -85,9 +88,12 @@ def test_clean_trials_of_a_large_library_say_none():
     assert loop.trace().verdict == "none"
 
 
-def test_a_large_library_takes_few_simulations_but_for_effects_on_the_noise(large):
+def test_a_large_library_takes_few_simulations(large):
     assert large[1] < 8_000
+
+
+def test_effects_on_the_noise_are_never_set_aside():
     # No column tells of them.
     alone = Effect("noise", hook="noise", prior=HalfNormal(1.0), null=0.0, apply=louder)
-    _, _, few = worth_fitting(rivals(trials(bias=0.05), [*LIBRARY, alone]))
-    assert few is None
+    _, found = linear_models(rivals(trials(bias=0.05), [*LIBRARY, alone]))
+    assert "noise" in found.kept

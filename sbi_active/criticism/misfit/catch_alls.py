@@ -11,30 +11,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.misfit.processes import Errors, integrated
-from sbi_active.criticism.misfit.search import Candidate
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
+from sbi_active.criticism.linear.errors import Errors, integrated
+from sbi_active.criticism.linear.search import Candidate
+from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
 
-def log_scatter(bare: Candidate, errors: Errors, noise: NoiseGrid) -> float:
-    """Return the log evidence of the bare model under larger noise.
+def log_scaled(bare: Candidate, errors: Errors, scales: Array) -> Array:
+    """Return the log evidence of the bare model under other sizes of the noise, (s,).
 
     Args:
         bare: The model.
-        errors: That its Gram matrices are of.
-        noise: Whose scales and their probabilities are taken.
+        errors: With the sensor's error.
+        scales: Factors on it, one a number, shape (s, N), or one for all, (s, 1).
     """
-    n, grams = len(errors.cells), bare.grams
-    gram, log_det = grams.gram[:n].sum(1), grams.log_det[:n].sum(1)
-    count = grams.count.sum()
-    found = []
-    for scale, log_p in zip(noise.scales, noise.log_scale_prior, strict=True):
-        log_z = _log_evidence(bare, gram / scale**2, log_det, count)
-        found.append(log_z - count * np.log(scale) + errors.log_cells + log_p)
-    return float(log_sum_exp(np.concatenate(found)))
+    scales = np.broadcast_to(scales, (len(scales), len(bare.model.residual)))
+    found = np.empty((len(scales), len(errors.cells)))
+    for i, cell in enumerate(errors.cells):
+        white = cell.whiten(bare.model.rows.T / scales[:, None])  # (s, k, N)
+        gram = white @ np.swapaxes(white, 1, 2)
+        log_det = 2 * (cell.log_scale + np.log(scales).sum(1))
+        found[:, i] = _log_evidence(bare, gram, log_det, scales.shape[1])
+    return log_sum_exp(found + errors.log_cells, axis=1)
 
 
 def log_one_part(bare: Candidate, errors: Errors) -> Array:

@@ -7,18 +7,29 @@ family are alternatives of one cause: the family is chosen first, then its form.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
+from sbi_active.actions import ActionSpace
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.misfit.processes import Posterior
+from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.misfit.catch_alls import (
+    log_one_part,
+    log_scaled,
+    log_without,
+)
 from sbi_active.criticism.misfit.record import alike, detection_of, keep_draws
 from sbi_active.criticism.results import (
     CATCH_ALLS,
+    NONE,
     OUTLIER,
     SCATTER,
     UNEXPLAINED,
@@ -28,12 +39,6 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.noise_grid import scattered
-from sbi_active.criticism.screening.catch_alls import (
-    log_one_part,
-    log_scatter,
-    log_without,
-)
-from sbi_active.criticism.screening.few_simulations import FewSimulations
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import (
     LEVEL,
@@ -41,9 +46,12 @@ from sbi_active.criticism.steps.detection import (
     THRESHOLD,
     alternatives,
 )
+from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
+from sbi_active.criticism.steps.near_aliases import near_aliases
 from sbi_active.criticism.steps.tracing import (
     RESCALED,
+    beside_imitations,
     credible_set,
     estimate_of,
     likeliest_first,
@@ -65,20 +73,32 @@ class BySensor:
     Attributes:
         search: Its models.
         rivals: They are made of.
+        equivalent: Groups of effects that no permitted action separates.
     """
 
-    search: FewSimulations
+    search: Search
     rivals: RivalSet
+    equivalent: Sequence[frozenset[str]] = ()
     _log_z: dict[ModelKey, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.search.fit_singles()
         errors, log_z = self.search.errors, self._log_z
         found = self.search.found
         log_z |= {key: c.posterior.log_sensor for key, c in found.items()}
         bare = found[ModelKey()]
         log_z[ModelKey(error=UNEXPLAINED)] = bare.posterior.log_process
         noise = scattered(self.rivals.noise)
-        log_z[ModelKey(error=SCATTER)] = log_scatter(bare, errors, noise)
+        scaled = log_scaled(bare, errors, noise.scales[:, None])
+        log_z[ModelKey(error=SCATTER)] = float(
+            log_sum_exp(scaled + noise.log_scale_prior)
+        )
+        # No column tells of effects on the noise alone, whose evidence is sampled.
+        noisy = [n for n, e in self.rivals.effects.items() if e.hook == "noise"]
+        if noisy:
+            shift = bare.posterior.log_sensor - log_evidence(self.rivals)[0]
+            for key in (ModelKey((n,)) for n in noisy):
+                log_z[key] = shift + log_evidence(self.rivals, key)[0]
         self._one_part = np.empty(0)
         if errors.is_by_trial:
             self._one_part = log_one_part(bare, errors)
@@ -107,10 +127,22 @@ class BySensor:
         """Return whether the bare model misses the trials."""
         level = LEVEL if self.rivals.has_known_noise else 0.0
         log_b = self._log_bayes_factor(self._log_z)
-        return detection_of(self.search.found[ModelKey()], log_b, level)
+        found = detection_of(self.search.found[ModelKey()], log_b, level)
+        noise = self.rivals.model.noise
+        if noise is None or noise.posterior is not None or self.rivals.roughness.any():
+            return found
+        least, freedom = found.chi_square, found.degrees_of_freedom
+        p = float(chi2.cdf(least, freedom))
+        return replace(found, least_chi_square=least, lower_p_value=p)
 
-    def traced(self) -> Tracing:
-        """Return which effects the trials point to, and record the models' draws."""
+    def traced(self, actions: ActionSpace | None, *, compare: bool) -> Tracing:
+        """Return which effects the trials point to, and record the models' draws.
+
+        Args:
+            actions: The permitted ones, for what they hardly separate.
+            compare: Whether to look for effects that are nearly the same over them, and
+                for those that the trials do not separate.
+        """
         rivals, found, detection = self.rivals, self.search.found, self.detected()
         log_z = dict(self._log_z)
         if not detection.alarm:
@@ -118,7 +150,7 @@ class BySensor:
         log_p = self._log_p(log_z)
         verdict = self._verdict(log_p) if detection.alarm else ModelKey()
         beside: tuple[str, ...] = ()
-        if verdict.effects and found[verdict].model.chi_square[2] < REFUTED:
+        if self._predicting(verdict) and found[verdict].model.chi_square[2] < REFUTED:
             process = ModelKey(error=UNEXPLAINED)
             both = found[verdict].posterior.log_process, log_z[process]
             log_z[process] = float(np.logaddexp(*both) - np.log(2))
@@ -126,7 +158,7 @@ class BySensor:
             if self._verdict(log_p) == process and both[0] > both[1]:
                 beside = verdict.effects
             verdict = self._verdict(log_p)
-        p = probabilities_of(log_p)
+        p = beside_imitations(probabilities_of(log_p))
         probabilities = {str(key): share for key, share in p.items()}
         inclusion = {
             name: sum(share for key, share in p.items() if name in key.effects)
@@ -148,16 +180,25 @@ class BySensor:
             for name, effect in rivals.effects.items()
             if name in evidences
         )
-        fitted = found[ModelKey(verdict.effects)]
+        near, aliases = (), ()
+        if compare:
+            near = equivalent_effects(rivals, None)
+        if compare and detection.alarm:
+            known = [*self.equivalent, *near]
+            singles = {n: log_z[ModelKey((n,))] for n in rivals.effects}
+            aliases = near_aliases(rivals, singles, actions, known)
+        elif detection.alarm:
+            aliases = self._aliases(log_z)
+        fitted = found[ModelKey(self._predicting(verdict))]
         tracing = Tracing(
             verdict=str(verdict),
             chosen=verdict.effects,
             probabilities=probabilities,
             inclusion=inclusion,
             credible_set=credible_set(probabilities),
-            equivalent=(),
-            near=(),
-            aliases=self._aliases(log_z) if detection.alarm else (),
+            equivalent=(*self.equivalent,),
+            near=near,
+            aliases=aliases,
             estimates=estimates,
             evidences=evidences,
             robust=self._is_robust(verdict),
@@ -173,7 +214,7 @@ class BySensor:
         return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 
     def _log_bayes_factor(self, log_z: dict[ModelKey, float]) -> float:
-        weights = alternatives([e.name for e in self.rivals.library], ())
+        weights = alternatives([e.name for e in self.rivals.library], self.equivalent)
         parts = [
             log_z[ModelKey.of(name)] + float(np.log(w))
             for name, w in weights.items()
@@ -214,21 +255,34 @@ class BySensor:
         return max(likeliest, key=likeliest.__getitem__)
 
     def _families(self, key: ModelKey) -> frozenset[str]:
-        """Return what a set is about: families of forces, and other effects."""
+        """Return what a set is about: families of forces, groups of what is alike."""
         effects = [self.rivals.effects[name] for name in key.effects]
-        return frozenset(str(e.family) if is_force(e) else e.name for e in effects)
+        groups = [group for group in self.equivalent if NONE not in group]
+        return frozenset(
+            str(e.family)
+            if is_force(e)
+            else min(next((g for g in groups if e.name in g), {e.name}))
+            for e in effects
+        )
+
+    def _predicting(self, key: ModelKey) -> tuple[str, ...]:
+        """Return the effects of a set that change the prediction."""
+        return tuple(n for n in key.effects if n in self.search.names)
 
     def _recorded(self, key: ModelKey, log_z: float) -> Evidence:
         if key.error is not None:
             own = self._recorded(ModelKey(), self._log_z[ModelKey()])
             return replace(own, key=key, log_evidence=log_z)
+        if key not in self.search.found:  # on the noise, sampled
+            return replace(self.rivals.fit(key).evidence, log_evidence=log_z)
         c = self.search.found[key]
         use = np.ones(self.search.errors.num_folds, bool)
         posterior = self.posterior(key, use)
-        return keep_draws(self.rivals, c.model, posterior.mean, posterior.cov, log_z)
+        own = keep_draws(self.rivals, c.model, posterior.mean, posterior.cov, log_z)
+        return replace(own, log_evidence=log_z)
 
     def _aliases(self, log_z: dict[ModelKey, float]) -> tuple[frozenset[str], ...]:
-        names = [n for n in self.search.names if ModelKey((n,)) in log_z]
+        names = [n for n in self.search.names if ModelKey((n,)) in self.search.found]
         return alike(self.search, {n: log_z[ModelKey((n,))] for n in names})
 
     def _is_robust(self, verdict: ModelKey) -> bool:
@@ -266,7 +320,12 @@ class BySensor:
         """Return the trials without which the data do not point to some effects."""
         errors, found = self.search.errors, self.search.found
         log_b = self._log_z[key] - self._log_z[ModelKey()]
-        if not key.effects or log_b < THRESHOLD or not errors.is_by_trial:
+        if (
+            not key.effects
+            or key not in found
+            or log_b < THRESHOLD
+            or not errors.is_by_trial
+        ):
             return ()
         own, bare = (log_without(found[k], errors) for k in (key, ModelKey()))
         trials = np.unique(self.rivals.measurements.trial)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from sbi_active.criticism.misfit.left_out import bounded, leave_out
-from sbi_active.criticism.misfit.linear import LinearModel
+from sbi_active.criticism.linear.left_out import bounded, leave_out
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 
 

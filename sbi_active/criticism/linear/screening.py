@@ -1,0 +1,133 @@
+"""Which effects of a large library are worth a fit: linear evidence of one Jacobian.
+
+A fit of an effect takes a dozen simulations of the trials, its column one. With the
+bare model's best fit and a column of every effect the evidence of all singles and pairs
+is linear algebra; effects that are in none of the best are set aside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from itertools import combinations
+
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.linear.library import Library
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.linear.sensor import sensor_error
+from sbi_active.criticism.steps.tracing import log_priors
+
+#: Effects of which all are fitted.
+MANY = 24
+#: Effects that are kept: the best alone, members of the best pairs, and those whose
+#: linear optimum leaves the smallest residual of the simulator itself.
+BEST, NUM_PAIRS, CLOSEST = 8, 6, 4
+#: Effects whose linear optimum is simulated, and whose pairs are compared.
+TRIED, PAIRED = 20, 30
+
+
+def is_large(effects: Collection[Effect]) -> bool:
+    """Return whether a library is too large to look at all that it may confuse.
+
+    It has more than 24 effects, or forces of the dictionary, which add up to anything.
+    """
+    return len(effects) > MANY or any(map(is_force, effects))
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What linear evidence says of a library.
+
+    Attributes:
+        kept: Names of the effects that are worth a fit, in the library's order.
+        behind: Nats by which each effect that was set aside is behind the best set,
+            alone or in a pair that is better than either member, nearest first.
+    """
+
+    kept: tuple[str, ...]
+    behind: dict[str, float]
+
+
+def linear_models(rivals: RivalSet) -> tuple[Search | None, Screening | None]:
+    """Return linear models of the trials, and which effects were set aside.
+
+    Prior probabilities stay those of the whole library: what was looked at and set
+    aside counts.
+
+    Args:
+        rivals: The models, with all effects; what is set aside leaves them.
+
+    Returns:
+        None for models where the size of the sensor's error is not declared, x has no
+        time axis, or the simulator is random or jumps; None for a screening where all
+        effects are to be fitted.
+    """
+    sensor = sensor_error(rivals)
+    if sensor is None:
+        return None, None
+    unit, cells = sensor
+    search = Search(rivals, unit, log_priors(rivals.library, ()), cells)
+    found = None
+    if len(rivals.effects) > MANY:
+        search.library.look_at_each()
+        found = _best_of(search.library, rivals.effects)
+    if found is None:
+        return search, None
+    found = _with_kin(found, search)
+    rivals.effects = {n: rivals.effects[n] for n in found.kept}
+    return search, found if found.behind else None
+
+
+def _with_kin(found: Screening, search: Search) -> Screening:
+    """Return what is fitted, with all forms of a family where none explains.
+
+    Far from a fit a Jacobian tells the family sooner than the form.
+    """
+    search.restrict(found.kept)
+    search.fit_singles()
+    effects = search.rivals.effects
+    keys = [k for k in search.found if k.effects]
+    if search.explains or not keys:
+        return found
+    closest = min(keys, key=lambda k: search.found[k].model.rms)
+    family = effects[closest.effects[0]].family
+    if not is_force(effects[closest.effects[0]]):
+        return found
+    kin = {n for n, e in effects.items() if e.family == family} - {*found.kept}
+    kept = tuple(n for n in effects if n in {*found.kept, *kin})
+    search.restrict(kept)
+    search.fit_singles()
+    return Screening(kept, {n: v for n, v in found.behind.items() if n not in kin})
+
+
+def _best_of(linear: Library, every: Collection[str]) -> Screening | None:
+    """Return which effects of a library are worth a fit; None for all."""
+    singles = {n: linear.score((n,)) for n in linear.names}
+    ranked = sorted(singles, key=singles.__getitem__)[::-1]
+    best = dict(singles)
+    pairs: dict[tuple[str, ...], float] = {}
+    paired = [n for n in linear.names if n in ranked[:PAIRED]]
+    linear.prepare(paired)
+    for pair in combinations(paired, 2):
+        value = linear.score(pair)
+        if value > max(singles[name] for name in pair):
+            pairs[pair] = value
+            for name in pair:
+                best[name] = max(best[name], value)
+    kept = {*ranked[:BEST]}
+    for pair in sorted(pairs, key=pairs.__getitem__)[::-1][:NUM_PAIRS]:
+        kept.update(pair)
+    left = {n: linear.remains(n) for n in ranked[:TRIED]}
+    kept.update(sorted(left, key=left.__getitem__)[:CLOSEST])
+    # Effects on the noise change no prediction, and no column tells of them.
+    kept.update(n for n in every if n not in singles)
+    top = max(best.values())
+    behind = {n: top - v for n, v in best.items() if n not in kept}
+    if not behind:
+        return None
+    return Screening(
+        tuple(n for n in every if n in kept),
+        dict(sorted(behind.items(), key=lambda item: item[1])),
+    )

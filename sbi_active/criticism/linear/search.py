@@ -1,0 +1,482 @@
+"""Fits of the bare model and of sets of effects, a dozen simulations each.
+
+A fit begins with a step to the linear optimum, by the derivatives of a smaller model
+and a column of each further effect, follows secants, and ends with derivatives at its
+own best fit, which its evidence rests on. Only sets that linear evidence puts near the
+front are fitted: all single effects, the pairs that look best beside the bare model or
+beside one of the best single effects, and larger sets grown from the best smaller ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
+from sbi_active.criticism.linear.left_out import LeftOut, leave_out
+from sbi_active.criticism.linear.library import Library
+from sbi_active.criticism.linear.model import LinearModel, enlarged, linearize
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.error_models import NoiseCell
+from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.steps.combinations import log_prior
+from sbi_active.inference.sampling.least_squares import descend
+from sbi_active.seeding import derive_seed
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitSettings:
+    """How much is spent on fits.
+
+    Attributes:
+        num_starts: Draws of the prior at which the bare model's search begins.
+        num_kept: Searches that go on from there.
+        first: Steps of these searches along secants.
+        num_drawn: Draws of a further effect at which its fit begins, beside its null.
+        num_far: Draws of the prior that are screened for a set with an effect that no
+            number makes vanish: parameters beside it lie far from those without it.
+        num_kept_far: Draws that are kept.
+        secant: Steps along secants between two linearizations.
+        rounds: Linearizations at most.
+        worth: A fall of the sum of squares that is worth another one, in units of the
+            residual's own variance.
+        tried: Deviations of its prior by which a further effect is tried.
+        faint: Share of them that hardly acts.
+        num_bases: Models beside which larger ones are looked for, by each order.
+        num_pairs: Pairs that are fitted.
+        num_larger: Larger sets that are fitted, of each size.
+        max_effects: Effects of a set at most.
+        behind: Nats by which linear evidence puts a larger set behind one that is
+            fitted, so that it is not fitted.
+        passes: Tail probability of a chi-square from which nothing larger than a pair
+            is looked for.
+    """
+
+    num_starts: int = 6
+    num_kept: int = 2
+    first: int = 8
+    num_drawn: int = 3
+    num_far: int = 32
+    num_kept_far: int = 6
+    secant: int = 5
+    rounds: int = 4
+    worth: float = 0.3
+    tried: float = 0.3
+    faint: float = 0.03
+    num_bases: int = 3
+    num_pairs: int = 10
+    num_larger: int = 3
+    max_effects: int = 4
+    behind: float = 10.0
+    passes: float = 0.01
+
+
+@dataclass
+class Candidate:
+    """A model that was fitted.
+
+    Attributes:
+        model: Linearized at its best fit.
+        grams: Of its rows.
+        posterior: Under the shared errors.
+        left: Its errors on left-out parts of the trials.
+        log_prior: Probability of its set of effects, nats.
+    """
+
+    model: LinearModel
+    grams: Grams
+    posterior: Posterior
+    left: LeftOut
+    log_prior: float
+
+    @property
+    def log_p(self) -> float:
+        """Unnormalized log posterior probability with a residual process, nats."""
+        return self.log_prior + self.posterior.log_process
+
+    @property
+    def log_p_sensor(self) -> float:
+        """Unnormalized log posterior probability with the sensor's error, nats."""
+        return self.log_prior + self.posterior.log_sensor
+
+    @property
+    def log_p_either(self) -> float:
+        """Unnormalized log posterior probability with either, nats."""
+        return self.log_prior + self.posterior.log_evidence
+
+
+@dataclass
+class Search:
+    """Fits models and keeps them.
+
+    Args:
+        rivals: The models and the trials; smooth.
+        unit: Standard deviation of the sensor, shape (N,).
+        prior: Log prior probabilities of "none" and each effect.
+        cells: The sensor's error alone.
+        settings: How much is spent on fits.
+
+    Attributes:
+        found: Fitted models, the bare one first.
+        errors: That all models share; known after the bare fit.
+        names: Effects that change the prediction, of which sets are fitted.
+    """
+
+    rivals: RivalSet
+    unit: Array
+    prior: dict[str, float]
+    cells: list[NoiseCell]
+    settings: FitSettings = FitSettings()
+    found: dict[ModelKey, Candidate] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        effects = self.rivals.effects.values()
+        self.names = [e.name for e in effects if e.hook != "noise"]
+        self._rivals: dict[ModelKey, Rival] = {}
+        self._library: Library | None = None
+        self._has_larger = False
+        self._seed = derive_seed(self.rivals.seed, "misfit")
+        bare = self._fit_bare()
+        self.errors = Errors(
+            self.rivals.measurements,
+            self.unit,
+            self.cells,
+            largest=bare.rms,
+            warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
+            varying=bare.jacobian[:, bare.trial_of < 0],
+        )
+        self.keep(bare)
+
+    @property
+    def library(self) -> Library:
+        """The bare model with the columns of all effects."""
+        if self._library is None:
+            self._library = Library(self)
+        return self._library
+
+    def model(self, key: ModelKey) -> LinearModel:
+        """Return a fitted model."""
+        return self.found[key].model
+
+    def keep(self, model: LinearModel) -> Candidate:
+        """Record a fitted model with its evidence."""
+        grams = self.errors.grams(model.rows)
+        posterior = self.errors.posterior(model, grams)
+        names = model.key.effects
+        prior = log_prior(names, self.prior) if names else self.prior["none"]
+        left = leave_out(model, self.errors)
+        self.found[model.key] = Candidate(model, grams, posterior, left, prior)
+        return self.found[model.key]
+
+    def restrict(self, names: Iterable[str]) -> None:
+        """Fit sets of some effects alone from now on, in the library's order."""
+        some = {*names}
+        every = self.rivals.library
+        self.names = [e.name for e in every if e.name in some and e.hook != "noise"]
+
+    def fit_singles(self) -> None:
+        """Fit each effect alone, and the bare model from where they end, once."""
+        new = [n for n in self.names if ModelKey((n,)) not in self.found]
+        for name in new:
+            self.fit_set(ModelKey((name,)))
+        if not new:
+            return
+        bare, rival = self.found[ModelKey()].model, self._rival(ModelKey())
+        u = np.array(
+            [
+                self.found[key].model.u[self.columns(key, ModelKey())]
+                for key in self._best(1)
+            ]
+        )
+        square = ((rival.residual(u)[0] / self.unit) ** 2).mean(1)
+        if square.min() < 2 * bare.rms**2:
+            again = self._polished(rival, u[int(np.argmin(square))])
+            if again.rms < bare.rms:
+                self.keep(again)
+
+    def fit_larger(self) -> None:
+        """Fit the sets of several effects that linear evidence puts in front, once."""
+        own, before = self.settings, -np.inf
+        if self._has_larger:
+            return
+        self._has_larger = True
+        for size in range(2, min(own.max_effects, len(self.names)) + 1):
+            bases = self._best(size - 1)
+            if (size > 2 and self.explains) or not bases:
+                break
+            scores: dict[ModelKey, float] = {}
+            for base in [*([ModelKey()] if size == 2 else []), *bases]:
+                for key, value in self._beside(base, size).items():
+                    scores[key] = max(value, scores.get(key, -np.inf))
+            most = own.num_pairs if size == 2 else own.num_larger
+            best = sorted(scores, key=scores.__getitem__)[::-1][:most]
+            sampled = self._sampled(size)
+            for key in dict.fromkeys([*best, *sampled]):
+                least = max(c.log_p_either for c in self.found.values()) - own.behind
+                if key in sampled or scores[key] > least:
+                    self.fit_set(key)
+            new = [
+                c.log_p_either for k, c in self.found.items() if len(k.effects) == size
+            ]
+            if max(new, default=-np.inf) < before:
+                break
+            before = max(new)
+
+    def fit_set(self, key: ModelKey) -> Candidate:
+        """Fit one set of effects from its parts, once."""
+        if key not in self.found:
+            known = [p for p in key.parts if p in self.found]
+            # Of a set that sampling found, its effects alone may be what was fitted.
+            alone = [ModelKey((n,)) for n in key.effects]
+            alone = [k for k in alone if k in self.found]
+            self.keep(self._fit(key, known or alone or [ModelKey()]))
+        return self.found[key]
+
+    def likeliest(self) -> str | None:
+        """Return the effect that alone is likeliest given the sensor's error."""
+
+        def log_p(name: str) -> float:
+            return self.found[ModelKey((name,))].log_p_sensor
+
+        return max(self.names, key=log_p, default=None)
+
+    @property
+    def explains(self) -> bool:
+        """Whether a model leaves no more than the sensor's error."""
+        least = self.settings.passes
+        return any(c.model.chi_square[2] >= least for c in self.found.values())
+
+    def columns(self, key: ModelKey, part: ModelKey) -> NDArray[np.bool_]:
+        """Return the coordinates of a model that one with fewer effects has."""
+        rival = self._rival(key)
+        keep = np.ones(rival.dim, dtype=bool)
+        for name in {*key.effects} - {*part.effects}:
+            keep[rival.columns()[name]] = False
+        return keep
+
+    def column(
+        self, base: ModelKey, name: str
+    ) -> tuple[LinearModel, NDArray[np.bool_]]:
+        """Return a model with a further effect where it vanishes, and its columns.
+
+        A chord and no tangent: many effects are flat at their null.
+        """
+        key = self._joined(base, [name])
+        rival, model = self._rival(key), self.found[base].model
+        null, step = self._null(name)
+        start = np.empty(rival.dim)
+        own = ~self.columns(key, base)
+        start[~own], start[own] = model.u, null
+        where = np.flatnonzero(own)
+        points = np.repeat(start[None], len(where), 0)
+        points[np.arange(len(where)), where] += step
+        r = rival.residual(points)[0] / self.unit
+        slope = ((r - model.residual) / step[:, None]).T
+        return enlarged(model, rival, own, null, slope), own
+
+    def rms(self, key: ModelKey, u: Array) -> float:
+        """Return the rms residual of a model anywhere, in sensor deviations."""
+        r = self._rival(key).residual(u[None])[0] / self.unit
+        return float(np.sqrt(np.mean(r**2)))
+
+    # Which sets are worth a fit.
+
+    def _best(self, size: int) -> list[ModelKey]:
+        """Return the sets to add to: the likeliest by either error, the best fits.
+
+        Evidence along an autocorrelated error is for what is fast; what leaves the
+        smallest residual may be slow, and half of what is missing.
+        """
+        keys = [k for k in self.found if len(k.effects) == size]
+        found = self.found
+        orders = [
+            sorted(keys, key=lambda k: -found[k].log_p_sensor),
+            sorted(keys, key=lambda k: -found[k].log_p),
+            sorted(keys, key=lambda k: found[k].model.rms),
+        ]
+        picked = [key for rank in zip(*orders, strict=True) for key in rank]
+        return [*dict.fromkeys(picked)][: self.settings.num_bases]
+
+    def _sampled(self, size: int) -> list[ModelKey]:
+        """Return the sets that sampled evidence puts in front, where there is any."""
+        fits = self.rivals.fits
+        keys = [k for k in fits if len(k.effects) == size and k.error is None]
+        keys = [k for k in keys if {*k.effects} <= {*self.names}]
+        best = sorted(keys, key=lambda k: -fits[k].evidence.log_evidence)
+        return best[: self.settings.num_bases]
+
+    def _beside(self, base: ModelKey, size: int) -> dict[ModelKey, float]:
+        """Return linear log posteriors of larger sets beside a model."""
+        # A free shape beside a form of its kind says nothing, and costs columns.
+        if any(map(self._free, base.effects)):
+            return {}
+        names = [n for n in self.names if n not in base.effects and not self._free(n)]
+        library = Library(self, base, names) if base.effects else self.library
+        library.prepare(names)
+        found = {}
+        for new in combinations(names, size - len(base.effects)):
+            key = self._joined(base, new)
+            if key not in self.found:
+                found[key] = library.score(new)
+        return found
+
+    def _joined(self, base: ModelKey, names: Iterable[str]) -> ModelKey:
+        every = {*base.effects, *names}
+        return ModelKey(tuple(e.name for e in self.rivals.library if e.name in every))
+
+    def _free(self, name: str) -> bool:
+        effect = self.rivals.effects[name]
+        return is_force(effect) and effect.phi_dim > 1
+
+    def _rival(self, key: ModelKey) -> Rival:
+        if key not in self._rivals:
+            self._rivals[key] = self.rivals.rival(key)
+        return self._rivals[key]
+
+    # The fits.
+
+    def _fit_bare(self) -> LinearModel:
+        own, rival = self.settings, self._rival(ModelKey())
+        # Those of the prior predictive, which are simulated already.
+        seed = derive_seed(self.rivals.seed, "spread")
+        u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
+        r = rival.residual(u)[0] / self.unit
+        order = np.argsort((r**2).sum(1))
+        half = own.num_starts // 2
+        far = order[half :: own.num_starts][: own.num_starts - half]
+        u = np.concatenate([u[order[:half]], u[far]])
+        scale = max(float(np.sqrt(np.mean(r[order[0]] ** 2))), 1.0)
+        u, cost = self._secant(rival, u, scale, own.first)
+        some = [self._polished(rival, p) for p in u[np.argsort(cost)[: own.num_kept]]]
+        return min(some, key=lambda model: model.rms)
+
+    def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:
+        """Fit a set of effects from the smaller one that leaves least."""
+        rival = self._rival(key)
+        parent = min(parents, key=lambda p: self.found[p].model.rms)
+        base, model = parent, self.found[parent].model
+        for name in key.effects:
+            if name not in base.effects:
+                model = self._with_column(model, parent, name)
+        scale = max(model.rms, 1.0)
+        known = model.residual[None] / scale, model.jacobian[None] / scale
+        u = np.clip(model.u, model.low, model.high)[None]
+        u, _ = self._secant(rival, u, scale, known=known)
+        fits = [self._polished(rival, u[0])]
+        effects = [self.rivals.effects[n] for n in key.effects]
+        is_far = any(not e.null_phi(1).isfinite().all() for e in effects)
+        if is_far or (len(effects) == 1 and not is_force(effects[0])):
+            # Not linear in phi: it may be far from where its column was taken.
+            u, cost = self._secant(rival, self._starts(key, parent), scale)
+            fits += [self._polished(rival, p) for p in u[np.argsort(cost)[:2]]]
+        best = min(fits, key=lambda fit: fit.rms)
+        if best.rms > self.found[parent].model.rms:
+            again = self._polished(rival, self._faint(key, parent))
+            best = min(best, again, key=lambda fit: fit.rms)
+        return best
+
+    def _with_column(
+        self, model: LinearModel, base: ModelKey, name: str
+    ) -> LinearModel:
+        """Return a model with a further effect, by its column beside another one."""
+        if base.effects or name not in self.library.names:
+            beside, own = self.column(base, name)
+        else:
+            beside, own = self.library.beside(name)
+        key = self._joined(model.key, [name])
+        new = ~self.columns(key, model.key)
+        return enlarged(
+            *(model, self._rival(key), new, beside.u[own], beside.jacobian[:, own])
+        )
+
+    def _starts(self, key: ModelKey, parent: ModelKey) -> Array:
+        """Return where a set's fit begins beside its linear optimum, shape (n, d)."""
+        own, rival, model = self.settings, self._rival(key), self.found[parent].model
+        c, shared = rival.coordinates, self.columns(key, parent)
+        u = c.sample(own.num_drawn, seed=derive_seed(self._seed, str(key)))
+        u[:, shared] = model.u
+        starts = [u]
+        if key in self.rivals.fits:  # what is flat at its null was found by sampling
+            starts.append(self.rivals.fits[key].likeliest[:1])
+        if not all(map(self._has_null, key.effects)):
+            seed = derive_seed(self._seed, str(key), "screened")
+            far = c.sample(own.num_far, seed=seed)
+            square = ((rival.residual(far)[0] / self.unit) ** 2).sum(1)
+            starts.append(far[np.argsort(square)[: own.num_kept_far]])
+        return np.clip(np.concatenate(starts), c.low, c.high)
+
+    def _faint(self, key: ModelKey, parent: ModelKey) -> Array:
+        """Return a fit with further effects that hardly act, shape (d,).
+
+        A set fits no worse than its part. Where it seems to, its fit was lost where an
+        effect as strong as its prior holds the machine still, or throws it about.
+        """
+        rival, model = self._rival(key), self.found[parent].model
+        u, columns = np.empty(rival.dim), rival.columns()
+        u[self.columns(key, parent)] = model.u
+        for name in {*key.effects} - {*parent.effects}:
+            null, step = self._null(name)
+            u[columns[name]] = null + self.settings.faint * step
+        return u
+
+    def _polished(self, rival: Rival, u: Array) -> LinearModel:
+        """Return a model linearized at the best fit from a start near it."""
+        model = linearize(rival, u, self.unit, self.rivals.step)
+        for _ in range(self.settings.rounds - 1):
+            scale = max(model.rms, 1.0)
+            if model.promised < self.settings.worth * scale**2:
+                break
+            known = model.residual[None] / scale, model.jacobian[None] / scale
+            start = np.clip(model.u, model.low, model.high)[None]
+            new, _ = self._secant(rival, start, scale, known=known)
+            if (new[0] == model.u).all():
+                break
+            model = linearize(rival, new[0], self.unit, self.rivals.step)
+        return model
+
+    def _secant(
+        self,
+        rival: Rival,
+        u: Array,
+        scale: float,
+        steps: int | None = None,
+        *,
+        known: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:
+        """Return starts improved along secants, and their cost."""
+        steps = self.settings.secant if steps is None else steps
+        unit = self.unit * scale
+        return descend(
+            *(rival, u, lambda r: r / unit, self.rivals.step, steps),
+            secant=True,
+            known=known,
+        )
+
+    def _null(self, name: str) -> tuple[Array, Array]:
+        """Return the null of an effect among the coordinates, and a step from it."""
+        rival = self._rival(ModelKey((name,)))
+        c, place = rival.coordinates, rival.columns()[name]
+        null = self.rivals.effects[name].null_phi(1).double().numpy()
+        z = c.to_z(np.clip(np.zeros((1, rival.dim)), c.low, c.high))
+        low, high = c.low[place], c.high[place]
+        if np.isfinite(null).all():
+            z[:, place] = null
+            u = c.from_z(z)[0, place]
+        else:  # the end of the prior that is nearest to it
+            u = np.where(null[0] > 0, high, low)
+        tried = self.settings.tried
+        step = np.where(u + tried > high, -tried, tried)
+        return np.clip(u, low, high), step
+
+    def _has_null(self, name: str) -> bool:
+        return bool(self.rivals.effects[name].null_phi(1).isfinite().all())
