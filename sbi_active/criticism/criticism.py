@@ -25,7 +25,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.screening import is_large, linear_models
+from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.missed import beside_misfit
@@ -41,10 +41,10 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
-from sbi_active.criticism.steps.detection import detect
-from sbi_active.criticism.steps.equivalence import equivalent_effects
+from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.criticism.steps.tracing import trace
 from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.progress import stage
@@ -171,7 +171,6 @@ class Criticism:
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
         self._misfit: Misfit | None = None
-        self._by_sensor: BySensor | None = None
         self._is_searched = False
 
     def _look(self) -> None:
@@ -195,9 +194,8 @@ class Criticism:
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:
-            self._misfit = find_misfit(
-                *(self.rivals, self.equivalent()), search=self._linear
-            )
+            groups = self.equivalent()
+            self._misfit = find_misfit(self.rivals, groups, search=self._linear)
             if self._misfit is not None and not self.set_aside:
                 self.set_aside = found = self._misfit.outlying()
                 if found:  # they are not to decide what the others say
@@ -206,9 +204,9 @@ class Criticism:
                     self.trials, self._equivalent = without(self.trials, found), None
                     self._look()
                     return self.misfit()
+            self._found = Sampled(self.rivals, groups)
             if self._linear is not None and self._misfit is None:
-                groups = self.equivalent()
-                self._by_sensor = BySensor(self._linear, self.rivals, groups)
+                self._found = BySensor(self._linear, self.rivals, groups)
             self._is_searched = True
         return self._misfit
 
@@ -226,8 +224,6 @@ class Criticism:
         It depends on the simulator and the actions, not on what was measured; without
         permitted actions, on those of the trials.
         """
-        if self._is_large:  # the next action looks for what separates them
-            return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
                 self._equivalent = equivalent_effects(self.rivals, self.actions)
@@ -236,15 +232,11 @@ class Criticism:
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            misfit, groups = self.misfit(), self.equivalent()
-            if self._by_sensor is not None:
-                self._detection = self._by_sensor.detected()
-            elif misfit is None:
-                num = len(self.rivals.effects) + NUM_OTHERS
-                with self._fitting("models fitted", num):
-                    self._detection = detect(self.rivals, groups)
-            else:
-                self._detection = detected(misfit)
+            misfit = self.misfit()
+            num = len(self.rivals.effects) + NUM_OTHERS
+            with self._fitting("models fitted", num):
+                own = self._found.detected() if misfit is None else detected(misfit)
+            self._detection = own
         return self._detection
 
     def trace(self) -> Tracing:
@@ -256,15 +248,12 @@ class Criticism:
             tracing = traced(misfit, self._scored)
         else:
             detection, groups = self.detect(), self.equivalent()
-            if self._by_sensor is not None:
-                tracing = self._by_sensor.traced(
-                    self.actions, compare=not self._is_large
+            with self._fitting("verdict, sets of effects fitted"):
+                tracing = trace(
+                    *(self._found, detection),
+                    # What separates its effects, the next action looks for.
+                    actions=None if self._is_large else self.actions,
                 )
-            else:
-                with self._fitting("verdict, sets of effects fitted"):
-                    tracing = trace(
-                        self.rivals, detection, groups, actions=self.actions
-                    )
             tracing, self._misfit = beside_misfit(
                 tracing,
                 detection,
@@ -337,8 +326,8 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        linear = self._by_sensor if tracing.misfit is None else self._misfit
-        if linear is not None:
+        linear = self._found if tracing.misfit is None else self._misfit
+        if linear is not None and not isinstance(linear, Sampled):
             return evaluate_linear(linear, trials.fit)
         return evaluate_left_out(
             trials.fit, self._fold, show_progress=self.show_progress
@@ -375,8 +364,9 @@ class Criticism:
             thin=False,
             seed=self.seed,
         )
-        part._equivalent = groups = self.equivalent()
-        return part.rivals, trace(part.rivals, part.detect(), groups, compare=False)
+        part._equivalent = self.equivalent()
+        detection = part.detect()
+        return part.rivals, trace(part._found, detection, compare=False)
 
     def report(
         self,

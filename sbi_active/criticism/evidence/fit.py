@@ -53,16 +53,3 @@ class Fit:
         u = self.sample.u[some]
         residual = self.rival.residual(u, penalized=False)[0]
         return u, self.sample.weight[some], residual
-
-
-@dataclass(frozen=True)
-class FirstLook:
-    """What a search by least squares alone says, before any evidence.
-
-    Attributes:
-        likeliest: The effect that fits best alone; None without any.
-        null_chi_square: Of the bare model's best fit.
-    """
-
-    likeliest: str | None
-    null_chi_square: float

@@ -15,7 +15,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import FirstLook, Fit
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.predicted_before import predicted_before
@@ -83,7 +83,6 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
-        look: What least squares found before; None where nobody looked.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
     """
@@ -110,7 +109,6 @@ class RivalSet:
         seed_of_trials = derive_seed(seed, "trials")
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
-        self.look: FirstLook | None = None
         self.warm_up = 0.0
         self._factors: tuple[Array, Array] | None = None
         self.noise = self.noise_of(self.measurements)

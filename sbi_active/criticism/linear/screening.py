@@ -11,29 +11,19 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
 
-from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_error
+from sbi_active.criticism.steps.equivalence import MANY
 from sbi_active.criticism.steps.tracing import log_priors
 
-#: Effects of which all are fitted.
-MANY = 24
 #: Effects that are kept: the best alone, members of the best pairs, and those whose
 #: linear optimum leaves the smallest residual of the simulator itself.
 BEST, NUM_PAIRS, CLOSEST = 8, 6, 4
 #: Effects whose linear optimum is simulated, and whose pairs are compared.
 TRIED, PAIRED = 20, 30
-
-
-def is_large(effects: Collection[Effect]) -> bool:
-    """Return whether a library is too large to look at all that it may confuse.
-
-    It has more than 24 effects, or forces of the dictionary, which add up to anything.
-    """
-    return len(effects) > MANY or any(map(is_force, effects))
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
-from sbi_active.criticism.linear.left_out import LeftOut, leave_out
+from sbi_active.criticism.linear.candidate import Candidate
+from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel, enlarged, linearize
+from sbi_active.criticism.linear.settings import FitSettings
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 from sbi_active.criticism.rivals.rival import Rival
@@ -32,87 +34,6 @@ from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitSettings:
-    """How much is spent on fits.
-
-    Attributes:
-        num_starts: Draws of the prior at which the bare model's search begins.
-        num_kept: Searches that go on from there.
-        first: Steps of these searches along secants.
-        num_drawn: Draws of a further effect at which its fit begins, beside its null.
-        num_far: Draws of the prior that are screened for a set with an effect that no
-            number makes vanish: parameters beside it lie far from those without it.
-        num_kept_far: Draws that are kept.
-        secant: Steps along secants between two linearizations.
-        rounds: Linearizations at most.
-        worth: A fall of the sum of squares that is worth another one, in units of the
-            residual's own variance.
-        tried: Deviations of its prior by which a further effect is tried.
-        faint: Share of them that hardly acts.
-        num_bases: Models beside which larger ones are looked for, by each order.
-        num_pairs: Pairs that are fitted.
-        num_larger: Larger sets that are fitted, of each size.
-        max_effects: Effects of a set at most.
-        behind: Nats by which linear evidence puts a larger set behind one that is
-            fitted, so that it is not fitted.
-        passes: Tail probability of a chi-square from which nothing larger than a pair
-            is looked for.
-    """
-
-    num_starts: int = 6
-    num_kept: int = 2
-    first: int = 8
-    num_drawn: int = 3
-    num_far: int = 32
-    num_kept_far: int = 6
-    secant: int = 5
-    rounds: int = 4
-    worth: float = 0.3
-    tried: float = 0.3
-    faint: float = 0.03
-    num_bases: int = 3
-    num_pairs: int = 10
-    num_larger: int = 3
-    max_effects: int = 4
-    behind: float = 10.0
-    passes: float = 0.01
-
-
-@dataclass
-class Candidate:
-    """A model that was fitted.
-
-    Attributes:
-        model: Linearized at its best fit.
-        grams: Of its rows.
-        posterior: Under the shared errors.
-        left: Its errors on left-out parts of the trials.
-        log_prior: Probability of its set of effects, nats.
-    """
-
-    model: LinearModel
-    grams: Grams
-    posterior: Posterior
-    left: LeftOut
-    log_prior: float
-
-    @property
-    def log_p(self) -> float:
-        """Unnormalized log posterior probability with a residual process, nats."""
-        return self.log_prior + self.posterior.log_process
-
-    @property
-    def log_p_sensor(self) -> float:
-        """Unnormalized log posterior probability with the sensor's error, nats."""
-        return self.log_prior + self.posterior.log_sensor
-
-    @property
-    def log_p_either(self) -> float:
-        """Unnormalized log posterior probability with either, nats."""
-        return self.log_prior + self.posterior.log_evidence
 
 
 @dataclass
@@ -241,14 +162,6 @@ class Search:
             alone = [k for k in alone if k in self.found]
             self.keep(self._fit(key, known or alone or [ModelKey()]))
         return self.found[key]
-
-    def likeliest(self) -> str | None:
-        """Return the effect that alone is likeliest given the sensor's error."""
-
-        def log_p(name: str) -> float:
-            return self.found[ModelKey((name,))].log_p_sensor
-
-        return max(self.names, key=log_p, default=None)
 
     @property
     def explains(self) -> bool:

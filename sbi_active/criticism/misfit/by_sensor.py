@@ -7,7 +7,7 @@ family are alternatives of one cause: the family is chosen first, then its form.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sbi_active.actions import ActionSpace
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
-from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.errors import Posterior
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.catch_alls import (
@@ -26,17 +24,15 @@ from sbi_active.criticism.misfit.catch_alls import (
     log_scaled,
     log_without,
 )
-from sbi_active.criticism.misfit.record import alike, detection_of, keep_draws
+from sbi_active.criticism.misfit.record import detection_of, keep_draws
 from sbi_active.criticism.results import (
     CATCH_ALLS,
-    NONE,
     OUTLIER,
     SCATTER,
     UNEXPLAINED,
     Detection,
     Evidence,
     ModelKey,
-    Tracing,
 )
 from sbi_active.criticism.rivals.noise_grid import scattered
 from sbi_active.criticism.steps.combinations import log_prior
@@ -44,26 +40,16 @@ from sbi_active.criticism.steps.detection import (
     LEVEL,
     REFUTED,
     THRESHOLD,
-    alternatives,
 )
-from sbi_active.criticism.steps.equivalence import equivalent_effects
-from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
-from sbi_active.criticism.steps.near_aliases import near_aliases
 from sbi_active.criticism.steps.tracing import (
-    RESCALED,
-    beside_imitations,
-    credible_set,
-    estimate_of,
-    likeliest_first,
+    log_bayes_factor,
     log_priors,
     probabilities_of,
+    verdict_of,
 )
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
-
-#: Probability from which a set of several effects is recorded with draws.
-SHOWN = 0.002
 
 
 @dataclass
@@ -118,15 +104,25 @@ class BySensor:
         use = np.arange(self.search.errors.num_folds) != fold
         found = self.search.found
         log_z = {key: self.posterior(key, use).log_sensor for key in found}
-        log_b = self._log_bayes_factor(log_z)
+        log_b = log_bayes_factor(log_z, self)
         if log_b < THRESHOLD and self.detected().p_value > LEVEL:
             return ModelKey()
-        return self._verdict(self._log_p(log_z))
+        prior = log_priors(self.rivals.library, ())
+        log_p = {k: v + prior[str(k)] for k, v in log_z.items() if len(k.effects) < 2}
+        log_p |= self._gaining(log_z, prior)
+        return verdict_of(probabilities_of(log_p), self)
+
+    @property
+    def catch_alls(self) -> tuple[str, ...]:
+        """Those that are compared after an alarm."""
+        if len(self._one_part):
+            return CATCH_ALLS
+        return tuple(name for name in CATCH_ALLS if name != OUTLIER)
 
     def detected(self) -> Detection:
         """Return whether the bare model misses the trials."""
         level = LEVEL if self.rivals.has_known_noise else 0.0
-        log_b = self._log_bayes_factor(self._log_z)
+        log_b = log_bayes_factor(self._log_z, self)
         found = detection_of(self.search.found[ModelKey()], log_b, level)
         noise = self.rivals.model.noise
         if noise is None or noise.posterior is not None or self.rivals.roughness.any():
@@ -135,178 +131,54 @@ class BySensor:
         p = float(chi2.cdf(least, freedom))
         return replace(found, least_chi_square=least, lower_p_value=p)
 
-    def traced(self, actions: ActionSpace | None, *, compare: bool) -> Tracing:
-        """Return which effects the trials point to, and record the models' draws.
+    def log_evidence(self, key: ModelKey, *, factor: float = 1.0) -> float:
+        """Return a model's log evidence, priors of effects as many times as wide."""
+        if factor == 1 or key not in self.search.found:
+            return self._log_z[key]
+        c, errors = self.search.found[key], self.search.errors
+        own = errors.posterior(c.model, c.grams, factor=factor, process=False)
+        return own.log_sensor
 
-        Args:
-            actions: The permitted ones, for what they hardly separate.
-            compare: Whether to look for effects that are nearly the same over them, and
-                for those that the trials do not separate.
-        """
-        rivals, found, detection = self.rivals, self.search.found, self.detected()
-        log_z = dict(self._log_z)
-        if not detection.alarm:
-            log_z.pop(ModelKey(error=OUTLIER), None)
-        log_p = self._log_p(log_z)
-        verdict = self._verdict(log_p) if detection.alarm else ModelKey()
-        beside: tuple[str, ...] = ()
-        if self._predicting(verdict) and found[verdict].model.chi_square[2] < REFUTED:
-            process = ModelKey(error=UNEXPLAINED)
-            both = found[verdict].posterior.log_process, log_z[process]
-            log_z[process] = float(np.logaddexp(*both) - np.log(2))
-            log_p = self._log_p(log_z)
-            if self._verdict(log_p) == process and both[0] > both[1]:
-                beside = verdict.effects
-            verdict = self._verdict(log_p)
-        p = beside_imitations(probabilities_of(log_p))
-        probabilities = {str(key): share for key, share in p.items()}
-        inclusion = {
-            name: sum(share for key, share in p.items() if name in key.effects)
-            for name in rivals.effects
-        }
-        evidences = {
-            str(key): self._recorded(key, log_z[key])
-            for key, share in p.items()
-            if len(key.effects) < 2 or share >= SHOWN or key == verdict
-        }
-        null = log_z[ModelKey()]
-        estimates = likeliest_first(
-            estimate_of(
-                effect,
-                evidences[name],
-                probability=inclusion[name],
-                log_bayes_factor=log_z[ModelKey((name,))] - null,
-            )
-            for name, effect in rivals.effects.items()
-            if name in evidences
-        )
-        near, aliases = (), ()
-        if compare:
-            near = equivalent_effects(rivals, None)
-        if compare and detection.alarm:
-            known = [*self.equivalent, *near]
-            singles = {n: log_z[ModelKey((n,))] for n in rivals.effects}
-            aliases = near_aliases(rivals, singles, actions, known)
-        elif detection.alarm:
-            aliases = self._aliases(log_z)
-        fitted = found[ModelKey(self._predicting(verdict))]
-        tracing = Tracing(
-            verdict=str(verdict),
-            chosen=verdict.effects,
-            probabilities=probabilities,
-            inclusion=inclusion,
-            credible_set=credible_set(probabilities),
-            equivalent=(*self.equivalent,),
-            near=near,
-            aliases=aliases,
-            estimates=estimates,
-            evidences=evidences,
-            robust=self._is_robust(verdict),
-            beside=beside,
-            outliers=self._outliers() if detection.alarm else {},
-            needed=self._needed(verdict),
-            p_value=fitted.model.chi_square[2],
-            log_process=fitted.posterior.log_process - fitted.posterior.log_sensor,
-            trial_names=dict(
-                zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
-            ),
-        )
-        return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
+    def larger(
+        self, singles: Mapping[str, float], prior: Mapping[str, float]
+    ) -> dict[ModelKey, float]:
+        """Return log posteriors of sets of several effects, where they gain enough."""
+        return self._gaining(self._log_z, prior)
 
-    def _log_bayes_factor(self, log_z: dict[ModelKey, float]) -> float:
-        weights = alternatives([e.name for e in self.rivals.library], self.equivalent)
-        parts = [
-            log_z[ModelKey.of(name)] + float(np.log(w))
-            for name, w in weights.items()
-            if ModelKey.of(name) in log_z
-        ]
-        return float(log_sum_exp(np.array(parts)) - log_z[ModelKey()])
-
-    def _log_p(self, log_z: dict[ModelKey, float]) -> dict[ModelKey, float]:
-        """Return unnormalized log posteriors; sets that gain too little do not count.
-
-        A set counts if it has a Bayes factor of 20 against each of its parts.
-        """
-        some = [name for name in CATCH_ALLS if ModelKey(error=name) in log_z]
-        prior = log_priors(self.rivals.library, some)
-        log_p = {}
+    def _gaining(
+        self, log_z: Mapping[ModelKey, float], prior: Mapping[str, float]
+    ) -> dict[ModelKey, float]:
+        """Return log posteriors of sets with a Bayes factor of 20 against each part."""
+        found = {}
         for key, value in log_z.items():
             parts = [log_z[part] for part in key.parts if part in log_z]
-            if len(key.effects) > 1 and value < max(parts, default=-np.inf) + THRESHOLD:
-                continue
-            several = len(key.effects) > 1
-            own = log_prior(key.effects, prior) if several else prior[str(key)]
-            log_p[key] = value + own
-        return log_p
+            if len(key.effects) > 1 and value >= max(parts) + THRESHOLD:
+                found[key] = value + log_prior(key.effects, prior)
+        return found
 
-    def _verdict(self, log_p: dict[ModelKey, float]) -> ModelKey:
-        """Return the most probable set of the most probable families."""
-        p = probabilities_of(log_p)
-        errors = {key: share for key, share in p.items() if key.error}
-        declared = {key: share for key, share in p.items() if key.effects}
-        if errors and max(errors.values()) > sum(declared.values()):
-            return max(errors, key=errors.__getitem__)
-        classes: dict[frozenset[str], dict[ModelKey, float]] = {}
-        for key, share in declared.items():
-            classes.setdefault(self._families(key), {})[key] = share
-        if not classes:
-            return ModelKey()
-        likeliest = max(classes.values(), key=lambda members: sum(members.values()))
-        return max(likeliest, key=likeliest.__getitem__)
+    def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
+        """Return whether the sensor leaves no room for what a model leaves over."""
+        names = self._predicting(key)
+        return bool(names.effects) and self.p_value(names) < REFUTED
 
-    def _families(self, key: ModelKey) -> frozenset[str]:
-        """Return what a set is about: families of forces, groups of what is alike."""
-        effects = [self.rivals.effects[name] for name in key.effects]
-        groups = [group for group in self.equivalent if NONE not in group]
-        return frozenset(
-            str(e.family)
-            if is_force(e)
-            else min(next((g for g in groups if e.name in g), {e.name}))
-            for e in effects
-        )
+    def log_with_process(self, key: ModelKey) -> float:
+        """Return the log evidence of effects with a residual process beside them."""
+        return self.search.found[self._predicting(key)].posterior.log_process
 
-    def _predicting(self, key: ModelKey) -> tuple[str, ...]:
-        """Return the effects of a set that change the prediction."""
-        return tuple(n for n in key.effects if n in self.search.names)
-
-    def _recorded(self, key: ModelKey, log_z: float) -> Evidence:
+    def record(self, key: ModelKey) -> Evidence:
+        """Return what is recorded of a model, and keep its draws."""
+        log_z, bare = self._log_z[key], ModelKey()
         if key.error is not None:
-            own = self._recorded(ModelKey(), self._log_z[ModelKey()])
-            return replace(own, key=key, log_evidence=log_z)
+            return replace(self.record(bare), key=key, log_evidence=log_z)
         if key not in self.search.found:  # on the noise, sampled
             return replace(self.rivals.fit(key).evidence, log_evidence=log_z)
-        c = self.search.found[key]
+        model = self.search.model(key)
         use = np.ones(self.search.errors.num_folds, bool)
-        posterior = self.posterior(key, use)
-        own = keep_draws(self.rivals, c.model, posterior.mean, posterior.cov, log_z)
-        return replace(own, log_evidence=log_z)
+        own = self.posterior(key, use)
+        kept = keep_draws(self.rivals, model, own.mean, own.cov, log_z)
+        return replace(kept, log_evidence=log_z)
 
-    def _aliases(self, log_z: dict[ModelKey, float]) -> tuple[frozenset[str], ...]:
-        names = [n for n in self.search.names if ModelKey((n,)) in self.search.found]
-        return alike(self.search, {n: log_z[ModelKey((n,))] for n in names})
-
-    def _is_robust(self, verdict: ModelKey) -> bool:
-        """Return whether priors a third and three times as wide give the same."""
-        errors = self.search.errors
-        for factor in RESCALED:
-            log_z = dict(self._log_z)
-            for key, c in self.search.found.items():
-                if key.effects:
-                    log_z[key] = errors.posterior(
-                        c.model, c.grams, factor=factor, process=False
-                    ).log_sensor
-            is_none = self._log_bayes_factor(log_z) < THRESHOLD
-            if is_none and not self.detected().by_chi_square:
-                found = ModelKey()
-            else:
-                found = self._verdict(self._log_p(log_z))
-            if self._families(found) != self._families(verdict) or (
-                found.error != verdict.error
-            ):
-                return False
-        return True
-
-    def _outliers(self) -> dict[float, float]:
+    def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one with a gross error."""
         if not len(self._one_part):
             return {}
@@ -316,18 +188,27 @@ class BySensor:
         order = np.argsort(-share, kind="stable")
         return {float(index[trials[k]]): float(share[k]) for k in order}
 
-    def _needed(self, key: ModelKey) -> tuple[float, ...]:
+    def needed(self, key: ModelKey) -> tuple[float, ...]:
         """Return the trials without which the data do not point to some effects."""
         errors, found = self.search.errors, self.search.found
         log_b = self._log_z[key] - self._log_z[ModelKey()]
-        if (
-            not key.effects
-            or key not in found
-            or log_b < THRESHOLD
-            or not errors.is_by_trial
-        ):
+        if key not in found or log_b < THRESHOLD or not errors.is_by_trial:
             return ()
         own, bare = (log_without(found[k], errors) for k in (key, ModelKey()))
         trials = np.unique(self.rivals.measurements.trial)
         index = self.rivals.trials.index.numpy()[trials]
         return (*index[own - bare < THRESHOLD].tolist(),)
+
+    def p_value(self, key: ModelKey) -> float:
+        """Return the tail probability of a model's chi-square."""
+        return self.search.model(self._predicting(key)).chi_square[2]
+
+    def log_process(self, key: ModelKey) -> float:
+        """Return the log Bayes factor of a residual process beside a model, nats."""
+        own = self.search.found[self._predicting(key)].posterior
+        return own.log_process - own.log_sensor
+
+    def _predicting(self, key: ModelKey) -> ModelKey:
+        """Return the effects of a set that change the prediction."""
+        names = self.search.names
+        return ModelKey(tuple(n for n in key.effects if n in names))

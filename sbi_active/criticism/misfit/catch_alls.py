@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.linear.candidate import Candidate
 from sbi_active.criticism.linear.errors import Errors, integrated
-from sbi_active.criticism.linear.search import Candidate
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.inference.sampling.weights import log_sum_exp
 

@@ -12,8 +12,9 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
+from sbi_active.criticism.linear.candidate import Candidate
 from sbi_active.criticism.linear.model import LinearModel
-from sbi_active.criticism.linear.search import Candidate, Search
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.results import (

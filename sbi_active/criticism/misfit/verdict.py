@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.fit import FirstLook
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.candidate import Candidate
 from sbi_active.criticism.linear.errors import Posterior
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
-from sbi_active.criticism.linear.screening import is_large
-from sbi_active.criticism.linear.search import Candidate, Search
+from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_error
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance
@@ -38,6 +37,7 @@ from sbi_active.criticism.misfit.rule import (
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.equivalence import is_large
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.tracing import RESCALED, log_priors
 from sbi_active.criticism.under_misfit import NAMED
@@ -266,8 +266,6 @@ def find_misfit(
         unit, cells = sensor
         search = Search(rivals, unit, log_priors(rivals.library, ()), cells)
     search.fit_singles()
-    square = search.found[ModelKey()].model.chi_square[0]
-    rivals.look = FirstLook(search.likeliest(), square)
     if not is_known and not _misses(search):
         return None
     search.fit_larger()

@@ -59,16 +59,14 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     null = rivals.fit().evidence
     # First what is likeliest: beside it, a hopeless effect is soon dismissed.
     weights = alternatives([e.name for e in rivals.library], equivalent)
-    look = rivals.look
-    first = [] if look is None or look.likeliest is None else [look.likeliest]
-    promising = rivals.effects
-    if not (first or rivals.nuisances):
+    promising = [*rivals.effects]
+    if not rivals.nuisances:
         promising = sorted(
             rivals.effects, key=lambda n: promise(rivals, ModelKey.of(n)), reverse=True
         )
     found = {
         name: log_evidence(rivals, ModelKey.of(name))
-        for name in dict.fromkeys([*first, UNEXPLAINED, SCATTER, *promising])
+        for name in dict.fromkeys([UNEXPLAINED, SCATTER, *promising])
     }
     others = [
         (found[name][0] + float(np.log(w)), found[name][1])
@@ -82,7 +80,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
     p_value, check = float(chi2.sf(null.best_chi_square, freedom)), None
     is_alarm = log_b - MARGIN * error > THRESHOLD or p_value < level
     sure = rivals.is_smooth and null.standard_error < SURE
-    if is_alarm and not (sure and (_is_found(rivals) or is_found_again(rivals))):
+    if is_alarm and not (sure and is_found_again(rivals)):
         check = rivals.fit_again().log_evidence
         null = rivals.fit().evidence
         log_b, error = bayes_factor(others, log_evidence(rivals))
@@ -103,14 +101,6 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
         least_chi_square=least,
         lower_p_value=lower_p,
     )
-
-
-def _is_found(rivals: RivalSet) -> bool:
-    """Return whether an earlier look ended where the bare model was sampled."""
-    if rivals.look is None:
-        return False
-    own = rivals.fit().evidence.best_chi_square
-    return own < rivals.look.null_chi_square + 2 * THRESHOLD
 
 
 def promise(rivals: RivalSet, key: ModelKey) -> float:

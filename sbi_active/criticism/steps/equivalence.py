@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.further_trials import conditions_at, together
@@ -22,6 +23,8 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
 
+#: Effects of a library whose pairs are all compared, and that are all fitted.
+MANY = 24
 #: A choice: of a list that is longer, or a box, so many actions stand for all.
 MAX_ACTIONS = 48
 NUM_THETA = 6  # a choice: five of six agree by the share below
@@ -46,6 +49,14 @@ FOUND = 1e-4
 NUM_FAR = 2
 
 
+def is_large(effects: Collection[Effect]) -> bool:
+    """Return whether a library is too large to look at all that it may confuse.
+
+    It has more than 24 effects, or forces of the dictionary, which add up to anything.
+    """
+    return len(effects) > MANY or any(map(is_force, effects))
+
+
 def equivalent_effects(
     rivals: RivalSet, actions: ActionSpace | None
 ) -> tuple[frozenset[str], ...]:
@@ -66,9 +77,11 @@ def equivalent_effects(
     where its strongest draw shows nothing, and is not compared with others.
 
     Args:
-        rivals: The models.
+        rivals: The models; of a large library nothing is compared.
         actions: The permitted ones; None compares on the trials at hand.
     """
+    if is_large(rivals.library):
+        return ()
     trials = rivals.trials if actions is None else every_action(rivals, actions)
     simulator = TrialSimulator(
         rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")

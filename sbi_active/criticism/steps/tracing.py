@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +11,11 @@ from numpy.typing import NDArray
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
-    SCATTER,
+    OUTLIER,
     UNEXPLAINED,
     Detection,
     Estimate,
@@ -24,15 +23,9 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.combinations import grow
-from sbi_active.criticism.steps.detection import REFUTED, THRESHOLD, alternatives
+from sbi_active.criticism.steps.detection import THRESHOLD, alternatives
 from sbi_active.criticism.steps.equivalence import equivalent_effects
-from sbi_active.criticism.steps.gross_errors import gross_errors
-from sbi_active.criticism.steps.influence import (
-    is_left_to_chance,
-    needed_trials,
-    withdrawn,
-)
+from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
 from sbi_active.criticism.steps.near_aliases import near_aliases
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -73,10 +66,83 @@ def log_priors(
     return {name: float(np.log(p)) for name, p in found.items()}
 
 
+class Evidences(Protocol):
+    """What the trials say of each model, by samples or by linear algebra."""
+
+    @property
+    def rivals(self) -> RivalSet:
+        """The models."""
+        ...
+
+    @property
+    def equivalent(self) -> Sequence[frozenset[str]]:
+        """Groups of effects that no permitted action separates."""
+        ...
+
+    @property
+    def catch_alls(self) -> tuple[str, ...]:
+        """Those that are compared after an alarm."""
+        ...
+
+    def detected(self) -> Detection:
+        """Return whether the bare model misses the trials."""
+        ...
+
+    def log_evidence(self, key: ModelKey, *, factor: float = 1.0) -> float:
+        """Return a model's log evidence, priors of effects as many times as wide."""
+        ...
+
+    def larger(
+        self, singles: Mapping[str, float], prior: Mapping[str, float]
+    ) -> dict[ModelKey, float]:
+        """Return log posteriors of sets of several effects, where they gain enough.
+
+        Args:
+            singles: Log posterior of each effect alone, unnormalized.
+            prior: Log prior probability of each.
+        """
+        ...
+
+    def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
+        """Return whether the error leaves no room for what a model leaves over.
+
+        Args:
+            key: Of the model.
+            detection: Of the bare model.
+        """
+        ...
+
+    def log_with_process(self, key: ModelKey) -> float:
+        """Return the log evidence of effects with a residual process beside them."""
+        ...
+
+    def record(self, key: ModelKey) -> Evidence:
+        """Return what is recorded of a model."""
+        ...
+
+    def outliers(self) -> dict[float, float]:
+        """Return the probability that each trial is the one, if one has a gross error.
+
+        By the trial's index, most probable first.
+        """
+        ...
+
+    def needed(self, key: ModelKey) -> tuple[float, ...]:
+        """Return the trials without which the data do not point to some effects."""
+        ...
+
+    def p_value(self, key: ModelKey) -> float:
+        """Return the tail probability of a model's chi-square; NaN for none."""
+        ...
+
+    def log_process(self, key: ModelKey) -> float:
+        """Return the log Bayes factor of a process beside a model; -inf for none."""
+        ...
+
+
 def trace(
-    rivals: RivalSet,
+    found: Evidences,
     detection: Detection,
-    equivalent: Sequence[frozenset[str]] = (),
     *,
     actions: ActionSpace | None = None,
     compare: bool = True,
@@ -85,7 +151,8 @@ def trace(
 
     The scales of the effects' priors are unknown. After an alarm the verdict is first
     one of: declared effects, "unexplained", "scatter", each with all of its
-    probability; then, of the effects, the most probable. Where known noise refutes
+    probability; then, of the effects, the most probable of the most probable families.
+    Where known noise refutes
     that (its chi-square has p < .001), the residual process is tried beside it: then
     "unexplained" is the process alone or with these effects, half and half. Of what
     several effects of a trajectory explain, it has the share that they may imitate.
@@ -93,40 +160,42 @@ def trace(
     that rest on one trial are named only if that trial has hardly a gross error.
 
     Args:
-        rivals: The models.
+        found: The models' evidence.
         detection: Whether there is anything to trace.
-        equivalent: Groups that no permitted action separates.
         actions: The permitted ones, for what they hardly separate.
-        compare: Whether to look for effects that these trials do not separate.
+        compare: Whether to look for effects that these trials do not separate, and that
+            are nearly the same over the permitted actions.
     """
+    rivals, equivalent = found.rivals, found.equivalent
     # Without an alarm there is no trial to set aside.
-    catch_alls = CATCH_ALLS if detection.alarm else (UNEXPLAINED, SCATTER)
+    every = found.catch_alls
+    catch_alls = every if detection.alarm else tuple(n for n in every if n != OUTLIER)
     prior = log_priors(rivals.library, catch_alls)
-    names = (NONE, *catch_alls, *rivals.effects)
-    log_prior = {ModelKey.of(name): prior[name] for name in names}
-    log_z = {key: log_evidence(rivals, key)[0] for key in log_prior}
+    keys = [ModelKey.of(name) for name in (NONE, *catch_alls, *rivals.effects)]
+    log_prior = {key: prior[str(key)] for key in keys}
+    log_z = {key: found.log_evidence(key) for key in keys}
     process = ModelKey(error=UNEXPLAINED)
     if detection.alarm:
         singles = {n: prior[n] + log_z[ModelKey((n,))] for n in rivals.effects}
-        for key, value in grow(rivals, singles, prior).items():
-            log_z[key] = log_evidence(rivals, key)[0]
+        for key, value in found.larger(singles, prior).items():
+            log_z[key] = found.log_evidence(key)
             log_prior[key] = value - log_z[key]
     log_p = {key: log_prior[key] + log_z[key] for key in log_z}
     p = probabilities_of(log_p)
-    verdict = _verdict(p, equivalent, alarm=detection.alarm)
+    verdict = verdict_of(p, found) if detection.alarm else ModelKey()
     beside: tuple[str, ...] = ()
-    found = verdict.effects
-    if found and detection.refutes(rivals.fit(verdict).evidence, REFUTED):
+    if verdict.effects and found.is_refuted(verdict, detection):
         # What takes up most of the misfit need not take up all of it.
-        rest = rivals.fit(ModelKey(found, UNEXPLAINED)).evidence.log_evidence
+        names, rest = verdict.effects, found.log_with_process(verdict)
         alone = log_z[process]
-        log_z[process] = log_sum_exp(np.array([alone, rest])) - float(np.log(2))
+        log_z[process] = float(np.logaddexp(alone, rest) - np.log(2))
         log_p[process] = log_prior[process] + log_z[process]
         p = probabilities_of(log_p)
-        verdict = _verdict(p, equivalent, alarm=detection.alarm)
+        verdict = verdict_of(p, found)
         if verdict == process and rest > alone:
-            beside = found
+            beside = names
     p = beside_imitations(p)
+    evidences = {str(key): found.record(key) for key in log_p}
     near = equivalent_effects(rivals, None) if compare else ()
     aliases = ()
     if compare and detection.alarm:
@@ -137,6 +206,16 @@ def trace(
         for name in rivals.effects
     }
     probabilities = {str(key): share for key, share in p.items()}
+    null = evidences[NONE].log_evidence
+    estimates = likeliest_first(
+        estimate_of(
+            effect,
+            evidences[name],
+            probability=inclusion[name],
+            log_bayes_factor=log_z[ModelKey((name,))] - null,
+        )
+        for name, effect in rivals.effects.items()
+    )
     tracing = Tracing(
         verdict=str(verdict),
         chosen=verdict.effects,
@@ -146,12 +225,14 @@ def trace(
         equivalent=(*equivalent,),
         near=near,
         aliases=aliases,
-        estimates=_estimates(rivals, inclusion),
-        evidences={str(key): _under_unknown_scale(rivals, key) for key in log_p},
-        robust=_is_robust(rivals, detection, log_prior, log_z, equivalent, verdict),
+        estimates=estimates,
+        evidences=evidences,
+        robust=_is_robust(found, detection, log_prior, log_z, verdict),
         beside=beside,
-        outliers=gross_errors(rivals) if detection.alarm else {},
-        needed=needed_trials(rivals, verdict) if verdict.effects else (),
+        outliers=found.outliers() if detection.alarm else {},
+        needed=found.needed(verdict) if verdict.effects else (),
+        p_value=found.p_value(verdict),
+        log_process=found.log_process(verdict),
         trial_names=dict(
             zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
         ),
@@ -181,35 +262,53 @@ def beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
 
 
-def _verdict(
-    probabilities: dict[ModelKey, float],
-    equivalent: Sequence[frozenset[str]],
-    *,
-    alarm: bool,
-) -> ModelKey:
+def verdict_of(probabilities: Mapping[ModelKey, float], found: Evidences) -> ModelKey:
     """Return the verdict: the kind of explanation, then the most probable of it.
 
-    Several effects that share the probability do not lose it to a catch-all, and
-    equivalent ones count as one.
+    Several effects that share the probability do not lose it to a catch-all. Equivalent
+    ones count as one, and so do forces of one family: it is chosen first, then its
+    form.
     """
-    if not alarm:
-        return ModelKey()
     catch_alls = {k: p for k, p in probabilities.items() if k.error}
-    declared = 1.0 - probabilities[ModelKey()] - sum(catch_alls.values())
-    best = max(catch_alls, key=catch_alls.__getitem__)
-    if catch_alls[best] > declared:
-        return best
-    groups = [group for group in equivalent if NONE not in group]
     classes: dict[frozenset[str], dict[ModelKey, float]] = {}
     for key, p in probabilities.items():
-        if not key.effects:
-            continue
-        alike = frozenset(
-            min(next((g for g in groups if name in g), {name})) for name in key.effects
-        )
-        classes.setdefault(alike, {})[key] = p
+        if key.effects:
+            classes.setdefault(kind_of(key, found), {})[key] = p
+    declared = sum(p for members in classes.values() for p in members.values())
+    best = max(catch_alls, key=catch_alls.__getitem__, default=ModelKey())
+    if catch_alls.get(best, 0.0) > declared or not classes:
+        return best
     likeliest = max(classes.values(), key=lambda members: sum(members.values()))
     return max(likeliest, key=likeliest.__getitem__)
+
+
+def kind_of(key: ModelKey, found: Evidences) -> frozenset[str]:
+    """Return what a set is about: families of forces, groups of what is alike."""
+    effects = [found.rivals.effects[name] for name in key.effects]
+    groups = [group for group in found.equivalent if NONE not in group]
+
+    def kind(effect: Effect) -> str:
+        if is_force(effect):
+            return str(effect.family)
+        return min(next((g for g in groups if effect.name in g), {effect.name}))
+
+    return frozenset(map(kind, effects))
+
+
+def log_bayes_factor(log_z: Mapping[ModelKey, float], found: Evidences) -> float:
+    """Return the log Bayes factor of everything else against the bare model.
+
+    Args:
+        log_z: Evidences; what was screened out has none to speak of.
+        found: The models.
+    """
+    names = [e.name for e in found.rivals.library]
+    parts = [
+        log_z[ModelKey.of(name)] + float(np.log(w))
+        for name, w in alternatives(names, found.equivalent).items()
+        if ModelKey.of(name) in log_z
+    ]
+    return float(log_sum_exp(np.array(parts)) - log_z[ModelKey()])
 
 
 def credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
@@ -254,46 +353,24 @@ def likeliest_first(estimates: Iterable[Estimate]) -> tuple[Estimate, ...]:
     return (*sorted(estimates, key=lambda e: -e.probability),)
 
 
-def _estimates(rivals: RivalSet, inclusion: dict[str, float]) -> tuple[Estimate, ...]:
-    null = rivals.fit().evidence.log_evidence
-    keys = {name: ModelKey((name,)) for name in rivals.effects}
-    return likeliest_first(
-        estimate_of(
-            effect,
-            rivals.fit(keys[name]).evidence,
-            probability=inclusion[name],
-            log_bayes_factor=log_evidence(rivals, keys[name])[0] - null,
-        )
-        for name, effect in rivals.effects.items()
-    )
-
-
 def _is_robust(
-    rivals: RivalSet,
+    found: Evidences,
     detection: Detection,
-    log_prior: dict[ModelKey, float],
-    log_z: dict[ModelKey, float],
-    equivalent: Sequence[frozenset[str]],
+    log_prior: Mapping[ModelKey, float],
+    log_z: Mapping[ModelKey, float],
     verdict: ModelKey,
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
-    every = alternatives([e.name for e in rivals.library], equivalent)
-    weights = {k: w for k, w in every.items() if ModelKey.of(k) in log_z}
     for factor in RESCALED:
         scaled = {
-            key: log_evidence(rivals, key, factor=factor)[0] if key.effects else value
+            key: found.log_evidence(key, factor=factor) if key.effects else value
             for key, value in log_z.items()
         }
-        singles = [scaled[ModelKey.of(k)] + np.log(w) for k, w in weights.items()]
-        log_b = log_sum_exp(np.array(singles)) - scaled[ModelKey()]
-        alarm = bool(log_b > THRESHOLD) or detection.by_chi_square
-        log_p = {key: log_prior[key] + scaled[key] for key in scaled}
-        if _verdict(probabilities_of(log_p), equivalent, alarm=alarm) != verdict:
+        other = ModelKey()
+        if log_bayes_factor(scaled, found) > THRESHOLD or detection.by_chi_square:
+            log_p = {key: log_prior[key] + scaled[key] for key in scaled}
+            other = verdict_of(probabilities_of(log_p), found)
+        same = kind_of(other, found) == kind_of(verdict, found)
+        if not same or other.error != verdict.error:
             return False
     return True
-
-
-def _under_unknown_scale(rivals: RivalSet, key: ModelKey) -> Evidence:
-    """Return a rival's record with the evidence that the probabilities rest on."""
-    value, error = log_evidence(rivals, key)
-    return replace(rivals.fit(key).evidence, log_evidence=value, standard_error=error)

@@ -6,7 +6,8 @@ from torch.distributions import HalfNormal, Normal
 
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.screening import MANY, linear_models
+from sbi_active.criticism.linear.screening import linear_models
+from sbi_active.criticism.steps.equivalence import MANY
 from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, TIMES, trials
 

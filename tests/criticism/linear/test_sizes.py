@@ -8,7 +8,7 @@ from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.linear.screening import MANY
+from sbi_active.criticism.steps.equivalence import MANY
 
 TIMES = torch.linspace(0, 2, 60)
 PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))

@@ -18,7 +18,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_error
 from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.steps.tracing import log_priors
+from sbi_active.criticism.steps.tracing import log_priors, trace
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
@@ -129,7 +129,7 @@ def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
     )
     wrong.fit_singles()
     verdict = BySensor(wrong, wrong.rivals)
-    tracing = verdict.traced(None, compare=False)
+    tracing = trace(verdict, verdict.detected(), compare=False)
     assert tracing.verdict == OUTLIER
     assert next(iter(tracing.outliers)) == 3.0
 
@@ -139,7 +139,7 @@ def test_clean_trials_have_none(few):
     clean.fit_singles()
     verdict = BySensor(clean, clean.rivals)
     assert not verdict.detected().alarm
-    assert verdict.traced(None, compare=False).verdict == "none"
+    assert trace(verdict, verdict.detected(), compare=False).verdict == "none"
 
 
 def test_numbers_without_a_time_axis_have_no_linear_models():

@@ -12,6 +12,7 @@ from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.combinations import grow, log_prior
 from sbi_active.criticism.steps.detection import THRESHOLD, detect
+from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.criticism.steps.tracing import log_priors, trace
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import ACTION, SHAPES, measured, rivals
@@ -92,7 +93,7 @@ def test_a_name_may_contain_what_joins_names():
     shapes = rivals(x).effects
     renamed = [replace(e, name=f"{n} + {n} lag") for n, e in shapes.items()]
     some = RivalSet(rivals(x).model, linear_world.PRIOR, Trials(ACTION, x), renamed)
-    tracing = trace(some, detect(some), compare=False)
+    tracing = trace(Sampled(some), detect(some), compare=False)
     assert tracing.chosen == ("curve + curve lag", "kink + kink lag")
     assert tracing.verdict == "curve + curve lag + kink + kink lag"
     assert tracing.inclusion["wave + wave lag"] < 0.2

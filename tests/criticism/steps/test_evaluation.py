@@ -9,6 +9,7 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.criticism.steps.tracing import trace
 from tests.criticism.steps.linear_world import (
     ACTION,
@@ -40,7 +41,7 @@ def crps(x, mean, sd):
 @pytest.fixture(scope="module")
 def fitted():
     some = rivals(X)
-    return some, trace(some, detect(some), compare=False)
+    return some, trace(Sampled(some), detect(some), compare=False)
 
 
 def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):

@@ -6,13 +6,13 @@ import torch
 
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence import RivalSet
-from sbi_active.criticism.steps.gross_errors import gross_errors
+from sbi_active.criticism.steps.sampled import Sampled
 from tests.criticism.steps.linear_world import ACTION, NOISE, PRIOR, measured, rivals
 
 
 def found(x, **options):
     trials = Trials(ACTION, x, **options)
-    return gross_errors(RivalSet(rivals(x).model, PRIOR, trials, []))
+    return Sampled(RivalSet(rivals(x).model, PRIOR, trials, [])).outliers()
 
 
 @pytest.mark.parametrize("at", [0, 7])

@@ -7,8 +7,8 @@ from sbi_active import DiscreteActions
 from sbi_active.criticism import Effect
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps import near_aliases as room
+from sbi_active.criticism.steps.detection import THRESHOLD
 from tests.criticism.steps.linear_world import NOISE, measured, rivals
 
 SIZE = 0.5

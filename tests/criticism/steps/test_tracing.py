@@ -12,6 +12,7 @@ from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import CATCH_ALLS, ModelKey
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import detect
+from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.criticism.steps.tracing import log_priors, trace
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
@@ -26,7 +27,7 @@ from tests.criticism.steps.linear_world import (
 
 def traced(x, **keywords):
     some = rivals(x)
-    return trace(some, detect(some), **keywords), some
+    return trace(Sampled(some), detect(some), **keywords), some
 
 
 def test_families_share_what_none_and_the_catch_alls_leave():
@@ -160,7 +161,7 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     )
     x = measured(curve=0.1, kink=0.28)
     some, group = rivals(x, twin), frozenset({"curve", "twin"})
-    tracing = trace(some, detect(some), [group])
+    tracing = trace(Sampled(some, [group]), detect(some))
     assert group in tracing.near
     assert tracing.equivalent == (group,)
     p = tracing.probabilities
