@@ -195,7 +195,7 @@ class Criticism:
         """
         if not self._is_searched:
             groups = self.equivalent()
-            self._misfit = find_misfit(self.rivals, groups, search=self._linear)
+            self._misfit = find_misfit(self._linear, groups)
             if self._misfit is not None and not self.set_aside:
                 self.set_aside = found = self._misfit.outlying()
                 if found:  # they are not to decide what the others say
@@ -204,8 +204,9 @@ class Criticism:
                     self.trials, self._equivalent = without(self.trials, found), None
                     self._look()
                     return self.misfit()
-            self._found = Sampled(self.rivals, groups)
-            if self._linear is not None and self._misfit is None:
+            self._found = Sampled(self.rivals, groups, self._linear)
+            timed = self.rivals.measurements.is_sequence
+            if timed and self._linear is not None and self._misfit is None:
                 self._found = BySensor(self._linear, self.rivals, groups)
             self._is_searched = True
         return self._misfit

@@ -20,6 +20,7 @@ from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.predicted_before import predicted_before
 from sbi_active.criticism.evidence.settings import (
+    KNOWN,
     NESTED,
     ROUGH,
     THOROUGH,
@@ -83,6 +84,8 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
+        best_fits: Where least squares ended, of rivals that were fitted so, by their
+            coordinates; their searches begin there.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
     """
@@ -126,6 +129,7 @@ class RivalSet:
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
         self.found: dict[ModelKey, Found] = {}
+        self.best_fits: dict[ModelKey, Array] = {}
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -254,6 +258,8 @@ class RivalSet:
     def search(self, key: ModelKey) -> Found:
         """Return the modes of a rival, from where smaller ones ended."""
         rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
+        if key in self.best_fits:
+            return _searched(rival, self.best_fits[key][None], KNOWN, seed)
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
         how = how if self.is_smooth else ROUGH

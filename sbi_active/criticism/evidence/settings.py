@@ -24,6 +24,8 @@ NESTED = SearchSettings(
     iterations=6,
     phases=10,
 )
+#: Searches that begin at a best fit by least squares, and at no other place.
+KNOWN = replace(NESTED, num_screened=0)
 #: Searches where the simulator jumps: derivatives lead to the neighborhood of a mode at
 #: most.
 ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)
@@ -43,7 +45,8 @@ def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
         is_smooth: Whether derivatives mean anything; a mode is wider than they say
             otherwise, and a likelihood higher than at any that was found.
     """
-    own = Settings(plenty=4.0, num_simulations=3 * MOST * num_trials)
+    # As many effective draws as are kept.
+    own = Settings(plenty=2.0, num_simulations=3 * MOST * num_trials)
     if not is_bare:
         own = Settings(
             num_effective=50.0,

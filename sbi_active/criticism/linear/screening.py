@@ -50,11 +50,11 @@ def linear_models(rivals: RivalSet) -> tuple[Search | None, Screening | None]:
         rivals: The models, with all effects; what is set aside leaves them.
 
     Returns:
-        None for models where the size of the sensor's error is not declared, x has no
-        time axis, or the simulator is random or jumps; None for a screening where all
-        effects are to be fitted.
+        None for models where the size of the sensor's error is not declared, or the
+        simulator is random or jumps; None for a screening where all effects are to be
+        fitted.
     """
-    sensor = sensor_error(rivals)
+    sensor = sensor_error(rivals, needs_time=False)
     if sensor is None:
         return None, None
     unit, cells = sensor

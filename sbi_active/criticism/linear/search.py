@@ -163,6 +163,27 @@ class Search:
             self.keep(self._fit(key, known or alone or [ModelKey()]))
         return self.found[key]
 
+    def best_fits(self) -> dict[ModelKey, Array]:
+        """Return the coordinates of the best fits."""
+        return {key: c.model.u for key, c in self.found.items()}
+
+    def worthy(self, behind: float) -> list[ModelKey]:
+        """Return the sets of several effects near the best, smaller ones first.
+
+        With the sensor's error alone, by log posteriors that are at most so much
+        smaller, nats; among the parts of the best all count.
+        """
+        log_p = {key: c.log_p_sensor for key, c in self.found.items()}
+        best = max(log_p, key=log_p.__getitem__)
+        some = {k for k, v in log_p.items() if v > log_p[best] - behind}
+        todo = [best]
+        while todo:
+            parts = [k for k in todo.pop().parts if k in log_p]
+            some |= {*parts}
+            todo += parts
+        several = [k for k in some if len(k.effects) > 1]
+        return sorted(several, key=lambda k: (len(k.effects), -log_p[k]))
+
     @property
     def explains(self) -> bool:
         """Whether a model leaves no more than the sensor's error."""

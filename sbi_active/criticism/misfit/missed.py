@@ -33,8 +33,7 @@ def beside_misfit(
     rivals: RivalSet,
     equivalent: Sequence[frozenset[str]],
     held_out: Trials | None,
-    *,
-    search: Search | None = None,
+    search: Search | None,
 ) -> tuple[Tracing, Misfit | None]:
     """Return a verdict by models with a residual process, where none explains.
 
@@ -48,7 +47,7 @@ def beside_misfit(
         rivals: The models.
         equivalent: Groups of effects that nothing separates.
         held_out: Trials on which models are scored; None for none.
-        search: Has fitted the models; None makes one.
+        search: Fits the models; None where the error of the sensor is not known.
 
     Returns:
         The verdict, and the models if it is theirs.
@@ -57,7 +56,7 @@ def beside_misfit(
     several = len(tracing.chosen) > 1 and not timed
     if _is_missed(tracing, detection, rivals) or several:
         # It is no error of a sensor: a process that follows the action is.
-        misfit = find_misfit(rivals, equivalent, is_known=True, search=search)
+        misfit = find_misfit(search, equivalent, is_known=True)
     is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
     if is_bare and (misfit is None or not timed):
         tracing = replace(tracing, guesses=guess(rivals))

@@ -22,7 +22,6 @@ from sbi_active.criticism.linear.errors import Posterior
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_error
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance
 from sbi_active.criticism.misfit.rule import (
@@ -39,7 +38,7 @@ from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import is_large
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.tracing import RESCALED, log_priors
+from sbi_active.criticism.steps.tracing import RESCALED
 from sbi_active.criticism.under_misfit import NAMED
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
@@ -238,11 +237,10 @@ def scored(search: Search, c: Candidate, log_p: float, square: Array) -> Scored:
 
 
 def find_misfit(
-    rivals: RivalSet,
+    search: Search | None,
     equivalent: Sequence[frozenset[str]] = (),
     *,
     is_known: bool = False,
-    search: Search | None = None,
 ) -> Misfit | None:
     """Return the models and what helps; None where one fits to the sensor's error.
 
@@ -252,19 +250,14 @@ def find_misfit(
     it missed, and so by what left-out trials say of each of its effects.
 
     Args:
-        rivals: The models, whose noise is the sensor's.
+        search: Fits the models; None where the error of the sensor is not known.
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
-        search: Fits the models, forces of the dictionary among them, whose sets are
-            judged elsewhere; None makes one.
+            Without a time axis nothing else tells.
     """
-    if search is None:
-        # Where it is known not to be the sensor's error there is nothing to tell apart.
-        sensor = sensor_error(rivals, needs_time=not is_known)
-        if sensor is None:
-            return None
-        unit, cells = sensor
-        search = Search(rivals, unit, log_priors(rivals.library, ()), cells)
+    if search is None or not (is_known or search.rivals.measurements.is_sequence):
+        return None
+    rivals = search.rivals
     search.fit_singles()
     if not is_known and not _misses(search):
         return None

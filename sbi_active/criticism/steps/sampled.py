@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
@@ -17,22 +19,59 @@ from sbi_active.criticism.results import (
     Evidence,
     ModelKey,
 )
-from sbi_active.criticism.steps.combinations import grow
-from sbi_active.criticism.steps.detection import REFUTED, detect
+from sbi_active.criticism.steps.combinations import grow, log_prior
+from sbi_active.criticism.steps.detection import REFUTED, THRESHOLD, detect
 from sbi_active.criticism.steps.influence import needed_trials
+
+Array = NDArray[Any]
+
+
+#: Nats by which linear evidence puts a set behind the best, so that it is not sampled,
+#: and sets that are sampled at most.
+BEHIND, MOST = 10.0, 8
+
+
+class LinearFits(Protocol):
+    """Models linear at their best fits."""
+
+    def fit_singles(self) -> None:
+        """Fit each effect alone."""
+        ...
+
+    def fit_larger(self) -> None:
+        """Fit sets of several effects."""
+        ...
+
+    def best_fits(self) -> dict[ModelKey, Array]:
+        """Return the coordinates of the best fits."""
+        ...
+
+    def worthy(self, behind: float) -> list[ModelKey]:
+        """Return sets of several effects near the best, smaller ones first."""
+        ...
 
 
 @dataclass
 class Sampled:
     """Models of any simulator, each fitted and sampled once it is asked for.
 
+    Where derivatives mean something, linear models say where a posterior is and which
+    sets of effects are worth a sample, and samples what their evidence is.
+
     Attributes:
         rivals: The models.
         equivalent: Groups of effects that no permitted action separates.
+        linear: Linear models; None where there are none.
     """
 
     rivals: RivalSet
     equivalent: Sequence[frozenset[str]] = ()
+    linear: LinearFits | None = None
+
+    def __post_init__(self) -> None:
+        if self.linear is not None:
+            self.linear.fit_singles()
+            self.rivals.best_fits |= self.linear.best_fits()
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
@@ -51,7 +90,17 @@ class Sampled:
         self, singles: Mapping[str, float], prior: Mapping[str, float]
     ) -> dict[ModelKey, float]:
         """Return log posteriors of sets of several effects, where they gain enough."""
-        return grow(self.rivals, dict(singles), dict(prior))
+        if self.linear is None:
+            return grow(self.rivals, dict(singles), dict(prior))
+        self.linear.fit_larger()
+        self.rivals.best_fits |= self.linear.best_fits()
+        found: dict[ModelKey, float] = {}
+        for key in self.linear.worthy(BEHIND)[:MOST]:
+            value = self.log_evidence(key)
+            known = [part for part in key.parts if part in self.rivals.fits]
+            if value > max(map(self.log_evidence, known)) + THRESHOLD:
+                found[key] = value + log_prior(key.effects, dict(prior))
+        return found
 
     def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
         """Return whether known noise leaves no room for what a model leaves over."""

@@ -85,10 +85,8 @@ def test_a_misfit_that_passes_for_the_sensor_is_known_once_nothing_explains_it(
 ):
     """As correlated errors do, until a process that follows the action is tried."""
 
-    def late(rivals, equivalent, *, is_known=False, search=None):
-        if not is_known:
-            return None
-        return find_misfit(rivals, equivalent, is_known=True, search=search)
+    def late(search, equivalent, *, is_known=False):
+        return find_misfit(search, equivalent, is_known=True) if is_known else None
 
     monkeypatch.setattr("sbi_active.criticism.criticism.find_misfit", late)
     found = loop(trials(lag=0.12, hidden=0.15))
