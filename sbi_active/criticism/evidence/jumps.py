@@ -24,6 +24,8 @@ Array = NDArray[Any]
 #: coarse one, whose slope is of the same kind where nothing jumps.
 STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2, 0.2), 0.1
 COARSE, SIMILAR_SLOPE = 5e-2, 0.5
+#: Places at which slopes are compared.
+NUM_PROBED = 4
 #: Deviations of the noise below which a roughness does not matter.
 SMALL = 0.1
 #: Draws a coefficient of the local regression, and draws at least.
@@ -50,32 +52,38 @@ def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
     noise = rival.error
     assert isinstance(noise, NoiseGrid)
     none = np.zeros(len(rival.simulator.measurements))
-    fine, is_steady = probe_step(rival, seed=derive_seed(seed, "probe"))
+    drawn = rival.coordinates.sample(NUM_PROBED, seed=derive_seed(seed, "probe"))
+    fine, is_steady = probe_step(rival, drawn)
     own = derive_seed(seed, "roughness")
     if is_steady or rival.simulator.is_stochastic:
         return fine or STEPS[-1], fine is not None, none
     # Fine slopes differ from coarse ones as well where a smooth response bends within
     # the coarse step.
     if fine is not None:
-        rough = local_roughness(rival, step=fine, seed=own)
+        rough, _ = local_roughness(rival, step=fine, seed=own)
         if (rough < SMALL * noise.typical_sd).all():
             return fine, True, none
-    return STEPS[-1], False, local_roughness(rival, step=STEPS[-1], seed=own)
+    rough, around = local_roughness(rival, step=STEPS[-1], seed=own)
+    if (rough < SMALL * noise.typical_sd).all():
+        # It jumps somewhere in the prior, and not where the fit is.
+        fine, _ = probe_step(rival, around[:NUM_PROBED])
+        if fine is not None:
+            return fine, True, none
+    return STEPS[-1], False, rough
 
 
-def probe_step(rival: Rival, *, seed: int) -> tuple[float | None, bool]:
+def probe_step(rival: Rival, u: Array) -> tuple[float | None, bool]:
     """Return a step for finite differences, and whether slopes hold over a coarse one.
 
     The step is the smallest whose slope agrees with that of twice the step within 10 %
-    for most of four draws from the prior: below it rounding or a solver's tolerance
+    at most of some places: below it rounding or a solver's tolerance
     speaks, and where there is none the simulator jumps. It may jump as well where
     slopes agree between two jumps and not with those across them.
 
     Args:
         rival: The bare model.
-        seed: Of the draws.
+        u: Places, shape (n, dim).
     """
-    u = rival.coordinates.sample(4, seed=seed)
     whiten = rival.error.start()
 
     def slope(step: float) -> Array:
@@ -92,8 +100,10 @@ def probe_step(rival: Rival, *, seed: int) -> tuple[float | None, bool]:
     return None, False
 
 
-def local_roughness(rival: Rival, *, step: float, seed: int) -> Array:
+def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Array]:
     r"""Return the standard deviation of what no smooth function follows, shape (N,).
+
+    And the draws around the best fit that tell, shape (n, dim).
 
     A simulator of contact or chaos answers a change of its parameters that is far
     within their posterior by a jump. Beside the error of measurement s, jumps of size r
@@ -132,7 +142,7 @@ def local_roughness(rival: Rival, *, step: float, seed: int) -> Array:
         u = np.clip(u, c.low, c.high)
         mean, _, _ = rival.simulator.predict(*c.split(u))
         rough = _beside_quadratic(u - best[0], mean)
-    return rough
+    return rough, u
 
 
 def quadratic(z: Array) -> Array:

@@ -30,7 +30,8 @@ def stairs(height):
 
 
 def test_a_line_has_the_finest_step_and_no_roughness():
-    assert probe_step(linear_rival(), seed=0) == (1e-4, True)
+    rival = linear_rival()
+    assert probe_step(rival, rival.coordinates.sample(4, seed=0)) == (1e-4, True)
     step, is_smooth, rough = look_for_jumps(linear_rival(), seed=0)
     assert (step, is_smooth) == (1e-4, True)
     assert not rough.any()
@@ -43,6 +44,23 @@ def test_stairs_have_the_roughness_of_their_rounding():
     _, is_smooth, rough = look_for_jumps(stairs(height), seed=0)
     assert not is_smooth
     assert np.median(rough) == pytest.approx(height / 4 / 0.6745, rel=0.4)
+
+
+def test_jumps_far_from_the_fit_are_none_there():
+    def curve(theta, action):
+        rough = torch.round(20 * theta) / 20
+        return torch.where(theta.abs() > 0.5, rough, theta) * action
+
+    prior = Independent(Normal(torch.zeros(1), 2 * torch.ones(1)), 1)
+    model = SimulatorModel(curve, noise=GaussianNoise(0.01))
+    action = torch.linspace(1, 2, 8)[:, None]
+    some = RivalSet(model, prior, Trials(action, 0.1 * action), [])
+    assert some.is_smooth
+    assert not some.roughness.any()
+    assert some.step <= 1e-3
+    # The same where the fit is among the jumps.
+    other = RivalSet(model, prior, Trials(action, 1.523 * action), [])
+    assert not other.is_smooth
 
 
 def test_quadratic_functions_leave_nothing_and_noise_its_deviation():
