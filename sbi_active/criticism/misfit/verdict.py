@@ -263,9 +263,9 @@ def find_misfit(
         return None
     search.fit_larger()
     if not is_known:
-        misses = _misses(search)
-        most = search.settings.max_effects if misses else 1
-        if (is_large(rivals.library) and not misses) or _is_one_trial(search, most):
+        if is_large(rivals.library) and not _misses(search):
+            return None
+        if _is_one_trial(search):
             return None
 
     standard = standard_errors(search)
@@ -355,18 +355,21 @@ def _misses(
     return best_process - best_sensor > THRESHOLD
 
 
-def _is_one_trial(search: Search, most: int) -> bool:
-    """Return whether the models of so many effects fit all trials but one."""
+def _is_one_trial(search: Search) -> bool:
+    """Return whether a model of at most one effect fits all trials but one.
+
+    Several effects fit all but the one trial that tells.
+    """
     errors, trial = search.errors, search.rivals.measurements.trial
     if len(np.unique(trial)) < FEWEST_TRIALS:  # two that agree outvote one
         return False
-    models = [c for k, c in search.found.items() if len(k.effects) <= most]
+    models = [c for k, c in search.found.items() if len(k.effects) <= 1]
     best = max(models, key=lambda c: c.log_prior + c.posterior.log_sensor)
     square = np.bincount(trial, best.model.residual**2)
     for suspect in np.argsort(-square)[:NUM_SUSPECTS]:
         # Of few trials a part is a piece of one: all pieces of the suspect go.
         use = np.ones(errors.num_folds, bool)
         use[np.unique(errors.fold[trial == suspect])] = False
-        if not _misses(search, use, most):
+        if not _misses(search, use, 1):
             return True
     return False

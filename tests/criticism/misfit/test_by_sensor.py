@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal
 
-from sbi_active import BoxActions, GaussianNoise, SimulatorModel
+from sbi_active import BoxActions, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
@@ -142,9 +142,10 @@ def test_clean_trials_have_none(few):
     assert trace(verdict, verdict.detected(), compare=False).verdict == "none"
 
 
-def test_numbers_without_a_time_axis_have_no_linear_models():
+@pytest.mark.parametrize("noise", [StudentTNoise(0.1, 4.0), None])
+def test_without_a_gaussian_sensor_there_are_no_linear_models(noise):
     trials = Trials(torch.ones(6, 1), torch.zeros(6, 2))
-    model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
+    model = SimulatorModel(lambda theta, xi: theta * xi, noise=noise)
     prior = BoxUniform(-torch.ones(2), torch.ones(2))
     assert linear_models(RivalSet(model, prior, trials, [], seed=0)) == (None, None)
 
