@@ -11,7 +11,7 @@ from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.cli.declared import declare, read_declared, write_declared
 from sbi_active.cli.folder import library_of
 from sbi_active.cli.given import actions_of, effects_of, prior_of, simulator_of
-from sbi_active.cli.trials import status
+from sbi_active.cli.trials import status, sum_up_campaign
 from sbi_active.cli.words import Answer
 
 SIZES = ("num_simulations", "num_samples", "num_workers", "time_limit")
@@ -47,6 +47,7 @@ def init(
         directory=folder,
     ) as campaign:
         write_declared(folder, declared)
+        sum_up_campaign(campaign)
         print(f"{folder}: a campaign of {campaign.actions}")
     print(f"next: sbi-active ask {folder}")
 

@@ -240,7 +240,7 @@ def _written(param: click.Parameter, value: Any) -> Any:
     if isinstance(value, dict):  # as in columns = {trial = "ball", x = "height"}
         value = [f"{k}={_joined(v)}" for k, v in value.items()]
     if param.nargs == -1:  # numbers of any shape, null for one not measured
-        return ["nan" if v is None else str(v) for v in _flat(value)]
+        return ["nan" if v is None else str(v) for v in flat(value)]
     if param.multiple:
         return [str(v) for v in (value if isinstance(value, list) else [value])]
     return _joined(value)
@@ -250,8 +250,9 @@ def _joined(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _flat(value: Any) -> list[Any]:
-    return sum(map(_flat, value), []) if isinstance(value, list) else [value]
+def flat(value: Any) -> list[Any]:
+    """Return the parts of nested lists."""
+    return sum(map(flat, value), []) if isinstance(value, list) else [value]
 
 
 def numbers_of(text: str) -> list[float]:

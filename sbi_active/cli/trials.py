@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sbi_active.cli.options import number_of, numbers_in, numbers_of
+from sbi_active.cli.record import shaped, sum_up
 from sbi_active.cli.words import Answer, spoken
 
 MANY = 5  # numbers, more than somebody types
@@ -104,7 +106,7 @@ def repair(campaign: Any) -> Answer:
 
 def status(campaign: Any) -> Answer:
     """Print the trials, the belief and the health."""
-    data = campaign.status if hasattr(campaign, "status") else found_in(campaign)
+    data = getattr(campaign, "status", None) or found_in(campaign)
     trials, belief = data["trials"], data["belief"]
     pending = sum(trial["status"] == "pending" for trial in trials)
     waits = ", one pending" if pending else ""
@@ -123,6 +125,23 @@ def status(campaign: Any) -> Answer:
         waiting = data["not_in_belief"]
         lines.append(f"not in the belief yet: {waiting}; run sbi-active update")
     return Answer(data, "\n".join(lines))
+
+
+def sum_up_campaign(campaign: Any) -> None:
+    """Leave a summary in the folder of a campaign that holds the right to write."""
+    from sbi_active.campaign.storage.described import describe_actions
+
+    with contextlib.suppress(Exception):  # a belief without moments has no summary
+        known = {
+            "status": found_in(campaign),
+            "is_sure": True,
+            "x_shape": [*campaign.x_shape],
+            "actions": describe_actions(campaign.actions),
+            "names": [*campaign.actions.names],
+            "units": [*campaign.actions.units],
+            "processed": [*campaign.state.processed],
+        }
+        sum_up(campaign.directory, known)
 
 
 def found_in(campaign: Any) -> dict[str, Any]:
@@ -166,9 +185,9 @@ def described(campaign: Any, trial: Any) -> dict[str, Any]:
 
 
 def _confirmed(campaign: Any, trial: Any) -> Answer:
-    data = described(campaign, trial)
-    what = f"{trial.status} at {_place(data)}{_short(data['x'], ', x = ')}"
-    text = f"trial {trial.index}: {what}\nnext: sbi-active ask {campaign.directory}"
+    data = trial if isinstance(trial, dict) else described(campaign, trial)
+    what = f"{data['status']} at {_place(data)}{_short(data['x'], ', x = ')}"
+    text = f"trial {data['trial']}: {what}\nnext: sbi-active ask {campaign.directory}"
     return Answer(data, text)
 
 
@@ -200,9 +219,7 @@ def _outcome(
             "trial ran and gave none, which tells about the parameters, or --missing "
             "where it failed"
         )
-    import numpy as np
-
-    return np.array(numbers, dtype=np.float64).reshape(shape), "ok"
+    return shaped(numbers, shape), "ok"
 
 
 def _require_trial(campaign: Any, number: int) -> None:
