@@ -7,7 +7,7 @@ at once. A command's module is imported when the command is called.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,8 +47,11 @@ METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
 SETTINGS = ("default", "faithful")
 
 
-def _option(name: str, help: str = "", **settings: Any) -> click.Option:
-    settings = {"type": TEXT, "show_default": "default" in settings, **settings}
+def _option(
+    name: str, help: str, type: Any = TEXT, metavar: str | None = None, **settings: Any
+) -> click.Option:
+    shows = settings.get("default") not in (None, "")
+    settings = {"type": type, "metavar": metavar, "show_default": shows, **settings}
     return click.Option([name], help=help, **settings)
 
 
@@ -64,29 +67,21 @@ def _argument(name: str, metavar: str, type: Any = FOLDER, **settings: Any) -> A
     return click.Argument([name], metavar=metavar, type=type, **settings)
 
 
-MODULE_NAME, A_B = {"metavar": "MODULE:NAME"}, {"metavar": "A,B,..."}
-DIR, BANK = _argument("folder", "DIR"), _argument("folder", "FOLDER")
-TRIAL = _argument("trial", "TRIAL", WHOLE)
-TASK = _argument("task", "TASK", one_of(TASKS))
-TASK_OPTION = _option(
-    "--task", f"one of: {', '.join(TASKS)}", type=one_of(TASKS), metavar="TASK"
-)
-TASK_SETTINGS = click.Option(
-    ["--option"],
-    type=TEXT,
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="of the task, as often as wanted: variant=sinh, target=2, noise=0.01, "
+DIR, TRIAL = _argument("folder", "DIR"), _argument("trial", "TRIAL", WHOLE)
+TASK_NAME, METHOD_NAME = one_of(TASKS), one_of(METHODS)
+TASK_NAMES, METHOD_NAMES = (f"one of: {', '.join(n)}" for n in (TASKS, METHODS))
+A_TASK = _option("--task", TASK_NAMES, TASK_NAME, "TASK")
+OF_TASK = _option(
+    "--option",
+    "of the task, as often as wanted: variant=sinh, target=2, noise=0.01, "
     "theta_true=[0.3,0.4,0.5]; the value is read as JSON, else as text",
+    metavar="NAME=VALUE",
+    multiple=True,
 )
-METHOD = _option(
-    "--method",
-    f"one of: {', '.join(METHODS)}",
-    type=one_of(METHODS),
-    default="asbi",
-    metavar="METHOD",
-)
-SEED = _option("--seed", "of all that is random", type=WHOLE, default=0)
+METHOD = _option("--method", METHOD_NAMES, METHOD_NAME, "METHOD", default="asbi")
+SEED = _option("--seed", "of all that is random", WHOLE, default=0)
+ROUNDS = _option("--rounds", "real trials", COUNT, default=4)
+WORKERS = _option("--workers", "processes", COUNT, default=1)
 JSON = _flag("--json", "for programs, errors too")
 TRUST = _flag("--trust", "import what the folder names, though it came from elsewhere")
 CONFIG = _option(
@@ -94,8 +89,8 @@ CONFIG = _option(
     "options by their names without the dashes in front; in a folder of recordings "
     "problem.toml, beside which problem.py may have a simulator, prior, actions and "
     "effects",
-    type=FILE,
-    metavar="FILE.toml",
+    FILE,
+    "FILE.toml",
     is_eager=True,
     callback=take_config,
 )
@@ -103,42 +98,113 @@ SIMULATOR = _option("--simulator", "or file.py:NAME", metavar="MODULE:FUNCTION")
 SIMULATOR_NOW = _option(
     "--simulator",
     "where it is now; the campaign knows where it was",
-    metavar="MODULE:FUNCTION",
+    metavar="MODULE:FN",
 )
-PRIOR = _option("--prior", "in place of bounds", **MODULE_NAME)
-PROBLEM = [
+PRIOR = _option("--prior", "in place of bounds", metavar="MODULE:NAME")
+ACTIONS = _several(
+    "--actions",
+    "SPEC",
+    "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
+    "A,B,...; or one MODULE:NAME of an action space",
+)
+SPACE = [
     PRIOR,
-    _option("--theta-low", "one a parameter", **A_B),
-    _option("--theta-high", "one a parameter", **A_B),
-    _several(
-        "--actions",
-        "SPEC",
-        "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
-        "A,B,...; or one MODULE:NAME of an action space",
-    ),
+    _option("--theta-low", "one a parameter", metavar="A,B,..."),
+    _option("--theta-high", "one a parameter", metavar="A,B,..."),
+    ACTIONS,
     _option(
-        "--noise",
-        "standard deviation of a measurement, one or one an entry of x, where the "
-        "simulator gives none",
-        metavar="SD[,SD...]",
+        "--noise", "standard deviation of x or of its entries", metavar="SD[,SD...]"
     ),
 ]
 EFFECTS = _option(
     "--effects",
-    "that it may lack: a list of Effect, or a function that returns one",
-    **MODULE_NAME,
+    "a list of Effect, or a function that returns one",
+    metavar="MODULE:NAME",
 )
+REASON = _option("--reason", "kept with the trial", default="")
 OUTCOME = [
-    _argument("x", "[X]...", TEXT, nargs=-1, required=False),
-    _option("--file", "with the numbers", type=FILE, metavar="X.csv"),
+    _argument("x", "[X]...", nargs=-1, type=TEXT, required=False),
+    _option("--file", "with the numbers", FILE, "X.csv"),
     _flag("--invalid", "it ran and gave no measurement"),
     _flag("--missing", "a fault that tells nothing hit it"),
-    _option("--action", "executed, where not the one asked for", **A_B),
+    _option("--action", "executed, where not the one asked for", metavar="A,B,..."),
 ]
-REASON = _option("--reason", "kept with the trial", default="", show_default=False)
-ROWS = _option("--rows", "a check", type=COUNT, default=256)
-ROUNDS = _option("--rounds", "real trials", type=COUNT, default=4)
-WORKERS = _option("--workers", "processes", type=COUNT, default=1)
+RUN = [
+    _argument("task", "TASK", TASK_NAME),
+    *(METHOD, ROUNDS, SEED, OF_TASK),
+    _option("--out", "folder for the results", FOLDER, "DIR", required=True),
+    _option(
+        "--setting", "the paper's is faithful", one_of(SETTINGS), default="default"
+    ),
+    _option("--simulations", "to train on, a round", COUNT),
+    _option("--samples", "for the gain, a candidate action", COUNT),
+    _option("--iterations", "training steps a round", COUNT),
+]
+BUILD = [
+    *(DIR, A_TASK, OF_TASK, SIMULATOR, PRIOR, SEED, WORKERS),
+    _option("--actions", "with --simulator", metavar="MODULE:NAME"),
+    _option("--simulator-version", "in place of its source code", default=""),
+    _option("--rows", "in the bank, in all", COUNT, required=True),
+]
+CHECK = [
+    _argument("simulator", "[MODULE:FUNCTION]", TEXT, required=False),
+    *(A_TASK, *SPACE, ROUNDS, WORKERS, SEED),
+    _option("--rows", "a check", COUNT, default=256),
+]
+INIT = [
+    *(DIR, CONFIG, SIMULATOR, *SPACE, EFFECTS, METHOD, SEED),
+    _option("--names", "of the action's entries", metavar="A,B,..."),
+    _option("--units", "of the action's entries", metavar="A,B,..."),
+    _option("--num-simulations", "a round", WHOLE, "N"),
+    _option("--num-samples", "a candidate action", WHOLE, "N"),
+    _option("--num-workers", "processes", WHOLE, "N"),
+    _option("--time-limit", "s a simulation", SECONDS, "S"),
+]
+CRITICIZE = [
+    _argument("trials", "TRIALS.csv", FILE, is_eager=True, callback=take_problem),
+    *(CONFIG, A_TASK, SIMULATOR, *SPACE, EFFECTS, SEED, TRUST),
+    _several(
+        "--columns",
+        "KEY=NAME[,NAME...]",
+        "columns that are trial, time, action, x, input, start, role, index or "
+        "repeat_of, where they are named otherwise, as in trial=ball,drop x=height_m",
+    ),
+    _several("--units", "NAME=UNIT", "of columns without a unit in the header"),
+    _option(
+        "--order",
+        "unknown: rows (or the column index) are not the order of execution",
+        one_of(("known", "unknown")),
+        default="known",
+    ),
+    _option(
+        "--inputs",
+        "inputs at times of their own: time, input_*, and trial unless all share them",
+        FILE,
+        "INPUTS.csv",
+    ),
+    _option(
+        "--input-hold",
+        "between two times an input has the value before, or is linear",
+        one_of(("previous", "linear")),
+        default="previous",
+    ),
+    _flag("--no-thin", "use all samples of trajectories, with measurement_sd declared"),
+    _flag("--designed", "the actions were chosen for their information"),
+    _option("--out", "folder for the report", FOLDER, "DIR"),
+]
+CHANGED = _flag("--simulator-changed", "take another than before, compute all again")
+TRIALS_CSV = """
+Find what a simulator lacks, from measured trials. Find the residual, trace it to an
+effect that the simulator lacks, add it, and report the error before and after.
+
+TRIALS.csv has one row a trial, with columns action_* and x_* and optionally role (fit
+or 'held out'), index and repeat_of; or one row a sample, with columns trial and time
+besides, and with input_* in place of actions that vary in time. start_* is a measured
+start state. Units stand in brackets, as in x_height[m], and are those of the simulator.
+An empty cell is what was not measured. In its place a folder: of a campaign, which
+knows its simulator and its prior, or of recordings, with trials.csv or one file *.csv a
+trial.
+"""
 
 main = Group(
     "sbi-active",
@@ -147,13 +213,29 @@ main = Group(
     "call or a file has to be changed; 130 after an interrupt.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-click.version_option(
-    package_name="sbi-active",
-    message="%(version)s",
-    help="Show the version and exit.",
-)(main)
+VERSION = {"message": "%(version)s", "help": "Show the version and exit."}
+click.version_option(package_name="sbi-active", **VERSION)(main)
 bank = Group("bank", help="Simulate into a bank, and inspect one.")
 main.add_command(bank)
+
+
+def _add(
+    name: str,
+    place: str,
+    params: Sequence[click.Parameter],
+    help: str,
+    to: Group = main,
+) -> None:
+    """Add a command, whose function has a place as ``module.name``."""
+    call = partial(_call, *place.split("."))
+    to.add_command(Command(name, callback=call, params=[*params], help=help))
+
+
+def _steer(name: str, help: str, *params: click.Parameter) -> None:
+    """Add a command on a campaign, which answers programs too."""
+    given = [DIR, *params, JSON, TRUST]
+    call = partial(_call_on_campaign, name)
+    main.add_command(Command(name, callback=call, params=given, help=help))
 
 
 def _call(module: str, function: str, **options: Any) -> Any:
@@ -161,213 +243,61 @@ def _call(module: str, function: str, **options: Any) -> Any:
     return getattr(found, function)(**options)
 
 
-def _on_campaign(name: str, folder: Path, **options: Any) -> Any:
+def _call_on_campaign(name: str, folder: Path, *, json: bool, **options: Any) -> Any:
     from sbi_active.cli.session import Session
 
-    options.pop("json")
     held = click.get_current_context().obj.get("session")
     with held or Session(folder) as session:
         return session.call(name, **options)
 
 
-def _add(name: str, callback: Callable[..., Any], help: str, *params: Any) -> None:
-    group, _, own = name.rpartition(" ")
-    command = Command(own, callback=callback, help=help, params=[*params])
-    (bank if group else main).add_command(command)
-
-
-def _add_of_campaign(name: str, help: str, *params: Any) -> None:
-    _add(name, partial(_on_campaign, name), help, DIR, *params, JSON, TRUST)
-
-
-_add(
-    "run",
-    partial(_call, "run", "run"),
-    "Run a campaign on a task.",
-    TASK,
-    METHOD,
-    ROUNDS,
-    SEED,
-    _option(
-        "--out", "folder for the results", type=FOLDER, required=True, metavar="DIR"
-    ),
-    TASK_SETTINGS,
-    _option(
-        "--setting",
-        "faithful: the paper's network and chained beliefs",
-        type=one_of(SETTINGS),
-        default="default",
-    ),
-    _option("--simulations", "to train on, a round", type=COUNT),
-    _option("--samples", "for the gain, a candidate action", type=COUNT),
-    _option("--iterations", "training steps a round", type=COUNT),
-)
-_add(
-    "bank build",
-    partial(_call, "bank", "build"),
-    "Simulate prior draws into a bank; run again, it goes on.",
-    BANK,
-    TASK_OPTION,
-    SIMULATOR,
-    TASK_SETTINGS,
-    PRIOR,
-    _option("--actions", "with --simulator", **MODULE_NAME),
-    _option(
-        "--simulator-version",
-        "yours; given, it stands for the simulator's source code",
-        default="",
-        show_default=False,
-    ),
-    _option("--rows", "in the bank, in all", type=COUNT, required=True),
-    SEED,
-    WORKERS,
-)
-_add(
-    "bank inspect",
-    partial(_call, "bank", "inspect"),
-    "Show rows and outcomes, and compare checksums.",
-    BANK,
-)
+_add("run", "run.run", RUN, "Run a campaign on a task.")
+_add("build", "bank.build", BUILD, "Simulate into a bank, from where it ended.", bank)
+_add("inspect", "bank.inspect", [DIR], "Show outcomes, and compare checksums.", bank)
 _add(
     "check",
-    partial(_call, "check", "check"),
+    "check.check",
+    CHECK,
     "Look a simulator over before a campaign. Shapes, seeds, noise, lost rows, "
     "parameters that change nothing, and the cost of a campaign; exit status 1 where "
     "something keeps a campaign from working.",
-    _argument("simulator", "[MODULE:FUNCTION]", TEXT, required=False),
-    TASK_OPTION,
-    *PROBLEM,
-    ROWS,
-    ROUNDS,
-    WORKERS,
-    SEED,
 )
+_add("criticize", "criticize.criticize", CRITICIZE, TRIALS_CSV)
 _add(
-    "criticize",
-    partial(_call, "criticize", "criticize"),
-    "Find what a simulator lacks, from measured trials. Find the residual, trace it to "
-    "an effect that the simulator lacks, add it, and report the error before and "
-    "after. TRIALS.csv has one row a trial, with columns action_* and x_* and "
-    "optionally role (fit or 'held out'), index and repeat_of; or one row a sample, "
-    "with columns trial and time besides, and with input_* in place of actions that "
-    "vary in time. start_* is a measured start state. Units stand in brackets, as in "
-    "x_height[m], and are those of the simulator. An empty cell is what was not "
-    "measured. In its place a folder: of a campaign, which knows its simulator and its "
-    "prior, or of recordings, with trials.csv or one file *.csv a trial.",
-    _argument("trials", "TRIALS.csv", FILE, is_eager=True, callback=take_problem),
-    CONFIG,
-    _several(
-        "--columns",
-        "KEY=NAME[,NAME...]",
-        "columns that are trial, time, action, x, input, start, role, index or "
-        "repeat_of, where they are named otherwise, as in trial=ball,drop time=time_s "
-        "x=height_m",
-    ),
-    _several("--units", "NAME=UNIT", "of columns without a unit in the header"),
-    _option(
-        "--order",
-        "unknown: rows (or the column index) are not the order of execution",
-        type=one_of(("known", "unknown")),
-        default="known",
-    ),
-    _option(
-        "--inputs",
-        "inputs at times of their own: time, input_*, and trial unless all share them",
-        type=FILE,
-        metavar="INPUTS.csv",
-    ),
-    _option(
-        "--input-hold",
-        "between two times an input has the value before, or is linear",
-        type=one_of(("previous", "linear")),
-        default="previous",
-    ),
-    _flag(
-        "--no-thin",
-        "use all samples of trajectories, where the simulator declares the sensor's "
-        "error by measurement_sd",
-    ),
-    TASK_OPTION,
-    SIMULATOR,
-    *PROBLEM,
-    EFFECTS,
-    _flag("--designed", "the actions were chosen for their information"),
-    _option("--out", "folder for the report", type=FOLDER, metavar="DIR"),
-    SEED,
-    TRUST,
+    "init", "campaign.init", INIT, "Make a campaign in a new folder, also by --config."
 )
-_add(
-    "init",
-    partial(_call, "campaign", "init"),
-    "Make a campaign in a new folder. The options may stand in a TOML file, by their "
-    "names without the dashes in front.",
-    DIR,
-    CONFIG,
-    SIMULATOR,
-    *PROBLEM,
-    _option("--names", "of the action's entries", **A_B),
-    _option("--units", "of the action's entries", **A_B),
-    EFFECTS,
-    METHOD,
-    _option("--num-simulations", "a round", type=WHOLE, metavar="N"),
-    _option("--num-samples", "a candidate action", type=WHOLE, metavar="N"),
-    _option("--num-workers", "processes", type=WHOLE, metavar="N"),
-    _option("--time-limit", "s a simulation", type=SECONDS, metavar="S"),
-    SEED,
-)
-_add_of_campaign(
+_steer(
     "ask",
     "Design the next trial, or show the pending one.",
     SIMULATOR_NOW,
-    _option(
-        "--target",
-        "what it should tell about: theta, model or a parameter's name",
-        default="auto",
-    ),
+    _option("--target", "theta, model or a parameter's name", default="auto"),
 )
-_add_of_campaign(
+_steer(
     "tell",
     "Record what a trial gave. X are the numbers, nan for one not measured.",
     *OUTCOME,
-    _option("--trial", "None is the pending one, or a new one", type=WHOLE),
+    _option("--trial", "None is the pending one, or a new one", WHOLE, "K"),
 )
-_add_of_campaign(
-    "correct", "Replace what was told of a trial.", TRIAL, *OUTCOME, REASON
-)
-_add_of_campaign("withdraw", "Take a trial out of the belief.", TRIAL, REASON)
-_add_of_campaign("status", "Show the trials, the belief and the health.")
-_add_of_campaign("repair", "Give up what is damaged, and say what that is.")
-_add_of_campaign(
-    "update",
-    "Bring the belief up to date.",
-    SIMULATOR_NOW,
-    _flag(
-        "--simulator-changed",
-        "take another simulator than before, and compute everything again",
-    ),
-)
-_add_of_campaign(
-    "adopt", "Go on with the effects that a verdict names.", SIMULATOR_NOW, EFFECTS
-)
-_add_of_campaign(
+_steer("correct", "Replace what was told of a trial.", TRIAL, *OUTCOME, REASON)
+_steer("withdraw", "Take a trial out of the belief.", TRIAL, REASON)
+_steer("status", "Show the trials, the belief and the health.")
+_steer("repair", "Give up what is damaged, and say what that is.")
+_steer("update", "Bring the belief up to date.", SIMULATOR_NOW, CHANGED)
+_steer("adopt", "Go on with the effects that a verdict names.", SIMULATOR_NOW, EFFECTS)
+_steer(
     "report",
     "Write one page that shows the campaign.",
-    _option("--out", "where to", type=FILE, metavar="PAGE.html"),
+    _option("--out", "where to", FILE, "PAGE.html"),
 )
-_add_of_campaign(
+_steer(
     "export",
     "Write belief and trials for ArviZ.",
-    SIMULATOR_NOW,
-    _option("--netcdf", "where to", type=FILE, required=True, metavar="FILE.nc"),
-    SEED,
+    *(SIMULATOR_NOW, SEED),
+    _option("--netcdf", "where to", FILE, "FILE.nc", required=True),
 )
 _add(
     "serve",
-    partial(_call, "session", "serve"),
-    "Answer requests of a program. One JSON object a line comes on standard input, as "
-    '{"command": "tell", "x": [0.84]}, and one goes to standard output; imports are '
-    "paid for once.",
-    DIR,
-    SIMULATOR_NOW,
-    TRUST,
+    "session.serve",
+    [DIR, SIMULATOR_NOW, TRUST],
+    'Answer requests of a program, a JSON object a line, as {"command": "ask"}.',
 )

@@ -29,7 +29,7 @@ class Value(click.ParamType):
         what: Words for the error.
         read: Returns the value of a word; ValueError or KeyError for any other word.
         names: Of the words, for the completion of a shell.
-        kind: Of what a shell completes besides: "plain", "file" or "dir".
+        kind: Of the words, for the help; a shell completes a "file" or a "dir".
     """
 
     def __init__(
@@ -37,9 +37,10 @@ class Value(click.ParamType):
         what: str,
         read: Callable[[Any], Any],
         names: Sequence[str] = (),
-        kind: str = "plain",
+        kind: str = "text",
     ) -> None:
-        self.name, self._read, self._names, self._kind = what, read, names, kind
+        self.name, self._names, self._kind = "value", names, kind
+        self._what, self._read = what, read
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -49,13 +50,17 @@ class Value(click.ParamType):
             return self._read(value)
         except (ValueError, KeyError):
             hint = "choose one of these" if self._names else "correct it"
-            self.fail(f"expected {self.name}; got {value!a:.80}; {hint}", param, ctx)
+            self.fail(f"expected {self._what}; got {value!a:.80}; {hint}", param, ctx)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """Return what stands for a word in the help."""
+        return "|".join(self._names) or self._kind.upper()
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
         """Return how a word that has begun may go on."""
-        if self._kind != "plain":
+        if self._kind in ("file", "dir"):
             return [CompletionItem(incomplete, type=self._kind)]
         return [CompletionItem(n) for n in self._names if n.startswith(incomplete)]
 
@@ -76,8 +81,9 @@ def _text(word: str) -> str:
     return word.encode(errors="surrogateescape").decode()
 
 
-WHOLE, COUNT = Value("a whole number", int), Value("a whole number >= 1", _count)
-SECONDS, TEXT = Value("a number", float), Value("text in UTF-8", _text)
+WHOLE = Value("a whole number", int, kind="n")
+COUNT = Value("a whole number >= 1", _count, kind="n")
+SECONDS, TEXT = Value("a number", float, kind="s"), Value("text in UTF-8", _text)
 FILE, FOLDER = Value("a path", Path, kind="file"), Value("a path", Path, kind="dir")
 
 

@@ -104,12 +104,11 @@ class Record:
         """Record the outcome of the pending trial, or of a new one with an action."""
         trials = self.state.trials
         pending = [t["trial"] for t in trials if t["status"] == "pending"]
-        if trial is None:
-            trial = pending[0] if pending else len(trials)
-        if trial in pending:
-            before = self._facts()[trial]
-        elif trial == len(trials) and action is not None:
-            before = {"index": trial, "action": None, "target": None, "reason": ""}
+        index = [*pending, len(trials)][0] if trial is None else trial
+        if index in pending:
+            before = self._facts()[index]
+        elif index == len(trials) and action is not None:
+            before = {"index": index, "action": None, "target": None, "reason": ""}
         else:  # a trial told again, or none
             raise Unsure
         return self._write("told", self._told(before, x, action, status))
@@ -165,10 +164,10 @@ class Record:
 
     def _permits(self, action: list[float]) -> bool:
         """Return whether an action is plainly one of the campaign's."""
-        space = self._summary["actions"] or {"kind": "of its author"}
-        if space["kind"] == "list":
+        space: dict[str, Any] = self._summary["actions"] or {}
+        if space.get("kind") == "list":
             return action in space["values"]
-        if space["kind"] != "box" or len(action) != len(space["low"]):
+        if space.get("kind") != "box" or len(action) != len(space["low"]):
             return False
         limits = zip(space["low"], action, space["high"], strict=True)
         return all(low <= a <= high for low, a, high in limits)
@@ -195,10 +194,10 @@ class Record:
         trials[index : index + 1] = [told]
         found = self._summary["status"]
         waiting = sorted({*found["not_in_belief"], index})
-        changed = {"status": {**found, "not_in_belief": waiting}}
-        if index in self._summary["processed"]:
-            changed["is_sure"] = False
-        sum_up(self.directory, {**self._summary, **changed})
+        status = {**found, "not_in_belief": waiting}
+        is_sure = self._summary["is_sure"] and index not in self._summary["processed"]
+        known = {**self._summary, "status": status, "is_sure": is_sure}
+        sum_up(self.directory, known)
         return told
 
 
