@@ -42,7 +42,7 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
         folder: Of the campaign.
         known: What :class:`Record` needs.
     """
-    content = {**known, "of": _digest(folder)}
+    content = {**known, "of": digest(folder)}
     temporary = folder / f".{os.getpid()}-{SUMMARY}"
     with contextlib.suppress(OSError):  # as in a folder that is read only
         with open(temporary, "x", encoding="utf-8") as file:  # follows no link
@@ -50,14 +50,19 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
         os.replace(temporary, folder / SUMMARY)
 
 
-def _digest(folder: Path) -> str:
-    digest = hashlib.sha256()
+def digest(folder: Path) -> str:
+    """Return what changes whenever anybody writes to a campaign.
+
+    Args:
+        folder: Of the campaign.
+    """
+    found = hashlib.sha256()
     for name in FILES:
         path, size = folder / name, HEAD if name == STATE else -1
-        with contextlib.suppress(FileNotFoundError), open(path, "rb") as file:
-            digest.update(file.read(size))
-        digest.update(name.encode())
-    return digest.hexdigest()
+        with contextlib.suppress(OSError, ValueError), open(path, "rb") as file:
+            found.update(file.read(size))
+        found.update(name.encode())
+    return found.hexdigest()
 
 
 class Record:
@@ -133,15 +138,13 @@ class Record:
         )
 
     def _require_same(self) -> None:
-        if self._summary["of"] != _digest(self.directory):
+        if self._summary["of"] != digest(self.directory):
             raise Unsure
 
     def _facts(self) -> list[dict[str, Any]]:
         """Return each trial as the log has it last."""
-        self._log = TrialLog(self.directory / LOG)
-        facts = {
-            e["trial"]["index"]: e["trial"] for e in self._log.entries if "trial" in e
-        }
+        entries = TrialLog(self.directory / LOG).entries
+        facts = {e["trial"]["index"]: e["trial"] for e in entries if "trial" in e}
         if [*sorted(facts)] != [*range(len(self.state.trials))]:
             raise Unsure
         return [facts[index] for index in sorted(facts)]

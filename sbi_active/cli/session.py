@@ -18,14 +18,13 @@ import click
 
 from sbi_active.cli import trials
 from sbi_active.cli.options import as_written
-from sbi_active.cli.record import Record, Unsure
+from sbi_active.cli.record import Record, Unsure, digest
 from sbi_active.cli.words import Answer, as_json, failure_json, output_to_errors
 
 #: Commands for which the simulator runs.
 SIMULATE = ("ask", "update", "criticize", "adopt")
 SUMMED = ("ask", "update", "adopt")  # of these, that hold the right to write
 LIGHT = ("tell", "correct", "withdraw", "status")
-LOG = "trials.jsonl"  # that grows with each trial, whoever writes
 
 
 class Session:
@@ -46,7 +45,7 @@ class Session:
     def __exit__(self, kind: object, *_: object) -> None:
         if self._campaign is not None:
             self._campaign.close()  # let others write
-            self._opened["log"] = self._log()
+            self._opened["files"] = digest(self.folder)
         if kind is not None:  # what went wrong may be that another process wrote
             self._campaign = None
 
@@ -68,7 +67,7 @@ class Session:
             simulator_changed: Take another simulator than before.
             **options: Of the command.
         """
-        wants = {"trust": trust, "simulator": simulator, "log": self._log()}
+        wants = {"trust": trust, "simulator": simulator, "files": digest(self.folder)}
         exports = name == "export" and (trust or simulator is not None)
         simulates = name in SIMULATE or exports
         held = self._campaign
@@ -87,21 +86,14 @@ class Session:
                 simulator_changed=simulator_changed,
                 repair=name == "repair",
             )
-        home = trials
-        if not hasattr(trials, name):
+        # What a repair gave up is said by warnings; what is left is the answer.
+        home, function = trials, "status" if name == "repair" else name
+        if not hasattr(trials, function):
             home = import_module("sbi_active.cli.campaign")
-        answer = getattr(home, name)(self._campaign, **options)
+        answer = getattr(home, function)(self._campaign, **options)
         if name in SUMMED:
             trials.sum_up_campaign(self._campaign)
         return answer
-
-    def _log(self) -> tuple[int, int]:
-        """Return what tells whether somebody else wrote to the campaign."""
-        try:
-            found = os.stat(self.folder / LOG)
-        except (OSError, ValueError):
-            return 0, 0
-        return found.st_mtime_ns, found.st_size
 
 
 def serve(folder: Path, *, simulator: str | None, trust: bool) -> None:

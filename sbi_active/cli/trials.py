@@ -35,23 +35,16 @@ def ask(campaign: Any, *, target: str) -> Answer:
 
 
 def tell(
-    campaign: Any,
-    *,
-    x: Sequence[str],
-    file: Path | None,
-    invalid: bool,
-    missing: bool,
-    action: str | None,
-    trial: int | None,
+    campaign: Any, *, trial: int | None, action: str | None, **outcome: Any
 ) -> Answer:
     """Record what a trial gave; it is on the disk when this ends."""
     if trial is not None:
         _require_trial(campaign, trial)
-    outcome, status = _outcome(campaign, x, file, invalid=invalid, missing=missing)
+    x, status = _outcome(campaign, **outcome)
     executed = None if action is None else numbers_of(action)
     folder = campaign.directory
     try:
-        told = campaign.tell(outcome, trial=trial, action=executed, status=status)
+        told = campaign.tell(x, trial=trial, action=executed, status=status)
     except ValueError as error:
         if not str(error).startswith("expected a pending trial"):
             raise
@@ -64,27 +57,15 @@ def tell(
 
 
 def correct(
-    campaign: Any,
-    *,
-    trial: int,
-    x: Sequence[str],
-    file: Path | None,
-    invalid: bool,
-    missing: bool,
-    action: str | None,
-    reason: str,
+    campaign: Any, *, trial: int, action: str | None, reason: str, **outcome: Any
 ) -> Answer:
     """Replace what was told of a trial."""
     _require_trial(campaign, trial)
-    outcome, status, executed = None, "ok", None
-    if action is not None:
-        executed = numbers_of(action)
-    if action is None or x or file is not None or invalid or missing:
-        outcome, status = _outcome(campaign, x, file, invalid=invalid, missing=missing)
-    told = campaign.correct(
-        trial, outcome, action=executed, status=status, reason=reason
-    )
-    return _confirmed(campaign, told)
+    executed = None if action is None else numbers_of(action)
+    is_of_action = executed is not None and not any(outcome.values())
+    x, status = (None, "ok") if is_of_action else _outcome(campaign, **outcome)
+    what = {"action": executed, "status": status, "reason": reason}
+    return _confirmed(campaign, campaign.correct(trial, x, **what))
 
 
 def withdraw(campaign: Any, *, trial: int, reason: str) -> Answer:
@@ -96,11 +77,6 @@ def withdraw(campaign: Any, *, trial: int, reason: str) -> Answer:
 def update(campaign: Any) -> Answer:
     """Bring the belief up to date with the trials told so far."""
     campaign.update()
-    return status(campaign)
-
-
-def repair(campaign: Any) -> Answer:
-    """Name what is left of what was damaged, and has to be told again."""
     return status(campaign)
 
 
@@ -192,7 +168,7 @@ def _confirmed(campaign: Any, trial: Any) -> Answer:
 
 
 def _outcome(
-    campaign: Any, x: Sequence[str], file: Path | None, **flags: bool
+    campaign: Any, *, x: Sequence[str], file: Path | None, **flags: bool
 ) -> tuple[Any, Any]:
     """Return what was measured, in the shape of the simulator's x, and its status."""
     said = [name for name, value in flags.items() if value]
