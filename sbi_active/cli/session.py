@@ -106,7 +106,7 @@ def serve(folder: Path, *, simulator: str | None, trust: bool) -> None:
     session = Session(folder)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     with answers, output_to_errors():
-        for line in sys.stdin:
+        for line in sys.stdin.buffer:
             if line.strip():
                 _write(answers, _answer(line, session, given))
 
@@ -116,7 +116,7 @@ def _write(answers: TextIO, answer: dict[str, Any]) -> None:
     answers.flush()
 
 
-def _answer(line: str, session: Session, given: dict[str, Any]) -> dict[str, Any]:
+def _answer(line: bytes, session: Session, given: dict[str, Any]) -> dict[str, Any]:
     """Return the answer to a request, or its error; both with the id that it has."""
     named: dict[str, Any] = {}
     try:
@@ -128,14 +128,14 @@ def _answer(line: str, session: Session, given: dict[str, Any]) -> dict[str, Any
         return {**named, **failure_json(error, session.folder)}
 
 
-def _request(line: str) -> dict[str, Any]:
+def _request(line: bytes) -> dict[str, Any]:
     try:
         request = json.loads(line)
     except (ValueError, RecursionError):
         request = None
     if not isinstance(request, dict):
         raise ValueError(
-            f'expected a request as {{"command": "ask"}}; got {line.strip()!r:.80}; '
+            f'expected a request as {{"command": "ask"}}; got {line.strip()!a:.80}; '
             "write one JSON object a line"
         )
     return request

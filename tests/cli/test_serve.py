@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -54,7 +55,7 @@ class Server:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
+            encoding="latin-1",
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
 
@@ -97,7 +98,7 @@ def server(camp):
 def test_a_robot_s_loop(server):
     asked = server.says({"command": "ask", "id": 7})
     assert asked["id"] == 7
-    assert asked["answer"]["names"] == ["speed"] or asked["answer"]["names"]
+    assert asked["answer"]["names"] == ["action"]
     told = server.says({"command": "tell", "x": 0.7, "trial": asked["answer"]["trial"]})
     assert told["answer"]["x"] == [pytest.approx(0.7)]
     assert told["answer"]["status"] == "ok"
@@ -120,6 +121,7 @@ def test_a_robot_s_loop(server):
 @pytest.mark.parametrize(
     ("request_", "text"),
     [
+        ("\xff", "write one JSON object a line"),
         ("{", "write one JSON object a line"),
         ("[1]", "write one JSON object a line"),
         ("[" * 99_999, "write one JSON object a line"),
@@ -161,6 +163,14 @@ def test_another_process_may_write_between_two_requests(server):
     assert len(server.says({"command": "status"})["answer"]["trials"]) == 2
     assert server.says({"command": "tell", "x": 0.6, "action": 1.5})["answer"]
     assert main(["status", "camp"]) == 0
+
+
+def test_an_interrupt_ends_the_session(server):
+    assert server.says({"command": "status"})["answer"]["trials"] == []
+    server.process.send_signal(signal.SIGINT)
+    status, error = server.ends()
+    assert status == 130
+    assert error.splitlines()[-1].startswith("sbi-active: interrupted")
 
 
 def test_what_serve_needs_is_said_before_it_begins(capsys):
