@@ -31,15 +31,8 @@ from sbi_active.cli.options import (
 
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
 TASKS = (
-    "numerical",
-    "oscillator",
-    "box_collision",
-    "pouring",
-    "pouring_real",
-    "servo_pendulum",
-    "ball_drops",
-    "location_finding",
-    "chain",
+    *("numerical", "oscillator", "box_collision", "pouring", "pouring_real"),
+    *("servo_pendulum", "ball_drops", "location_finding", "chain"),
 )
 #: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
 METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")

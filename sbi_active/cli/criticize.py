@@ -24,10 +24,11 @@ from sbi_active.cli.given import (
     load_object,
     prior_of,
     simulator_of,
+    with_generic,
     with_noise,
 )
 from sbi_active.cli.session import Session
-from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
+from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import TrialTable
 from sbi_active.criticism.effects.augmented import takes_times
@@ -66,14 +67,12 @@ def criticize(trials: Path, **options: Any) -> None:
     space = actions or DiscreteActions(measured.action.unique(dim=0).float())
     over_time = measured.inputs is not None
     own = [*effects, *effects_of([given.effects] if given.effects else [])]
-    taken = {effect.name for effect in own}
-    shape = measured if over_time else space
-    generic = generic_effects(simulator, shape, prior=prior)
+    known = measured if over_time else space
     report = close_loop(
         simulator,
         prior,
         measured,
-        effects=[*own, *(e for e in generic if e.name not in taken)],
+        effects=with_generic(own, simulator, known, prior),
         actions=actions,
         thin=not given.no_thin,
         seed=given.seed,

@@ -9,9 +9,14 @@ from typing import Any
 from sbi_active.campaign import Campaign
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.declared import named, read_declared, require_trust
-from sbi_active.cli.given import effects_of, load_object, make_task, simulator_of
-from sbi_active.criticism import Effect, generic_effects
-from sbi_active.simulation import SimulatorModel
+from sbi_active.cli.given import (
+    effects_of,
+    load_object,
+    make_task,
+    simulator_of,
+    with_generic,
+)
+from sbi_active.criticism import Effect
 
 
 def open_campaign(
@@ -108,15 +113,4 @@ def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:
 
 
 def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:
-    """Return effects and the generic ones of other names.
-
-    Args:
-        own: Declared ones.
-        simulator: As it was before any was adopted.
-        reader: The campaign, with the prior from before.
-    """
-    if not isinstance(simulator, SimulatorModel):
-        simulator = SimulatorModel(simulator)
-    taken = {effect.name for effect in own}
-    generic = generic_effects(simulator, reader.actions, prior=reader.first_prior)
-    return [*own, *(effect for effect in generic if effect.name not in taken)]
+    return with_generic(own, simulator, reader.actions, reader.first_prior)

@@ -25,7 +25,7 @@ from sbi_active.actions import (
 from sbi_active.cli.declared import in_campaign, names_object
 from sbi_active.cli.options import number_of, numbers_of
 from sbi_active.cli.words import place_of
-from sbi_active.criticism import Effect
+from sbi_active.criticism import Effect, generic_effects
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 
@@ -285,3 +285,21 @@ def effects_of(names: Sequence[str], folder: str | None = None) -> list[Effect]:
             )
         effects += found
     return effects
+
+
+def with_generic(
+    own: Sequence[Effect], simulator: Any, space: Any, prior: Distribution
+) -> list[Effect]:
+    """Return effects and the generic ones of other names.
+
+    Args:
+        own: Declared ones.
+        simulator: As it was before any was adopted.
+        space: Actions, or trials with inputs.
+        prior: Of the simulator's parameters.
+    """
+    if not isinstance(simulator, SimulatorModel):
+        simulator = SimulatorModel(simulator)
+    taken = {effect.name for effect in own}
+    generic = generic_effects(simulator, space, prior=prior)
+    return [*own, *(effect for effect in generic if effect.name not in taken)]

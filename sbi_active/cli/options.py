@@ -99,22 +99,15 @@ class Group(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Return what the command gets."""
-        if not args and not ctx.resilient_parsing:
-            raise self._unknown(ctx, "none")
-        return super().parse_args(ctx, args)
-
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
-        """Return the command that the first word names, and the other words."""
-        if args[0] not in self.commands and not ctx.resilient_parsing:
-            raise self._unknown(ctx, args[0])
-        return super().resolve_command(ctx, args)
-
-    def _unknown(self, ctx: click.Context, word: str) -> click.UsageError:
-        names = ", ".join(sorted(self.commands))
+        word = args[0] if args else "none"
+        is_option = word.startswith("-")
+        if word in self.commands or is_option or ctx.resilient_parsing:
+            return super().parse_args(ctx, args)
         near = difflib.get_close_matches(word, self.commands, 1)
         todo = f"write {near[0]}" if near else "choose one of these"
+        names = ", ".join(sorted(self.commands))
         text = f"expected a command among {names}; got {word}; {todo}"
-        return click.UsageError(text, ctx)
+        raise click.UsageError(text, ctx)
 
 
 class Command(click.Command):

@@ -87,7 +87,8 @@ def status(campaign: Any) -> Answer:
     pending = sum(trial["status"] == "pending" for trial in trials)
     waits = ", one pending" if pending else ""
     head = f"{data['method']}, {len(trials) - pending} trials{waits}"
-    lines = [f"{head}{belief['combinations']}, health {data['health']}"]
+    together = f"; {belief['combinations']}" if belief["combinations"] else ""
+    lines = [f"{head}, health {data['health']}{together}"]
     for trial in trials:
         gained, reason = trial["information_gained"], trial["reason"]
         gain = "" if gained is None else f"  {gained:.2f} nats"
@@ -138,7 +139,7 @@ def found_in(campaign: Any) -> dict[str, Any]:
             },
             "trustworthy": None if diagnostics is None else diagnostics.trustworthy,
             "warnings": [] if diagnostics is None else [*diagnostics.warnings],
-            "combinations": f"; {together}" if together else "",
+            "combinations": str(together) if together else None,
         },
         "health": campaign.health,
         "not_in_belief": waiting,
