@@ -162,17 +162,16 @@ def in_words(error: click.ClickException) -> str:
     text, ctx = error.format_message(), getattr(error, "ctx", None)
     path = "sbi-active" if ctx is None else ctx.command_path
     if isinstance(error, click.NoSuchOption):
-        near = (
-            f"write {' or '.join(error.possibilities)}" if error.possibilities else ""
-        )
-        got = f"got {error.option_name}; {near or 'leave it out'}"
-        return f"expected an option of {path}; {got}, or see {path} --help"
+        near = " or ".join(error.possibilities or ())
+        todo = f"write {near}" if near else "leave it out"
+        got = f"got {error.option_name}; {todo}, or see {path} --help"
+        return f"expected an option of {path}; {got}"
     if isinstance(error, click.MissingParameter) and error.param is not None:
         what = error.param.get_error_hint(ctx) if ctx else error.param.name
         return f"expected {what}; got none; give it, or see {path} --help"
     if isinstance(error, click.BadParameter) and error.param is not None:
         return f"{error.param.get_error_hint(ctx) if ctx else ''}: {error.message}"
-    return f"{text}, or see {path} --help"
+    return f"{text.rstrip('.')}, or see {path} --help"
 
 
 def take_config(
@@ -225,8 +224,8 @@ def as_written(
         param = known.get(name.replace("-", "_"))
         if param is None or param.name is None:
             raise ValueError(
-                f"expected options among {', '.join(sorted(known))}; got {name!r} in "
-                f"{place}; remove it or write one of these"
+                f"expected options among {', '.join(sorted(known)) or 'none'}; got {name!r} "
+                f"in {place}; remove it or write one of these"
             )
         if value is not None:
             found[param.name] = _written(param, value)
@@ -235,6 +234,10 @@ def as_written(
 
 def _written(param: click.Parameter, value: Any) -> Any:
     if getattr(param, "is_flag", False):
+        if not isinstance(value, bool):
+            raise ValueError(
+                f"expected true or false as {param.name}; got {value!r:.80}; correct it"
+            )
         return value
     if isinstance(value, dict):  # as in columns = {trial = "ball", x = "height"}
         value = [f"{k}={_joined(v)}" for k, v in value.items()]
@@ -251,7 +254,9 @@ def _joined(value: Any) -> str:
 
 def flat(value: Any) -> list[Any]:
     """Return the parts of nested lists."""
-    return sum(map(flat, value), []) if isinstance(value, list) else [value]
+    if not isinstance(value, list):
+        return [value]
+    return [part for item in value for part in flat(item)]
 
 
 def numbers_of(text: str) -> list[float]:
