@@ -223,9 +223,10 @@ def as_written(
     for name, value in values.items():
         param = known.get(name.replace("-", "_"))
         if param is None or param.name is None:
+            names = ", ".join(sorted(known)) or "none"
             raise ValueError(
-                f"expected options among {', '.join(sorted(known)) or 'none'}; got {name!r} "
-                f"in {place}; remove it or write one of these"
+                f"expected options among {names}; got {name!r} in {place}; remove it or "
+                "write one of these"
             )
         if value is not None:
             found[param.name] = _written(param, value)
