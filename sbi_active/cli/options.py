@@ -225,8 +225,8 @@ def as_written(
         if param is None or param.name is None:
             names = ", ".join(sorted(known)) or "none"
             raise ValueError(
-                f"expected options among {names}; got {name!r} in {place}; remove it or "
-                "write one of these"
+                f"expected options among {names}; got {name!r} in {place}; remove it "
+                "or write one of these"
             )
         if value is not None:
             found[param.name] = _written(param, value)

@@ -25,6 +25,7 @@ from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
+from sbi_active.cli.trials import sum_up_campaign
 from sbi_active.cli.words import as_json
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
@@ -134,6 +135,7 @@ def run(
         said = {"task": task, "options": [*option], "method": method}
         said |= {"setting": setting, "seed": seed, "version": __version__}
         _save(out, campaign, {**said, "seconds": wall, "rounds": records}, seed)
+        sum_up_campaign(campaign)
         campaign.close()
     print(_table(records))
     belief = campaign.belief
