@@ -72,7 +72,7 @@ def one_of(names: Sequence[str]) -> Value:
 
 def _count(word: Any) -> int:
     if int(word) < 1:
-        raise ValueError(word)
+        raise ValueError(f"expected at least 1; got {word}; write more")
     return int(word)
 
 
