@@ -3,7 +3,8 @@
     python -m benchmarks cost.doors
 
 Each line is a process of its own; lines are run in turn, three times over, and the
-median counts. ``-X importtime`` then names the slowest of what is imported.
+median counts. Those on a campaign are a round of a robot's loop, in a new folder each
+time. ``-X importtime`` then names the slowest of what is imported.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 from datetime import date
 from pathlib import Path
 
@@ -32,14 +34,67 @@ DOORS = {
     "sbi-active run numerica": ["-c", _MAIN, "run", "numerica", "--out", "."],
     "sbi-active run --roundz 3": ["-c", _MAIN, "run", "numerical", "--roundz", "3"],
 }
+SIMULATOR = """
+def slide(theta, action):
+    friction, drag = theta[:, :1], theta[:, 1:]
+    return action**2 / (2 * 9.81 * friction) / (1 + drag * action)
+"""
+INIT = (
+    "init camp --simulator sled.py:slide --noise 0.02 --theta-low 0.2,0 "
+    "--theta-high 1,1 --actions 0.5:3 --method nsbi --num-simulations 200"
+)
+ROUND = (
+    "ask camp",
+    "tell camp 0.7",
+    "status camp",
+    "correct camp 0 0.71",
+    "update camp",
+    "withdraw camp 0",
+)
+#: The same round by one session, whose requests these are.
+SERVED = (
+    {"command": "ask"},
+    {"command": "tell", "x": 0.7},
+    {"command": "status"},
+    {"command": "correct", "trial": 0, "x": 0.71},
+    {"command": "update"},
+    {"command": "withdraw", "trial": 0},
+)
 
 
-def cpu_seconds(arguments: list[str]) -> float:
-    """Return user and system time of one process of this Python."""
+def cpu_seconds(
+    arguments: list[str], folder: str | None = None, said: str = ""
+) -> float:
+    """Return user and system time of one process of this Python.
+
+    Args:
+        arguments: Of the process.
+        folder: Where it runs; None is here.
+        said: To its standard input.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, *arguments], capture_output=True, check=False)
+    command = [sys.executable, *arguments]
+    subprocess.run(
+        command, capture_output=True, check=False, cwd=folder, input=said.encode()
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+
+
+def loop_seconds() -> dict[str, float]:
+    """Return CPU seconds of each command of a round, and of the round by a session."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "sled.py").write_text(SIMULATOR)
+        for words in (INIT, *ROUND):
+            seconds = cpu_seconds(["-c", _MAIN, *words.split()], folder)
+            found[f"sbi-active {words.partition(' --')[0]}"] = seconds
+        again = INIT.replace("camp", "other").split()
+        cpu_seconds(["-c", _MAIN, *again], folder)
+        said = "".join(json.dumps(request) + "\n" for request in SERVED)
+        seconds = cpu_seconds(["-c", _MAIN, "serve", "other"], folder, said)
+        found[f"sbi-active serve other, {len(SERVED)} requests"] = seconds
+    return found
 
 
 def slowest_imports(statement: str, num: int = 5) -> list[tuple[str, float]]:
@@ -56,12 +111,12 @@ def slowest_imports(statement: str, num: int = 5) -> list[tuple[str, float]]:
 def main() -> None:
     """Print the table and keep it."""
     runs = [
-        {name: cpu_seconds(line) for name, line in DOORS.items()}
+        {name: cpu_seconds(line) for name, line in DOORS.items()} | loop_seconds()
         for _ in range(NUM_RUNS)
     ]
-    medians = {name: statistics.median(run[name] for run in runs) for name in DOORS}
+    medians = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
     for name, seconds in medians.items():
-        print(f"{name:32} {seconds:6.3f} CPU s")
+        print(f"{name:36} {seconds:6.3f} CPU s")
     imports = {statement: slowest_imports(statement) for statement in [*DOORS][:4]}
     for statement, packages in imports.items():
         listed = ", ".join(f"{name} {seconds:.2f}" for name, seconds in packages)

@@ -226,3 +226,40 @@ def stranger(command: str) -> None:
     }
     call(command, "camp", *rest.get(command, []))
     assert not Path("ran").exists()
+
+
+LINES: dict[str, bytes] = {
+    "no JSON": b"ask",
+    "half of it": b'{"command": "ask"',
+    "a list": b"[1]",
+    "no encoding": b"\xff\xfe{}",
+    "a NUL": b'{"command": "st\x00atus"}',
+    "nested": b"[" * 100_000,
+    "very long": b'{"command": "' + b"a" * 1_000_000 + b'"}',
+    "no command": b"{}",
+    "a command of the shell": b'{"command": "init", "folder": "new"}',
+    "another folder": b'{"command": "status", "folder": "/tmp"}',
+    "trust": b'{"command": "status", "trust": true}',
+    "text as x": b'{"command": "tell", "x": "fast", "action": 1}',
+    "nothing as x": b'{"command": "tell", "x": null, "action": 1}',
+    "infinite": b'{"command": "tell", "x": [Infinity], "action": 1}',
+    "two numbers": b'{"command": "tell", "x": [1, 2], "action": 1}',
+    "an object as x": b'{"command": "tell", "x": {"a": 1}, "action": 1}',
+    "a huge trial": b'{"command": "tell", "x": 1, "trial": 1e400}',
+    "a flag as text": b'{"command": "tell", "missing": "perhaps", "action": 1}',
+}
+
+
+@ATTACKS.add("lines for a session", cases=list(LINES))
+def served(name: str) -> None:
+    begun()
+    lines = [LINES[name], b'{"command": "status", "id": 1}', b""]
+    done = call(
+        "serve", "camp", input=b"\n".join(lines).decode("latin-1"), encoding="latin-1"
+    )
+    assert done.returncode == 0, done.stderr
+    error, last = map(json.loads, done.stdout.splitlines())
+    assert error["error"]["status"] in (1, 2), error
+    assert last["id"] == 1, last
+    assert last["answer"]["trials"] == [], last
+    assert history() == []

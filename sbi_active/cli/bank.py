@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
-from sbi_active.cli.loading import load_object, make_task
+from sbi_active.cli.given import load_object, make_task
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate
@@ -30,38 +30,69 @@ BLOCK = 8192
 LINES = 30
 
 
-def build(arguments: argparse.Namespace) -> int:
+def build(
+    folder: Path,
+    *,
+    task: str | None,
+    option: Sequence[str],
+    simulator: str | None,
+    prior: str | None,
+    actions: str | None,
+    simulator_version: str,
+    rows: int,
+    seed: int,
+    workers: int,
+) -> None:
     """Simulate prior draws into a bank, from where it ended."""
-    simulator, prior, actions = _source(arguments)
+    if (task is None) == (simulator is None):
+        raise ValueError(
+            "expected --task or --simulator; got both or neither; give one of them"
+        )
+    source = _of_task(task, option) if task else _named(simulator, prior, actions)
+    model, drawn, space = source
     missing = 0
     with (
         Bank(
-            arguments.folder,
-            simulator=simulator,
-            version=arguments.simulator_version,
+            folder,
+            simulator=model,
+            version=simulator_version,
             created=date.today().isoformat(),
         ) as bank,
-        tqdm(total=arguments.rows, desc="bank", unit="row") as bar,
+        tqdm(total=rows, desc="bank", unit="row") as bar,
     ):
-        store = bank.drawn_from(prior, label="prior")
-        for start in range(0, arguments.rows, BLOCK):
-            seed = derive_seed(arguments.seed, "bank", start)
-            theta, action = _draw(prior, actions, seed)
-            num_rows = min(BLOCK, arguments.rows - start)
-            rows = simulate(
-                simulator,
+        store = bank.drawn_from(drawn, label="prior")
+        for start in range(0, rows, BLOCK):
+            block = derive_seed(seed, "bank", start)
+            theta, action = _draw(drawn, space, block)
+            num_rows = min(BLOCK, rows - start)
+            done = simulate(
+                model,
                 theta[:num_rows],
                 action[:num_rows],
-                seed=seed,
-                num_workers=arguments.workers,
-                store=_Block(store, run_digest(seed, theta, action), num_rows),
+                seed=block,
+                num_workers=workers,
+                store=_Block(store, run_digest(block, theta, action), num_rows),
             )
-            missing += rows.counts["missing"]
+            missing += done.counts["missing"]
             bar.update(num_rows)
-    print(f"{arguments.folder}: {len(bank)} rows, {bank.counts}")
+    print(f"{folder}: {len(bank)} rows, {bank.counts}")
     if missing:
         print(f"note: {missing} rows are missing; run again to try them once more")
-    return 0
+
+
+def _of_task(name: str, options: Sequence[str]) -> tuple[Any, Any, Any]:
+    task = make_task(name, options)
+    return task.simulator, task.prior, task.actions
+
+
+def _named(*names: str | None) -> tuple[Any, Any, Any]:
+    if None in names:
+        raise ValueError(
+            "expected --prior and --actions with --simulator; got one without the "
+            "other; name them, as in --prior my_robot:prior"
+        )
+    simulator, prior, actions = [load_object(str(name)) for name in names]
+    return simulator, prior, actions
 
 
 @dataclass(frozen=True)
@@ -93,27 +124,9 @@ def _draw(
     return theta.float(), actions.sample((BLOCK,), seed=derive_seed(seed, "action"))
 
 
-def _source(
-    arguments: argparse.Namespace,
-) -> tuple[Callable[..., Any], Distribution, ActionSpace]:
-    if arguments.task is not None:
-        task = make_task(arguments.task, arguments.option)
-        return task.simulator, task.prior, task.actions
-    if arguments.prior is None or arguments.actions is None:
-        raise ValueError(
-            "expected --prior and --actions with --simulator; got one without the "
-            "other; name them, as in --prior my_robot:prior"
-        )
-    return (
-        load_object(arguments.simulator),
-        load_object(arguments.prior),
-        load_object(arguments.actions),
-    )
-
-
-def inspect(arguments: argparse.Namespace) -> int:
+def inspect(folder: Path) -> int:
     """Print what a bank holds; status 1 where checksums fail."""
-    bank = Bank(arguments.folder)
+    bank = Bank(folder)
     problems = bank.verify()
     if problems:
         print("\n".join(["checksums: NOT ok", *problems]))

@@ -2,113 +2,157 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import click
 import torch
+from click.core import ParameterSource
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.campaign.storage.manifest import MANIFEST, has_manifest
-from sbi_active.cli import campaign
-from sbi_active.cli.check import actions_of, prior_of, with_noise
-from sbi_active.cli.folder import effects_of, read_config
-from sbi_active.cli.loading import load_object
-from sbi_active.cli.problem import read_problem
-from sbi_active.criticism import Effect, Trials, close_loop, generic_effects
+from sbi_active.cli.given import (
+    actions_of,
+    effects_of,
+    load_object,
+    prior_of,
+    simulator_of,
+    with_generic,
+    with_noise,
+)
+from sbi_active.cli.session import Session
+from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import TrialTable
 from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
 from sbi_active.tasks import get_task  # pyright: ignore
 
+#: What a folder of recordings may hold, and what of its simulator that may name.
+MODULE, NAMED = "problem.py", ("simulator", "prior", "actions", "effects")
+OF_CAMPAIGN = ("trials", "simulator", "effects", "out", "trust")
 
-def criticize(arguments: argparse.Namespace) -> int:
+
+def criticize(trials: Path, **options: Any) -> None:
     """Compare a simulator with measured trials, and print the report."""
-    if arguments.trials.is_dir():
-        if has_manifest(arguments.trials):
-            return _criticize_campaign(arguments)
-        if not [*arguments.trials.glob("*.csv")]:
+    given = SimpleNamespace(trials=trials, **options)
+    if trials.is_dir():
+        if has_manifest(trials):
+            return _criticize_campaign(given)
+        if not [*trials.glob("*.csv")]:
             raise ValueError(
-                f"expected a campaign or recordings in {arguments.trials}; got neither "
+                f"expected a campaign or recordings in {trials}; got neither "
                 f"{MANIFEST} nor a file *.csv; make a campaign by sbi-active init, or "
                 "write one table of all trials, or one a trial"
             )
-        read_problem(arguments)
-    elif arguments.config is not None:
-        read_config(arguments)
-    if arguments.task is None and arguments.simulator is None:
+        _take_problem(given)
+    if given.task is not None and given.simulator is not None:
+        raise ValueError("expected --task or --simulator; got both; drop one of them")
+    if given.task is None and given.simulator is None:
         raise ValueError(
             "expected --simulator or --task with a table of trials; got neither; name "
             "it, as in --simulator my_robot.py:simulator, or in problem.toml beside "
             "recordings in a folder"
         )
-    table, trials = _trials(arguments)
-    simulator, prior, actions, effects = _source(arguments, trials)
+    table, measured = _trials(given)
+    simulator, prior, actions, effects = _source(given, measured)
     # Only scales are taken from these where the permitted actions are unknown.
-    space = actions or DiscreteActions(trials.action.unique(dim=0).float())
-    over_time = trials.inputs is not None
-    own = [*effects, *effects_of(_named_effects(arguments))]
-    taken = {effect.name for effect in own}
-    generic = generic_effects(simulator, trials if over_time else space, prior=prior)
+    space = actions or DiscreteActions(measured.action.unique(dim=0).float())
+    over_time = measured.inputs is not None
+    own = [*effects, *effects_of([given.effects] if given.effects else [])]
+    known = measured if over_time else space
     report = close_loop(
         simulator,
         prior,
-        trials,
-        effects=[*own, *(e for e in generic if e.name not in taken)],
+        measured,
+        effects=with_generic(own, simulator, known, prior),
         actions=actions,
-        thin=not arguments.no_thin,
-        seed=arguments.seed,
-        designed=arguments.designed,
+        thin=not given.no_thin,
+        seed=given.seed,
+        designed=given.designed,
         show_progress=sys.stderr.isatty(),
     )
     print(report)
     if table.columns.time is not None or any(table.columns.units.values()):
-        print(f"\n{_described(arguments.trials, table, trials)}")
-    if arguments.out is not None:
-        print(f"\nsaved: {report.save(arguments.out)}")
-    return 0
+        print(f"\n{_described(trials, table, measured)}")
+    if given.out is not None:
+        print(f"\nsaved: {report.save(given.out)}")
+    return None
 
 
-def _criticize_campaign(arguments: argparse.Namespace) -> int:
+def _criticize_campaign(given: SimpleNamespace) -> None:
     """Compare a campaign with its own trials; it brings most of what a table lacks."""
-    taken = ("trials", "simulator", "effects", "out", "trust", "command", "parser")
-    given = {k: v for k, v in vars(arguments).items() if k not in taken}
-    wrong = [k for k, v in given.items() if v != arguments.parser.get_default(k)]
+    source = click.get_current_context().get_parameter_source
+    wrong = [
+        name
+        for name in vars(given)
+        if name not in OF_CAMPAIGN and source(name) is not ParameterSource.DEFAULT
+    ]
     if wrong:
         raise ValueError(
             f"expected --simulator, --effects, --out or --trust for a campaign; got "
             f"--{wrong[0].replace('_', '-')}; leave it out, since the campaign in "
-            f"{arguments.trials} has its own"
+            f"{given.trials} has its own"
         )
-    arguments.folder = arguments.trials
-    return campaign.criticize(arguments)
+    options = {name: getattr(given, name) for name in OF_CAMPAIGN[1:]}
+    with Session(given.trials) as session:
+        session.call("criticize", **options)
 
 
-def _named_effects(arguments: argparse.Namespace) -> list[str]:
-    return [] if arguments.effects is None else [arguments.effects]
+def _take_problem(given: SimpleNamespace) -> None:
+    """Take from a folder's problem files what the command line leaves out.
+
+    In ``problem.toml``, which was read before, files are those of the folder;
+    ``problem.py`` has the objects that are named, under the options' own names.
+    """
+    source = click.get_current_context().get_parameter_source
+    beside = given.trials if given.config is None else given.config.parent
+    for name in NAMED:
+        if source(name) is ParameterSource.DEFAULT_MAP:
+            value = getattr(given, name)
+            is_list = not isinstance(value, str)
+            within = [_within(beside, word) for word in (value if is_list else [value])]
+            setattr(given, name, within if is_list else within[0])
+    path = given.trials / MODULE
+    if not path.is_file() or given.task is not None:
+        return
+    load_object(f"{path}:__name__")
+    module = sys.modules[path.stem]
+    has_bounds = given.theta_low is not None or given.theta_high is not None
+    for name in NAMED:
+        is_given = getattr(given, name) or name == "prior" and has_bounds
+        if not is_given and hasattr(module, name):
+            value = f"{path}:{name}"
+            setattr(given, name, [value] if name == "actions" else value)
 
 
-def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
+def _within(folder: Path, text: str) -> str:
+    """Return what a file names, with the path of files that lie beside it."""
+    file, colon, what = text.partition(":")
+    beside = file.endswith(".py") and (folder / file).is_file()
+    return f"{folder / file}{colon}{what}" if beside else text
+
+
+def _trials(given: SimpleNamespace) -> tuple[TrialTable, Trials]:
     """Return what the file holds; what it lacks in a small way is noted on stderr."""
-    columns = _pairs(arguments.columns, "--columns")
+    columns = _pairs(given.columns, "--columns")
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always", UserWarning)
         table = read_trials(
-            arguments.trials,
+            given.trials,
             columns={key: text.split(",") for key, text in columns.items()} or None,
-            units=_pairs(arguments.units, "--units"),
-            inputs=arguments.inputs,
+            units=_pairs(given.units, "--units"),
+            inputs=given.inputs,
         )
         trials = Trials(
-            **table.arguments,
-            order=arguments.order,
-            input_hold=arguments.input_hold,
+            **table.arguments, order=given.order, input_hold=given.input_hold
         )
     for note in noted:
         print(f"sbi-active: note: {note.message}", file=sys.stderr)
@@ -116,27 +160,25 @@ def _trials(arguments: argparse.Namespace) -> tuple[TrialTable, Trials]:
     if num - held < 2:
         raise ValueError(
             f"expected at least two trials to fit; got {num - held} in "
-            f"{arguments.trials} ({num} in all, {held} held out); measure more, "
+            f"{given.trials} ({num} in all, {held} held out); measure more, "
             "since one trial fits any model"
         )
     return table, trials
 
 
-def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
-    found = {}
-    for text in texts or []:
-        key, equals, value = text.partition("=")
-        if not (key and equals and value):
+def _pairs(texts: Sequence[str], option: str) -> dict[str, str]:
+    parts = [text.partition("=") for text in texts]
+    for text, (key, _, value) in zip(texts, parts, strict=True):
+        if not (key and value):
             raise ValueError(
                 f"expected {option} KEY=NAME; got {text!r}; write, say, x=height_m"
             )
-        found[key] = value
-    return found
+    return {key: value for key, _, value in parts}
 
 
 def _described(path: Path, table: TrialTable, trials: Trials) -> str:
     """Return what was read, with its units."""
-    columns, num = table.columns, len(trials)
+    columns = table.columns
     parts = {
         "action": map(columns.label, columns.action),
         "inputs": trials.input_labels or (),
@@ -144,7 +186,7 @@ def _described(path: Path, table: TrialTable, trials: Trials) -> str:
     }
     named = {key: ", ".join(names) for key, names in parts.items()}
     what = "; ".join(f"{key} {names}" for key, names in named.items() if names)
-    what = f"{num} trials of {path}: {what}"
+    what = f"{len(trials)} trials of {path}: {what}"
     if columns.time is None:
         return what
     counts = trials.mask.flatten(2).any(-1) if trials.x.ndim > 2 else trials.mask
@@ -153,39 +195,34 @@ def _described(path: Path, table: TrialTable, trials: Trials) -> str:
 
 
 def _source(
-    arguments: argparse.Namespace, trials: Trials
+    given: SimpleNamespace, trials: Trials
 ) -> tuple[SimulatorModel, Distribution, ActionSpace | None, list[Effect]]:
     """Return what the trials are compared with."""
-    if arguments.task is not None:
+    actions = actions_of(given.actions) if given.actions else None
+    effects: list[Effect] = []
+    if given.task is not None:
         for name in ("prior", "theta_low", "theta_high"):
-            if getattr(arguments, name) is not None:
+            if getattr(given, name) is not None:
                 raise ValueError(
                     f"expected no --{name.replace('_', '-')} with --task, which has a "
-                    f"prior; got {getattr(arguments, name)}; drop one of them"
+                    f"prior; got {getattr(given, name)}; drop one of them"
                 )
-        task = get_task(arguments.task)
-        _require_units(task.actions, trials, arguments)
-        actions = actions_of(arguments) if arguments.actions else task.actions
-        effects = getattr(task, "effects", list)()
-        simulator = with_noise(task.simulator, arguments.noise)
-        return simulator, task.prior, actions, [*effects]
-    fn = load_object(arguments.simulator)
-    if not callable(fn):
-        raise ValueError(
-            f"expected a function or SimulatorModel; got {type(fn).__name__} under "
-            f"{arguments.simulator}; name what takes (theta, action)"
-        )
-    if not isinstance(fn, SimulatorModel):
-        fn = _with_times(SimulatorModel(fn), trials, arguments)
-    prior, simulator = prior_of(arguments), with_noise(fn, arguments.noise)
-    actions = actions_of(arguments) if arguments.actions else None
-    if actions is not None:
-        _require_units(actions, trials, arguments)
-    return simulator, prior, actions, []
+        task = get_task(given.task)
+        _require_units(task.actions, trials, given.trials)
+        actions, effects = actions or task.actions, getattr(task, "effects", list)()
+        model, prior = task.simulator, task.prior
+    else:
+        model = simulator_of(given.simulator, None)
+        if not isinstance(model, SimulatorModel):
+            model = _with_times(SimulatorModel(model), trials, given)
+        prior = prior_of(given.prior, given.theta_low, given.theta_high)
+        if actions is not None:
+            _require_units(actions, trials, given.trials)
+    return with_noise(model, given.noise), prior, actions, [*effects]
 
 
 def _with_times(
-    model: SimulatorModel, trials: Trials, arguments: argparse.Namespace
+    model: SimulatorModel, trials: Trials, given: SimpleNamespace
 ) -> SimulatorModel:
     """Return a user's function as the simulator of trials with sample times."""
     times = trials.template()[1]
@@ -197,8 +234,8 @@ def _with_times(
     if ragged and not takes_times(model):
         raise ValueError(
             "expected a simulator that takes times=, shape (n, k), where trials are "
-            f"sampled at different times, as in {arguments.trials}; got one without "
-            f"under {arguments.simulator}; add it, or give a SimulatorModel with "
+            f"sampled at different times, as in {given.trials}; got one without "
+            f"under {given.simulator}; add it, or give a SimulatorModel with "
             "sample_times"
         )
     fn = model.fn
@@ -211,14 +248,12 @@ def _with_times(
     return SimulatorModel(timed if takes_times(model) else fn, sample_times=times)
 
 
-def _require_units(
-    actions: ActionSpace, trials: Trials, arguments: argparse.Namespace
-) -> None:
+def _require_units(actions: ActionSpace, trials: Trials, path: Path) -> None:
     """Raise where the file states another unit of the action than the simulator."""
     for unit, label in zip(actions.units, trials.action_labels or (), strict=False):
         given = label.partition(" [")[2].removesuffix("]")
         if unit and given and unit != given:
             raise ValueError(
-                f"expected actions in {unit}; got {label} in {arguments.trials}; "
+                f"expected actions in {unit}; got {label} in {path}; "
                 "convert the column, and state the unit in brackets"
             )

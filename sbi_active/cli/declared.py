@@ -7,7 +7,6 @@ remembered outside of the folder. Nothing here imports torch.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import os
@@ -38,18 +37,23 @@ def names_object(specs: Sequence[str]) -> bool:
     return len(specs) == 1 and specs[0].count(":") == 1 and not is_number
 
 
-def declared_by(arguments: argparse.Namespace) -> dict[str, Any]:
+def declare(
+    simulator: str | None,
+    noise: str | None,
+    prior: str | None,
+    actions: Sequence[str],
+    effects: str | None,
+) -> dict[str, Any]:
     """Return where everything is that a program wrote, as other commands need it."""
-    if arguments.simulator is None:
+    if simulator is None:
         raise ValueError(
             "expected --simulator; got none; name it, as in --simulator my_robot.py:fn"
         )
-    actions = arguments.actions or []
     return {
-        "simulator": arguments.simulator,
-        "effects": [] if arguments.effects is None else [arguments.effects],
-        "noise": arguments.noise,
-        "prior": arguments.prior,
+        "simulator": simulator,
+        "effects": [] if effects is None else [effects],
+        "noise": noise,
+        "prior": prior,
         "actions": actions[0] if names_object(actions) else None,
         "folder": os.getcwd(),
     }
@@ -100,7 +104,7 @@ def _is_texts(value: Any) -> bool:
 
 def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
     """Write where everything is, and remember that it was written here."""
-    from sbi_active.simulation.bank.segments import write_file
+    from sbi_active.simulation.bank.files import write_file
 
     write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
     _remember(folder)

@@ -6,10 +6,11 @@ target=2 --option noise=0.01 --out DIR``.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import math
+import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,13 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from sbi_active import __version__
 from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.declared import declared_of_task, write_declared
-from sbi_active.cli.loading import make_task
-from sbi_active.cli.progress import Progress
+from sbi_active.cli.given import make_task
+from sbi_active.cli.trials import sum_up_campaign
+from sbi_active.cli.words import as_json
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
@@ -32,68 +35,118 @@ from sbi_active.simulation import simulate
 from sbi_active.tasks import Task  # pyright: ignore
 
 SETTINGS = {"default": lambda _: CampaignOptions(), "faithful": faithful_options}
+#: Of the table: what is written for a round, and how.
+COLUMNS = {
+    "round": ("round", "{}"),
+    "action": ("action", "{}"),
+    "EIG": ("eig", "{:.2f}"),
+    "+-": ("eig_se", "{:.2f}"),
+    "exact EIG": ("exact_eig", "{:.2f}"),
+    "gained": ("information_gained", "{:.2f}"),
+    "log p(truth)": ("log_prob_true", "{:.2f}"),
+    "gap to exact": ("gap", "{:.2f}"),
+    "time [s]": ("wall", "{:.1f}"),
+}
 
 
-def run(arguments: argparse.Namespace) -> int:
+class Progress:
+    """A bar of rounds that names the present step and goes on counting seconds.
+
+    Args:
+        total: Rounds.
+        name: In front of the bar.
+    """
+
+    #: Seconds between two signs of life: on a terminal, and in a file.
+    SIGN, SIGN_IN_FILE = 1.0, 30.0
+
+    def __init__(self, total: int, name: str) -> None:
+        self._bar = tqdm(total=total, desc=name, unit="round", mininterval=0)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._tick, daemon=True)
+        self.step, self.count = self._bar.set_postfix_str, self._bar.update
+
+    def __enter__(self) -> Progress:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        self._bar.close()
+
+    def _tick(self) -> None:
+        interval = self.SIGN if sys.stderr.isatty() else self.SIGN_IN_FILE
+        while not self._over.wait(interval):
+            self._bar.refresh()
+
+
+def run(
+    task: str,
+    *,
+    out: Path,
+    method: str,
+    rounds: int,
+    seed: int,
+    option: Sequence[str],
+    setting: str,
+    **sizes: int | None,
+) -> None:
     """Run a campaign on a task, and save its table, figure and results."""
     start = time.perf_counter()
-    beliefs, rounds, exact_gains = [], [], []
-    with Progress(arguments.rounds, arguments.method) as progress:
+    records, gains = [], []
+    with Progress(rounds, method) as progress:
         progress.step("preparing the task")
-        task = make_task(arguments.task, arguments.option)
+        problem = make_task(task, option)
         campaign = Campaign(
-            task.simulator,
-            task.prior,
-            task.actions,
-            method=arguments.method,
-            seed=arguments.seed,
-            options=_campaign_options(arguments),
-            directory=(folder := _new_folder(arguments.out)),
+            problem.simulator,
+            problem.prior,
+            problem.actions,
+            method=method,
+            seed=seed,
+            options=_campaign_options(setting, method, **sizes),
+            directory=(folder := _new_folder(out)),
         )
-        declared = declared_of_task(arguments.task, arguments.option)
-        write_declared(folder, declared)
-        beliefs.append(campaign.belief)
-        for index in range(arguments.rounds):
+        write_declared(folder, declared_of_task(task, option))
+        beliefs = [campaign.belief]
+        for index in range(rounds):
             progress.step("looking up what is exact")
-            exact_gains.append(_exact_gain(task, campaign))
+            gains.append(_exact_gain(problem, campaign))
             progress.step("simulating, training and designing")
             trial = campaign.ask()
             progress.step("measuring")
-            campaign.tell(
-                task.real_system(
-                    trial.action, seed=derive_seed(arguments.seed, "real", index)
-                )
-            )
+            real = derive_seed(seed, "real", index)
+            campaign.tell(problem.real_system(trial.action, seed=real))
             progress.step("updating the belief")
             beliefs.append(campaign.update())
-            rounds.append(_round_record(task, campaign, exact_gains[-1]))
+            records.append(_round_record(problem, campaign, gains[-1]))
             progress.count()
         wall = time.perf_counter() - start
         progress.step("drawing and saving")
-        figure_path = arguments.out / "loop.png"
-        with forked_generators(arguments.seed, "figure"):
+        with forked_generators(seed, "figure"):
             figure = plot_rounds(
                 beliefs,
                 [t.design for t in campaign.history if t.design is not None],
-                parameter_names=task.parameter_names,
-                theta_true=task.theta_true,
-                exact_gains=exact_gains,
+                parameter_names=problem.parameter_names,
+                theta_true=problem.theta_true,
+                exact_gains=gains,
             )
-        save(figure, str(figure_path))
-        _save(arguments, campaign, rounds, wall)
+        save(figure, str(out / "loop.png"))
+        said = {"task": task, "options": [*option], "method": method}
+        said |= {"setting": setting, "seed": seed, "version": __version__}
+        _save(out, campaign, {**said, "seconds": wall, "rounds": records}, seed)
+        sum_up_campaign(campaign)
         campaign.close()
-    print(_table(rounds))
-    mean, sd = campaign.belief.mean, campaign.belief.variance.sqrt()
-    for name, m, s, truth in zip(
-        task.parameter_names, mean, sd, task.theta_true, strict=True
-    ):
+    print(_table(records))
+    belief = campaign.belief
+    moments = zip(belief.mean, belief.variance.sqrt(), problem.theta_true, strict=True)
+    for name, (m, s, truth) in zip(problem.parameter_names, moments, strict=True):
         print(f"{name}: {m:.4g} +- {s:.2g} (truth {truth:g})")
-    diagnostics = getattr(campaign.belief, "diagnostics", Diagnostics())
+    diagnostics = getattr(belief, "diagnostics", Diagnostics())
     for warning in (*diagnostics.warnings, *diagnostics.network_warnings):
         print(f"note: {warning}")
-    print(f"{wall:.1f} s; figure: {figure_path}; results: {arguments.out}")
+    print(f"{wall:.1f} s; figure: {out / 'loop.png'}; results: {out}")
     print(f"to go on with it: sbi-active ask {folder}")
-    return 0
 
 
 def _new_folder(out: Path) -> Path:
@@ -103,23 +156,26 @@ def _new_folder(out: Path) -> Path:
     return next(out / name for name in names if not (out / name).exists())
 
 
-def _campaign_options(arguments: argparse.Namespace) -> CampaignOptions:
+def _campaign_options(
+    setting: str,
+    method: str,
+    *,
+    simulations: int | None,
+    samples: int | None,
+    iterations: int | None,
+) -> CampaignOptions:
     """Return the named setting with the sizes that were given."""
-    options = SETTINGS[arguments.setting](arguments.method)
-    sizes = {
-        "num_simulations": arguments.simulations,
-        "num_samples": arguments.samples,
-    }
+    options = SETTINGS[setting](method)
+    sizes = {"num_simulations": simulations, "num_samples": samples}
     options = replace(options, **{k: v for k, v in sizes.items() if v is not None})
-    if arguments.iterations is not None:
-        default = find_method(arguments.method).estimator
-        estimator = options.density_estimator or default
+    if iterations is not None:
+        estimator = options.density_estimator or find_method(method).estimator
         if not isinstance(estimator, MixtureDensity):
             raise ValueError(
                 f"expected --iterations with a method that trains a mixture density; "
-                f"got --method {arguments.method}; leave it out"
+                f"got --method {method}; leave it out"
             )
-        estimator = replace(estimator, num_iterations=arguments.iterations)
+        estimator = replace(estimator, num_iterations=iterations)
         options = replace(options, density_estimator=estimator)
     return options
 
@@ -139,29 +195,34 @@ def _reference(task: Task, trials: Sequence[Trial]) -> Any:
     if used:
         x = torch.stack([t.x for t in used if t.x is not None])
         return task.reference(torch.stack([t.action for t in used]), x)
-    if not bool(task.theta_true.isfinite().all()):  # nobody knows it
+    if not _is_known(task):
         return None
     action = task.actions.values[:1]
     row = simulate(task.simulator, task.theta_true[None], action, seed=0)
     return task.reference(action[:0], row.x[:0])
 
 
+def _is_known(task: Task) -> bool:
+    """Return whether anybody knows the truth."""
+    return bool(task.theta_true.isfinite().all())
+
+
 def _round_record(
     task: Task, campaign: Campaign, exact_gain: torch.Tensor | None
 ) -> dict[str, Any]:
-    """Return the figures of the last round."""
+    """Return the figures of the last round; JSON has no NaN, but null."""
     trial = campaign.history[-1]
     assert trial.design is not None
     assert trial.x is not None
     index = trial.design.index
     log_prob = math.nan
-    if bool(task.theta_true.isfinite().all()):
+    if _is_known(task):
         log_prob = float(campaign.belief.log_prob(task.theta_true))
     record = {
         "round": len(campaign.history),
         "action": trial.action.tolist(),
         "status": trial.status,
-        "x": [v if math.isfinite(v) else None for v in trial.x.flatten().tolist()],
+        "x": trial.x.flatten().tolist(),
         "eig": float(trial.design.expected_information_gain[index]),
         "eig_se": float(trial.design.standard_error[index]),
         "information_gained": trial.information_gained,
@@ -174,54 +235,27 @@ def _round_record(
         exact = _reference(task, campaign.history)
         record["exact_eig"] = float(exact_gain[index])
         record["regret"] = float(exact_gain.max() - exact_gain[index])
-        exact_log_prob = float(exact.log_prob(task.theta_true[None])[0])
-        record["exact_log_prob_true"] = exact_log_prob
-        record["gap"] = exact_log_prob - log_prob
-    return record
+        record["exact_log_prob_true"] = float(exact.log_prob(task.theta_true[None])[0])
+        record["gap"] = record["exact_log_prob_true"] - log_prob
+    return as_json(record)
 
 
-def _table(rounds: Sequence[dict[str, Any]]) -> str:
-    columns = {
-        "round": lambda r: str(r["round"]),
-        "action": lambda r: ", ".join(f"{a:g}" for a in r["action"]),
-        "EIG": lambda r: f"{r['eig']:.2f} +- {r['eig_se']:.2f}",
-        "exact EIG": lambda r: f"{r['exact_eig']:.2f}" if "exact_eig" in r else "-",
-        "gained": lambda r: f"{r['information_gained']:.2f}",
-        "log p(truth)": lambda r: f"{r['log_prob_true']:.2f}",
-        "gap to exact": lambda r: f"{r['gap']:.2f}" if "gap" in r else "-",
-        "time [s]": lambda r: f"{sum(r['seconds'].values()):.1f}",
-    }
-    rows = [[cell(r) for cell in columns.values()] for r in rounds]
-    return as_table(rows, [*columns])
+def _table(records: Sequence[dict[str, Any]]) -> str:
+    def cell(record: dict[str, Any], name: str, form: str) -> str:
+        shown = {**record, "wall": sum(record["seconds"].values())}
+        shown["action"] = ", ".join(f"{a:g}" for a in record["action"])
+        return "-" if shown.get(name) is None else form.format(shown[name])
+
+    rows = [
+        [cell(record, *column) for column in COLUMNS.values()] for record in records
+    ]
+    return as_table(rows, [*COLUMNS])
 
 
-def _save(
-    arguments: argparse.Namespace,
-    campaign: Campaign,
-    rounds: Sequence[dict[str, Any]],
-    wall: float,
-) -> None:
+def _save(out: Path, campaign: Campaign, summary: dict[str, Any], seed: int) -> None:
     from sbi_active.export import to_inference_data
 
-    summary = {
-        "task": arguments.task,
-        "options": arguments.option,
-        "method": arguments.method,
-        "setting": arguments.setting,
-        "seed": arguments.seed,
-        "version": __version__,
-        "seconds": wall,
-        "rounds": [
-            # JSON has no NaN, which is where there is no truth.
-            {
-                k: None if isinstance(v, float) and math.isnan(v) else v
-                for k, v in r.items()
-            }
-            for r in rounds
-        ],
-    }
-    (arguments.out / "result.json").write_text(
-        json.dumps(summary, indent=2) + "\n", encoding="utf-8"
-    )
-    data = to_inference_data(campaign, seed=arguments.seed)
-    data.to_netcdf(str(arguments.out / "inference_data.nc"))
+    text = json.dumps(summary, indent=2) + "\n"
+    (out / "result.json").write_text(text, encoding="utf-8")
+    data = to_inference_data(campaign, seed=seed)
+    data.to_netcdf(str(out / "inference_data.nc"))

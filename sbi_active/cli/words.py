@@ -1,12 +1,22 @@
-"""What the library says, in the words of the command line."""
+"""What the library says, in the words of the command line, and where that goes."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
+import os
 import re
 import sys
 import traceback
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import click
+
+from sbi_active.cli.options import in_words
+
+FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 
 #: What the library says to users of Python, and what that is on the command line.
 WORDS = (
@@ -21,6 +31,18 @@ WORDS = (
     (r"load the campaign with prior=", "add --trust"),
     (r"simulator_changed=True", "sbi-active update DIR --simulator-changed"),
 )
+
+
+class Answer(NamedTuple):
+    """What a command found.
+
+    Attributes:
+        data: For programs; numbers that are not finite become null.
+        text: For people.
+    """
+
+    data: dict[str, Any]
+    text: str
 
 
 def spoken(text: str, folder: object) -> str:
@@ -52,6 +74,26 @@ def _briefly(text: str) -> str:
     return re.sub(r"Traceback \(most recent call last\):\n(?: .*\n)*(.*)", last, text)
 
 
+def failure(error: BaseException) -> tuple[int, str]:
+    """Return the exit status of an error, and its text."""
+    if isinstance(error, KeyboardInterrupt):
+        text = f"{str(error) or 'interrupted'}; what was told before is kept"
+        return INTERRUPTED, text
+    if isinstance(error, click.ClickException):
+        return MISUSED, in_words(error)
+    if isinstance(error, ValueError | OSError):
+        return MISUSED, str(error)
+    # Of a simulator, or a fault of this library.
+    return FAILED, f"{type(error).__name__}: {error}{place_of(error)}"
+
+
+def failure_json(error: BaseException, folder: object) -> dict[str, Any]:
+    """Return an error as JSON: its class, its text, and its exit status."""
+    status, text = failure(error)
+    kind, message = type(error).__name__, spoken(_briefly(text), folder)
+    return {"error": {"type": kind, "message": message, "status": status}}
+
+
 def place_of(error: BaseException) -> str:
     """Return where an error was raised, to be added to its text."""
     frames = traceback.extract_tb(error.__traceback__)
@@ -68,3 +110,32 @@ def as_json(value: Any) -> Any:
         return [as_json(part) for part in value]
     is_number = not isinstance(value, float) or math.isfinite(value)
     return value if is_number else None
+
+
+@contextlib.contextmanager
+def output_to_errors() -> Iterator[None]:
+    """Send to standard error what simulators print, in C and in workers too."""
+    with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as undo:
+        with contextlib.suppress(OSError):  # one of them is closed
+            kept = os.dup(1)
+            undo.callback(os.close, kept)
+            os.dup2(2, 1)
+            undo.callback(os.dup2, kept, 1)
+            undo.callback(_flush_c)
+        yield
+
+
+def _flush_c() -> None:
+    with contextlib.suppress(Exception):  # a platform without it
+        ctypes.CDLL(None).fflush(None)
+
+
+def flush() -> None:
+    """Write what is left, so that the end of the process has nothing to complain of."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except AttributeError:
+        pass  # closed from the start

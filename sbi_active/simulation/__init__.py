@@ -1,28 +1,34 @@
 """Simulators, their noise, and the engine that runs them.
 
 Here lives what turns parameters and an action into outcomes. What is learned from
-outcomes does not.
+outcomes does not. A name is imported when it is used.
 """
 
-from sbi_active.renamed import former_names
-from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.reuse import reuse
-from sbi_active.simulation.check import check_simulator
-from sbi_active.simulation.model import SimulatorModel
-from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise
-from sbi_active.simulation.noise.base import NoiseModel
-from sbi_active.simulation.noise.estimation import estimate_noise
-from sbi_active.simulation.noise.gaussian import GaussianNoise
-from sbi_active.simulation.noise.student import StudentTNoise
-from sbi_active.simulation.outcomes import (
-    MissingRowsWarning,
-    Outcome,
-    SimulationError,
-    SimulationInterrupted,
-    Simulations,
-)
-from sbi_active.simulation.workers.engine import simulate
-from sbi_active.simulation.workers.settings import Workers
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sbi_active.renamed import former_names, lazy_names
+
+if TYPE_CHECKING:
+    from sbi_active.simulation.bank.bank import Bank
+    from sbi_active.simulation.bank.reweighting import reuse
+    from sbi_active.simulation.check import check_simulator
+    from sbi_active.simulation.model import SimulatorModel
+    from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise
+    from sbi_active.simulation.noise.base import NoiseModel
+    from sbi_active.simulation.noise.estimation import estimate_noise
+    from sbi_active.simulation.noise.gaussian import GaussianNoise
+    from sbi_active.simulation.noise.student import StudentTNoise
+    from sbi_active.simulation.outcomes import (
+        MissingRowsWarning,
+        Outcome,
+        SimulationError,
+        SimulationInterrupted,
+        Simulations,
+    )
+    from sbi_active.simulation.workers.engine import simulate
+    from sbi_active.simulation.workers.settings import Workers
 
 __all__ = [
     "AutocorrelatedNoise",
@@ -43,14 +49,33 @@ __all__ = [
     "simulate",
 ]
 
-__getattr__ = former_names(
+__getattr__ = lazy_names(
     __name__,
     {
-        "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
-        "RowStore": "sbi_active.simulation.workers:RowStore",
-        "Simulator": "sbi_active.simulation.simulator:Simulator",
-        "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
-        "require_noise": "sbi_active.simulation.simulator:require_noise",
-        "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
+        "bank.bank": "Bank",
+        "bank.reweighting": "reuse",
+        "check": "check_simulator",
+        "model": "SimulatorModel",
+        "noise.autocorrelated": "AutocorrelatedNoise",
+        "noise.base": "NoiseModel",
+        "noise.estimation": "estimate_noise",
+        "noise.gaussian": "GaussianNoise",
+        "noise.student": "StudentTNoise",
+        "outcomes": "MissingRowsWarning Outcome SimulationError SimulationInterrupted "
+        "Simulations",
+        "workers.engine": "simulate",
+        "workers.settings": "Workers",
     },
+    former_names(
+        __name__,
+        {
+            "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
+            "RowStore": "sbi_active.simulation.workers:RowStore",
+            "Simulator": "sbi_active.simulation.simulator:Simulator",
+            "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
+            "require_noise": "sbi_active.simulation.simulator:require_noise",
+            "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
+        },
+        stacklevel=3,
+    ),
 )

@@ -8,7 +8,7 @@ import pytest
 
 from sbi_active import CampaignOptions
 from sbi_active.cli import campaign as commands
-from sbi_active.cli import folder, main
+from sbi_active.cli import given, main
 from tests.campaign.sizes import REFINEMENT
 
 SIMULATOR = """
@@ -149,7 +149,7 @@ def test_exported(made, capsys, tmp_path):
 
 
 def test_a_missing_effect_is_found_and_adopted(made, capsys, monkeypatch):
-    usual = folder.generic_effects
+    usual = given.generic_effects
     kept = {"bias", "action gain", "sensor gain"}
 
     def three(*arguments, **options):
@@ -157,7 +157,7 @@ def test_a_missing_effect_is_found_and_adopted(made, capsys, monkeypatch):
         assert kept < {effect.name for effect in effects}
         return [effect for effect in effects if effect.name in kept]
 
-    monkeypatch.setattr(folder, "generic_effects", three)
+    monkeypatch.setattr(given, "generic_effects", three)
     for index, speed in enumerate((0.5, 1.0, 1.5, 2.0, 2.5, 3.0)):
         distance = speed**2 / (2 * 9.81 * 0.5) / (1 + 0.3 * speed)
         slip = 0.02 * (-1) ** index
@@ -198,7 +198,7 @@ own = [offset]
 def test_effects_of_the_command_line_for_a_campaign(
     made, capsys, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(folder, "generic_effects", lambda *_, **__: [])
+    monkeypatch.setattr(given, "generic_effects", lambda *_, **__: [])
     monkeypatch.delitem(sys.modules, "tape", raising=False)
     (tmp_path / "tape.py").write_text(EFFECTS)
     for index, speed in enumerate((0.5, 1.0, 1.5, 2.0, 2.5, 3.0)):

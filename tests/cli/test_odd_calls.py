@@ -275,6 +275,7 @@ def test_numbers_that_are_not_finite_are_null(camp, capfd, monkeypatch):
     )
     monkeypatch.setattr(Campaign, "belief", infinite)
     monkeypatch.setattr(Campaign, "parameter_names", ["a", "b"])
+    Path("camp/status.json").unlink()  # what was summed up with another belief
     assert main(["status", "camp", "--json"]) == 0
     answer = json.loads(capfd.readouterr().out, parse_constant=refuse)
     assert answer["belief"]["parameters"] == {

@@ -11,8 +11,7 @@ from matplotlib.colors import to_rgb
 
 from sbi_active.campaign import Trial
 from sbi_active.cli import main
-from sbi_active.cli.progress import Progress
-from sbi_active.cli.run import _reference
+from sbi_active.cli.run import Progress, _reference
 from sbi_active.tasks import get_task  # pyright: ignore
 
 SMALL = ["--simulations", "200", "--samples", "20", "--iterations", "30"]

@@ -1,6 +1,5 @@
 """The command on small modules in files, one for each defect, and a clean one."""
 
-import argparse
 import subprocess
 import sys
 import time
@@ -293,10 +292,9 @@ def test_the_round_that_is_timed_is_one_of_a_campaign():
         return theta * action
 
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    arguments = argparse.Namespace(workers=1, seed=0)
     model, actions = SimulatorModel(simulator, noise=0.1), DiscreteActions([1.0, 2.0])
     start = time.perf_counter()
-    seconds = _time_round(model, prior, actions, arguments)
+    seconds = _time_round(model, prior, actions, 1, 0)
     assert 0.1 < seconds <= time.perf_counter() - start
 
 

@@ -15,7 +15,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.reuse import FEW, reuse
+from sbi_active.simulation.bank.reweighting import FEW, reuse
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import Workers

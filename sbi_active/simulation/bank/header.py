@@ -15,8 +15,8 @@ from sbi_active.simulation.bank.damage import (
     regular_size,
     require,
 )
+from sbi_active.simulation.bank.files import TEMPORARY, write_file
 from sbi_active.simulation.bank.fingerprint import differences
-from sbi_active.simulation.bank.segments import TEMPORARY, write_file
 
 FORMAT = 1
 HEADER = "bank.json"

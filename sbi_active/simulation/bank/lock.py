@@ -10,7 +10,7 @@ from pathlib import Path
 import filelock
 
 from sbi_active.messages import Explained
-from sbi_active.simulation.bank.segments import write_file
+from sbi_active.simulation.bank.files import write_file
 
 _inherited: list[filelock.BaseFileLock] = []
 

@@ -7,11 +7,9 @@ synchronized with the disk, and only then renamed; nothing is ever written to it
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,9 +24,8 @@ from sbi_active.simulation.bank.damage import (
     regular_size,
     require,
 )
+from sbi_active.simulation.bank.files import TEMPORARY, write_file
 from sbi_active.simulation.outcomes import Outcome
-
-TEMPORARY = ".writing-"
 
 #: Compare with ``meta`` in the file, which holds the checksums of all columns.
 META, CHECKSUM = "meta", "sha256"
@@ -186,43 +183,6 @@ def _is_possible(name: str, array: np.ndarray, meta: Mapping[str, Any]) -> bool:
     if name == "run":
         return bool(((array >= 0) & (array < len(meta["runs"]))).all())
     return name != "index" or bool((array >= 0).all())
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file so that its name never stands for less than its whole content.
-
-    Raises:
-        OSError: As the system gives it; the former file, if any, is untouched.
-    """
-    temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        synchronize(path.parent)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise type(error)(
-            error.errno,
-            f"expected to write {len(content)} bytes; got {error.strerror!r}; make "
-            "room or choose a place that can be written, and run again: what was "
-            "stored before is whole",
-            str(path),
-        ) from error
-
-
-def synchronize(folder: Path) -> None:
-    """Make the names in a folder durable; file systems differ in whether they are."""
-    if os.name != "posix":  # elsewhere a folder cannot be opened, nor needs it
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def leftovers(folder: Path) -> Iterator[Path]:

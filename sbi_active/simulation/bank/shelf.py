@@ -22,11 +22,11 @@ from sbi_active.simulation.bank.damage import (
     regular_size,
     require,
 )
+from sbi_active.simulation.bank.files import synchronize
 from sbi_active.simulation.bank.segments import (
     COLUMNS,
     leftovers,
     read_segment,
-    synchronize,
     write_segment,
 )
 from sbi_active.simulation.outcomes import Outcome

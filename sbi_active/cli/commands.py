@@ -1,0 +1,296 @@
+"""The commands of ``sbi-active`` and their options, each option declared once.
+
+Nothing here imports torch, so that help, the version and a slip of the pen are answered
+at once. A command's module is imported when the command is called.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sbi_active.cli.options import (
+    COUNT,
+    FILE,
+    FOLDER,
+    SECONDS,
+    TEXT,
+    WHOLE,
+    Command,
+    Group,
+    Several,
+    one_of,
+    take_config,
+    take_problem,
+)
+
+#: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
+TASKS = (
+    *("numerical", "oscillator", "box_collision", "pouring", "pouring_real"),
+    *("servo_pendulum", "ball_drops", "location_finding", "chain"),
+)
+#: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
+METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
+#: Names of the settings of a method, as in ``sbi_active.cli.run.SETTINGS``.
+SETTINGS = ("default", "faithful")
+
+
+def _option(
+    name: str, help: str, type: Any = TEXT, metavar: str | None = None, **settings: Any
+) -> click.Option:
+    shows = settings.get("default") not in (None, "")
+    settings = {"type": type, "metavar": metavar, "show_default": shows, **settings}
+    return click.Option([name], help=help, **settings)
+
+
+def _flag(name: str, help: str) -> click.Option:
+    return click.Option([name], is_flag=True, help=help)
+
+
+def _several(name: str, metavar: str, help: str) -> click.Option:
+    return Several([name], type=TEXT, metavar=f"{metavar} ...", help=help)
+
+
+def _argument(name: str, metavar: str, type: Any = FOLDER, **settings: Any) -> Any:
+    return click.Argument([name], metavar=metavar, type=type, **settings)
+
+
+DIR, TRIAL = _argument("folder", "DIR"), _argument("trial", "TRIAL", WHOLE)
+TASK_NAME, METHOD_NAME = one_of(TASKS), one_of(METHODS)
+TASK_NAMES, METHOD_NAMES = (f"one of: {', '.join(n)}" for n in (TASKS, METHODS))
+A_TASK = _option("--task", TASK_NAMES, TASK_NAME, "TASK")
+OF_TASK = _option(
+    "--option",
+    "of the task, as often as wanted: variant=sinh, target=2, noise=0.01, "
+    "theta_true=[0.3,0.4,0.5]; the value is read as JSON, else as text",
+    metavar="NAME=VALUE",
+    multiple=True,
+)
+METHOD = _option("--method", METHOD_NAMES, METHOD_NAME, "METHOD", default="asbi")
+SEED = _option("--seed", "of all that is random", WHOLE, default=0)
+ROUNDS = _option("--rounds", "real trials", COUNT, default=4)
+WORKERS = _option("--workers", "processes", COUNT, default=1)
+JSON = _flag("--json", "for programs, errors too")
+TRUST = _flag("--trust", "import what the folder names, though it came from elsewhere")
+CONFIG = _option(
+    "--config",
+    "options by their names without the dashes in front; in a folder of recordings "
+    "problem.toml, beside which problem.py may have a simulator, prior, actions and "
+    "effects",
+    FILE,
+    "FILE.toml",
+    is_eager=True,
+    callback=take_config,
+)
+SIMULATOR = _option("--simulator", "or file.py:NAME", metavar="MODULE:FUNCTION")
+SIMULATOR_NOW = _option(
+    "--simulator",
+    "where it is now; the campaign knows where it was",
+    metavar="MODULE:FN",
+)
+PRIOR = _option("--prior", "in place of bounds", metavar="MODULE:NAME")
+ACTIONS = _several(
+    "--actions",
+    "SPEC",
+    "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
+    "A,B,...; or one MODULE:NAME of an action space",
+)
+SPACE = [
+    PRIOR,
+    _option("--theta-low", "one a parameter", metavar="A,B,..."),
+    _option("--theta-high", "one a parameter", metavar="A,B,..."),
+    ACTIONS,
+    _option(
+        "--noise", "standard deviation of x or of its entries", metavar="SD[,SD...]"
+    ),
+]
+EFFECTS = _option(
+    "--effects",
+    "a list of Effect, or a function that returns one",
+    metavar="MODULE:NAME",
+)
+REASON = _option("--reason", "kept with the trial", default="")
+OUTCOME = [
+    _argument("x", "[X]...", nargs=-1, type=TEXT, required=False),
+    _option("--file", "with the numbers", FILE, "X.csv"),
+    _flag("--invalid", "it ran and gave no measurement"),
+    _flag("--missing", "a fault that tells nothing hit it"),
+    _option("--action", "executed, where not the one asked for", metavar="A,B,..."),
+]
+RUN = [
+    _argument("task", "TASK", TASK_NAME),
+    *(METHOD, ROUNDS, SEED, OF_TASK),
+    _option("--out", "folder for the results", FOLDER, "DIR", required=True),
+    _option(
+        "--setting", "the paper's is faithful", one_of(SETTINGS), default="default"
+    ),
+    _option("--simulations", "to train on, a round", COUNT),
+    _option("--samples", "for the gain, a candidate action", COUNT),
+    _option("--iterations", "training steps a round", COUNT),
+]
+BUILD = [
+    *(DIR, A_TASK, OF_TASK, SIMULATOR, PRIOR, SEED, WORKERS),
+    _option("--actions", "with --simulator", metavar="MODULE:NAME"),
+    _option("--simulator-version", "in place of its source code", default=""),
+    _option("--rows", "in the bank, in all", COUNT, required=True),
+]
+CHECK = [
+    _argument("simulator", "[MODULE:FUNCTION]", TEXT, required=False),
+    *(A_TASK, *SPACE, ROUNDS, WORKERS, SEED),
+    _option("--rows", "a check", COUNT, default=256),
+]
+INIT = [
+    *(DIR, CONFIG, SIMULATOR, *SPACE, EFFECTS, METHOD, SEED),
+    _option("--names", "of the action's entries", metavar="A,B,..."),
+    _option("--units", "of the action's entries", metavar="A,B,..."),
+    _option("--num-simulations", "a round", WHOLE, "N"),
+    _option("--num-samples", "a candidate action", WHOLE, "N"),
+    _option("--num-workers", "processes", WHOLE, "N"),
+    _option("--time-limit", "s a simulation", SECONDS, "S"),
+]
+CRITICIZE = [
+    _argument("trials", "TRIALS.csv", FILE, is_eager=True, callback=take_problem),
+    *(CONFIG, A_TASK, SIMULATOR, *SPACE, EFFECTS, SEED, TRUST),
+    _several(
+        "--columns",
+        "KEY=NAME[,NAME...]",
+        "columns that are trial, time, action, x, input, start, role, index or "
+        "repeat_of, where they are named otherwise, as in trial=ball,drop x=height_m",
+    ),
+    _several("--units", "NAME=UNIT", "of columns without a unit in the header"),
+    _option(
+        "--order",
+        "unknown: rows (or the column index) are not the order of execution",
+        one_of(("known", "unknown")),
+        default="known",
+    ),
+    _option(
+        "--inputs",
+        "inputs at times of their own: time, input_*, and trial unless all share them",
+        FILE,
+        "INPUTS.csv",
+    ),
+    _option(
+        "--input-hold",
+        "between two times an input has the value before, or is linear",
+        one_of(("previous", "linear")),
+        default="previous",
+    ),
+    _flag("--no-thin", "use all samples of trajectories, with measurement_sd declared"),
+    _flag("--designed", "the actions were chosen for their information"),
+    _option("--out", "folder for the report", FOLDER, "DIR"),
+]
+CHANGED = _flag("--simulator-changed", "take another than before, compute all again")
+TRIALS_CSV = """
+Find what a simulator lacks, from measured trials. Find the residual, trace it to an
+effect that the simulator lacks, add it, and report the error before and after.
+
+TRIALS.csv has one row a trial, with columns action_* and x_* and optionally role (fit
+or 'held out'), index and repeat_of; or one row a sample, with columns trial and time
+besides, and with input_* in place of actions that vary in time. start_* is a measured
+start state. Units stand in brackets, as in x_height[m], and are those of the simulator.
+An empty cell is what was not measured. In its place a folder: of a campaign, which
+knows its simulator and its prior, or of recordings, with trials.csv or one file *.csv a
+trial.
+"""
+
+main = Group(
+    "sbi-active",
+    help="Tune a black-box simulator from a handful of real trials.",
+    epilog="Exit status: 0; 1 where something failed, as in the simulator; 2 where the "
+    "call or a file has to be changed; 130 after an interrupt.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+VERSION = {"message": "%(version)s", "help": "Show the version and exit."}
+click.version_option(package_name="sbi-active", **VERSION)(main)
+bank = Group("bank", help="Simulate into a bank, and inspect one.")
+main.add_command(bank)
+
+
+def _add(
+    name: str,
+    place: str,
+    params: Sequence[click.Parameter],
+    help: str,
+    to: Group = main,
+) -> None:
+    """Add a command, whose function has a place as ``module.name``."""
+    call = partial(_call, *place.split("."))
+    to.add_command(Command(name, callback=call, params=[*params], help=help))
+
+
+def _steer(name: str, help: str, *params: click.Parameter) -> None:
+    """Add a command on a campaign, which answers programs too."""
+    given = [DIR, *params, JSON, TRUST]
+    call = partial(_call_on_campaign, name)
+    main.add_command(Command(name, callback=call, params=given, help=help))
+
+
+def _call(module: str, function: str, **options: Any) -> Any:
+    found = importlib.import_module(f"sbi_active.cli.{module}")
+    return getattr(found, function)(**options)
+
+
+def _call_on_campaign(name: str, folder: Path, *, json: bool, **options: Any) -> Any:
+    from sbi_active.cli.session import Session
+
+    held = click.get_current_context().obj.get("session")
+    with held or Session(folder) as session:
+        return session.call(name, **options)
+
+
+_add("run", "run.run", RUN, "Run a campaign on a task.")
+_add("build", "bank.build", BUILD, "Simulate into a bank, from where it ended.", bank)
+_add("inspect", "bank.inspect", [DIR], "Show outcomes, and compare checksums.", bank)
+_add(
+    "check",
+    "check.check",
+    CHECK,
+    "Look a simulator over before a campaign. Shapes, seeds, noise, lost rows, "
+    "parameters that change nothing, and the cost of a campaign; exit status 1 where "
+    "something keeps a campaign from working.",
+)
+_add("criticize", "criticize.criticize", CRITICIZE, TRIALS_CSV)
+_add(
+    "init", "campaign.init", INIT, "Make a campaign in a new folder, also by --config."
+)
+_steer(
+    "ask",
+    "Design the next trial, or show the pending one.",
+    SIMULATOR_NOW,
+    _option("--target", "theta, model or a parameter's name", default="auto"),
+)
+_steer(
+    "tell",
+    "Record what a trial gave. X are the numbers, nan for one not measured.",
+    *OUTCOME,
+    _option("--trial", "None is the pending one, or a new one", WHOLE, "K"),
+)
+_steer("correct", "Replace what was told of a trial.", TRIAL, *OUTCOME, REASON)
+_steer("withdraw", "Take a trial out of the belief.", TRIAL, REASON)
+_steer("status", "Show the trials, the belief and the health.")
+_steer("repair", "Give up what is damaged, and say what that is.")
+_steer("update", "Bring the belief up to date.", SIMULATOR_NOW, CHANGED)
+_steer("adopt", "Go on with the effects that a verdict names.", SIMULATOR_NOW, EFFECTS)
+_steer(
+    "report",
+    "Write one page that shows the campaign.",
+    _option("--out", "where to", FILE, "PAGE.html"),
+)
+_steer(
+    "export",
+    "Write belief and trials for ArviZ.",
+    *(SIMULATOR_NOW, SEED),
+    _option("--netcdf", "where to", FILE, "FILE.nc", required=True),
+)
+_add(
+    "serve",
+    "session.serve",
+    [DIR, SIMULATOR_NOW, TRUST],
+    'Answer requests of a program, a JSON object a line, as {"command": "ask"}.',
+)

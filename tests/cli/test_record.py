@@ -1,0 +1,166 @@
+"""``tell``, ``correct``, ``withdraw`` and ``status`` without torch, as with it."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sbi_active import Campaign
+from sbi_active.cli import main, record
+from tests.cli.test_campaign import SIMULATOR
+
+BOUNDS = ["--theta-low=0.2,0", "--theta-high=1,1", "--noise", "0.02"]
+SIZES = ["--method", "nsbi", "--num-simulations", "200", "--num-samples", "50"]
+TWO = SIMULATOR.replace("    return ", "    x = ") + (
+    "    return torch.stack([x[:, 0], 2 * x[:, 0]], 1)\n"
+)
+COMMAND = """
+import sys
+from sbi_active.cli import main
+status = main()
+print("torch" in sys.modules, "numpy" in sys.modules, file=sys.stderr)
+sys.exit(status)
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A campaign with a trial that the belief has used and one to come."""
+    place = tmp_path_factory.mktemp("record")
+    (place / "sled.py").write_text(TWO)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setattr(sys, "path", [*sys.path])
+        patch.delitem(sys.modules, "sled", raising=False)
+        words = ["--simulator", "sled.py:slide", "--actions", "0.5:3"]
+        assert main(["init", "camp", *words, *BOUNDS, *SIZES]) == 0
+        assert main(["tell", "camp", "0.3", "0.6", "--action", "1"]) == 0
+        assert main(["ask", "camp"]) == 0
+    return place
+
+
+@pytest.fixture
+def camp(made, tmp_path, monkeypatch):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "sled", raising=False)
+    return Path("camp")
+
+
+def in_a_process(*words):
+    return subprocess.run(
+        [sys.executable, "-c", COMMAND, *words],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "tell camp 0.4 0.8",
+        "tell camp 0.4 0.8 --action 1.5 --trial 1 --json",
+        "tell camp --invalid",
+        "correct camp 0 0.31 0.61 --reason typo",
+        "withdraw camp 1",
+        "status camp --json",
+        "status camp",
+    ],
+)
+def test_neither_torch_nor_numpy_is_imported(camp, words):
+    done = in_a_process(*words.split())
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines()[-1] == "False False"
+
+
+SERIES = [
+    ["tell camp 0.4 nan"],
+    ["tell camp --missing", "tell camp 0.5 1.0 --action 2.5"],
+    ["tell camp --invalid --action 0.7"],
+    [
+        "withdraw camp 1 --reason pushed",
+        "tell camp 1 2 --action 3",
+        "correct camp 2 1 3",
+    ],
+    ["correct camp 0 0.31 0.61 --reason typo", "correct camp 0 --action 1.5"],
+    ["correct camp 0 --invalid", "withdraw camp 0", "tell camp 0.1 0.2"],
+    ["tell camp 0.4 0.8", "tell camp 0.4 0.8", "correct camp 1 0.4 0.8 --reason same"],
+    ["tell camp 0.4 0.8 --trial 0 --action 1", "tell camp 1e-20 -1e3"],
+    ["tell camp 0.4 0.8 --action 9", "tell camp --missing --action 2"],
+]
+
+
+def log(folder):
+    lines = (folder / "trials.jsonl").read_text().splitlines()
+    return [
+        {k: v for k, v in json.loads(line).items() if k not in ("time", "crc")}
+        for line in lines
+    ]
+
+
+@pytest.mark.parametrize("series", SERIES, ids=lambda s: s[0][:40])
+def test_the_log_and_the_answers_are_the_campaign_s(camp, series, capsys, monkeypatch):
+    shutil.copytree(camp, "other")
+    answers = []
+    for folder in ("camp", "other"):
+        capsys.readouterr()
+        for words in [*series, "status camp", "status camp"]:
+            if folder == "other":  # the campaign itself is loaded
+                Path(folder, "status.json").unlink(missing_ok=True)
+            words = words.replace("camp", folder, 1).split()
+            assert main([*words, "--json"]) == 0
+        shown = capsys.readouterr().out.splitlines()
+        answers.append([json.loads(line) for line in shown])
+    assert log(Path("camp")) == log(Path("other"))
+    assert answers[0] == answers[1]
+    one, other = (Campaign.load(name) for name in ("camp", "other"))
+    assert repr(one) == repr(other)
+
+
+def test_a_trial_that_somebody_else_told_is_seen(camp, capsys):
+    with Campaign.load("camp") as campaign:
+        campaign.tell([0.2, 0.4], trial=1)
+    assert main(["status", "camp", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["not_in_belief"] == [1]
+
+
+def test_lost_lines_of_the_log_are_noticed(camp, capsys):
+    path = camp / "trials.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:-1]))
+    for words in (["status", "camp"], ["tell", "camp", "0.4", "0.8", "--action", "1"]):
+        assert main(words) == 2
+        assert "trials.jsonl as it was written" in capsys.readouterr().err
+    assert path.read_bytes() == b"".join(lines[:-1])
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "3", '{"of": 1}', "[" * 99_999])
+def test_a_summary_that_is_none_is_not_asked(camp, content, capsys):
+    (camp / "status.json").write_text(content)
+    assert main(["tell", "camp", "0.4", "0.8"]) == 0
+    assert main(["status", "camp"]) == 0
+    assert "not in the belief yet: [1]" in capsys.readouterr().out
+
+
+def test_a_summary_is_never_written_through_a_link(camp, tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    summary = camp / "status.json"
+    content = summary.read_text()
+    summary.unlink()
+    (tmp_path / "kept").write_text(content)
+    summary.symlink_to(tmp_path / "kept")
+    assert main(["tell", "camp", "0.4", "0.8"]) == 0
+    assert (tmp_path / "kept").read_text() == content
+    assert not summary.is_symlink()
+
+
+def test_one_writer_at_a_time(camp, capsys):
+    with record.WriterLock(camp):
+        assert main(["tell", "camp", "0.4", "0.8"]) == 2
+    assert "expected no other writer" in capsys.readouterr().err
+    assert main(["tell", "camp", "0.4", "0.8"]) == 0

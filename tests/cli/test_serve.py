@@ -1,0 +1,195 @@
+"""``serve``: a JSON request a line, a JSON answer a line, whatever happens."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sbi_active.cli import main
+from tests.cli.test_campaign import SIMULATOR
+
+LOUD = (
+    SIMULATOR
+    + """
+
+def loud(theta, action):
+    import os
+    print("simulating")
+    os.write(1, b"past Python")
+    return slide(theta, action)
+
+
+def broken(theta, action):
+    raise ZeroDivisionError("by zero")
+"""
+)
+INIT = [
+    *("--theta-low=0.2,0", "--theta-high=1,1", "--actions", "0.5:3", "--noise", "0.02"),
+    *("--method", "nsbi", "--num-simulations", "200", "--simulator"),
+]
+
+
+@pytest.fixture
+def camp(monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "sled", raising=False)
+    Path("sled.py").write_text(LOUD)
+    assert main(["init", "camp", *INIT, "sled.py:loud"]) == 0
+
+
+def refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")
+
+
+class Server:
+    """A session in a process of its own."""
+
+    def __init__(self, *words):
+        code = "import sys; from sbi_active.cli import main; sys.exit(main())"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, "serve", "camp", *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            encoding="latin-1",
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+
+    def says(self, request):
+        line = request if isinstance(request, str) else json.dumps(request)
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        return json.loads(answer, parse_constant=refuse)
+
+    def ends(self):
+        _, error = self.process.communicate(timeout=60)
+        return self.process.returncode, error
+
+
+@pytest.fixture(scope="module")
+def lasting(tmp_path_factory):
+    place = tmp_path_factory.mktemp("lasting")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setattr(sys, "path", [*sys.path])
+        patch.delitem(sys.modules, "sled", raising=False)
+        Path("sled.py").write_text(LOUD)
+        assert main(["init", "camp", *INIT, "sled.py:loud"]) == 0
+        started = Server()
+    yield started
+    assert started.ends()[0] == 0
+
+
+@pytest.fixture
+def server(camp):
+    started = Server()
+    yield started
+    started.process.kill()
+    started.process.communicate()
+
+
+def test_a_robot_s_loop(server):
+    asked = server.says({"command": "ask", "id": 7})
+    assert asked["id"] == 7
+    assert asked["answer"]["names"] == ["action"]
+    told = server.says({"command": "tell", "x": 0.7, "trial": asked["answer"]["trial"]})
+    assert told["answer"]["x"] == [pytest.approx(0.7)]
+    assert told["answer"]["status"] == "ok"
+    again = {"command": "correct", "trial": 0, "x": [0.71], "reason": "read off"}
+    assert server.says(again)["answer"]["reason"] == "read off"
+    updated = server.says({"command": "update"})["answer"]
+    assert updated["not_in_belief"] == []
+    missed = server.says({"command": "tell", "missing": True, "action": [1.5]})
+    assert missed["answer"]["action"] == [1.5]
+    assert missed["answer"]["status"] == "missing"
+    assert [t["status"] for t in server.says({"command": "status"})["answer"]["trials"]]
+    saved = server.says({"command": "report", "out": "page.html"})
+    assert saved == {"answer": {"saved": "page.html"}}
+    status, error = server.ends()
+    assert status == 0, error
+    assert "simulating" in error
+    assert "past Python" in error
+
+
+@pytest.mark.parametrize(
+    ("request_", "text"),
+    [
+        ("\xff", "write one JSON object a line"),
+        ("{", "write one JSON object a line"),
+        ("[1]", "write one JSON object a line"),
+        ("[" * 99_999, "write one JSON object a line"),
+        ({}, "expected a command among ask, tell, correct"),
+        ({"command": ["ask"]}, "expected a command among ask"),
+        ({"command": "init"}, "got 'init'"),
+        ({"command": "tell", "x": [0.3], "speed": 3}, "expected options among"),
+        ({"command": "tell", "x": ["fast"]}, "write them with a point"),
+        ({"command": "tell", "x": [1, 2], "action": 1}, "expected 1 numbers"),
+        ({"command": "tell", "x": [None], "action": 1}, "a number that was measured"),
+        ({"command": "tell", "x": 1}, "ask for one by sbi-active ask camp"),
+        ({"command": "withdraw"}, "expected 'TRIAL'; got none"),
+        ({"command": "withdraw", "trial": "first"}, "expected a whole number"),
+        ({"command": "ask", "target": "weather"}, "expected"),
+    ],
+)
+def test_errors_are_json_and_the_session_goes_on(lasting, request_, text):
+    answer = lasting.says(request_)
+    assert text in answer["error"]["message"]
+    assert answer["error"]["status"] == 2
+    assert answer["error"]["type"]
+    last = lasting.says('\n{"command": "status", "id": "last"}')
+    assert last["id"] == "last"
+    assert last["answer"]["trials"] == []
+
+
+def test_a_simulator_that_fails_is_an_answer(camp):
+    assert main(["init", "other", *INIT, "sled.py:slide"]) == 0
+    server = Server("--simulator", "sled.py:broken")
+    answer = server.says({"command": "ask"})
+    assert answer["error"]["status"] in (1, 2)
+    assert server.says({"command": "status"})["answer"]["trials"] == []
+    assert server.ends()[0] == 0
+
+
+def test_another_process_may_write_between_two_requests(server):
+    assert server.says({"command": "tell", "x": 0.5, "action": 1})["answer"]
+    assert main(["tell", "camp", "0.9", "--action", "2"]) == 0
+    assert len(server.says({"command": "status"})["answer"]["trials"]) == 2
+    assert server.says({"command": "tell", "x": 0.6, "action": 1.5})["answer"]
+    assert main(["status", "camp"]) == 0
+
+
+def test_an_interrupt_ends_the_session(server):
+    assert server.says({"command": "status"})["answer"]["trials"] == []
+    server.process.send_signal(signal.SIGINT)
+    status, error = server.ends()
+    assert status == 130
+    assert error.splitlines()[-1].startswith("sbi-active: interrupted")
+
+
+def test_what_serve_needs_is_said_before_it_begins(capsys):
+    assert main(["serve"]) == 2
+    assert "expected 'DIR'; got none" in capsys.readouterr().err
+
+
+def test_nobody_reads_the_answers(camp):
+    ours, theirs = os.pipe()
+    os.close(ours)
+    code = "import sys; from sbi_active.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "serve", "camp"],
+        input='{"command": "status"}\n' * 3,
+        stdout=theirs,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    os.close(theirs)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
