@@ -255,14 +255,8 @@ class Criticism:
                     # What separates its effects, the next action looks for.
                     actions=None if self._is_large else self.actions,
                 )
-            tracing, self._misfit = beside_misfit(
-                tracing,
-                detection,
-                self.rivals,
-                groups,
-                self._scored,
-                search=self._linear,
-            )
+            given = self.rivals, groups, self._scored, self._linear
+            tracing, self._misfit = beside_misfit(tracing, detection, *given)
             if self._misfit is not None:
                 self._residuals = None
         self._tracing = replace(tracing, set_aside=self.set_aside)

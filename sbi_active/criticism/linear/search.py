@@ -25,6 +25,7 @@ from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.model import LinearModel, enlarged, linearize
+from sbi_active.criticism.linear.nulls import at_null, has_null
 from sbi_active.criticism.linear.settings import FitSettings
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
@@ -113,12 +114,8 @@ class Search:
         if not new:
             return
         bare, rival = self.found[ModelKey()].model, self._rival(ModelKey())
-        u = np.array(
-            [
-                self.found[key].model.u[self.columns(key, ModelKey())]
-                for key in self._best(1)
-            ]
-        )
+        best = {key: self.columns(key, ModelKey()) for key in self._best(1)}
+        u = np.array([self.found[k].model.u[own] for k, own in best.items()])
         square = ((rival.residual(u)[0] / self.unit) ** 2).mean(1)
         if square.min() < 2 * bare.rms**2:
             again = self._polished(rival, u[int(np.argmin(square))])
@@ -207,7 +204,7 @@ class Search:
         """
         key = self._joined(base, [name])
         rival, model = self._rival(key), self.found[base].model
-        null, step = self._null(name)
+        null, step = self._at_null(name)
         start = np.empty(rival.dim)
         own = ~self.columns(key, base)
         start[~own], start[own] = model.u, null
@@ -272,6 +269,10 @@ class Search:
         effect = self.rivals.effects[name]
         return is_force(effect) and effect.phi_dim > 1
 
+    def _at_null(self, name: str) -> tuple[Array, Array]:
+        alone = self._rival(ModelKey((name,)))
+        return at_null(alone, self.rivals.effects[name], self.settings.tried)
+
     def _rival(self, key: ModelKey) -> Rival:
         if key not in self._rivals:
             self._rivals[key] = self.rivals.rival(key)
@@ -308,7 +309,7 @@ class Search:
         u, _ = self._secant(rival, u, scale, known=known)
         fits = [self._polished(rival, u[0])]
         effects = [self.rivals.effects[n] for n in key.effects]
-        is_far = any(not e.null_phi(1).isfinite().all() for e in effects)
+        is_far = not all(map(has_null, effects))
         if is_far or (len(effects) == 1 and not is_force(effects[0])):
             # Not linear in phi: it may be far from where its column was taken.
             u, cost = self._secant(rival, self._starts(key, parent), scale)
@@ -342,7 +343,7 @@ class Search:
         starts = [u]
         if key in self.rivals.fits:  # what is flat at its null was found by sampling
             starts.append(self.rivals.fits[key].likeliest[:1])
-        if not all(map(self._has_null, key.effects)):
+        if not all(has_null(self.rivals.effects[n]) for n in key.effects):
             seed = derive_seed(self._seed, str(key), "screened")
             far = c.sample(own.num_far, seed=seed)
             square = ((rival.residual(far)[0] / self.unit) ** 2).sum(1)
@@ -359,7 +360,7 @@ class Search:
         u, columns = np.empty(rival.dim), rival.columns()
         u[self.columns(key, parent)] = model.u
         for name in {*key.effects} - {*parent.effects}:
-            null, step = self._null(name)
+            null, step = self._at_null(name)
             u[columns[name]] = null + self.settings.faint * step
         return u
 
@@ -395,22 +396,3 @@ class Search:
             secant=True,
             known=known,
         )
-
-    def _null(self, name: str) -> tuple[Array, Array]:
-        """Return the null of an effect among the coordinates, and a step from it."""
-        rival = self._rival(ModelKey((name,)))
-        c, place = rival.coordinates, rival.columns()[name]
-        null = self.rivals.effects[name].null_phi(1).double().numpy()
-        z = c.to_z(np.clip(np.zeros((1, rival.dim)), c.low, c.high))
-        low, high = c.low[place], c.high[place]
-        if np.isfinite(null).all():
-            z[:, place] = null
-            u = c.from_z(z)[0, place]
-        else:  # the end of the prior that is nearest to it
-            u = np.where(null[0] > 0, high, low)
-        tried = self.settings.tried
-        step = np.where(u + tried > high, -tried, tried)
-        return np.clip(u, low, high), step
-
-    def _has_null(self, name: str) -> bool:
-        return bool(self.rivals.effects[name].null_phi(1).isfinite().all())
