@@ -19,7 +19,7 @@ from benchmarks.robustness.campaign_problem import campaign, tell
 from sbi_active import Campaign
 from sbi_active.campaign.storage import DamagedCampaignError
 from sbi_active.campaign.storage.damage import LogChangedError
-from sbi_active.simulation.bank.lock import LockedError
+from sbi_active.simulation.bank.damage import LockedError
 
 ATTACKS = Attacks()
 FOLDER = "camp"

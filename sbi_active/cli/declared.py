@@ -100,7 +100,7 @@ def _is_texts(value: Any) -> bool:
 
 def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
     """Write where everything is, and remember that it was written here."""
-    from sbi_active.simulation.bank.segments import write_file
+    from sbi_active.simulation.bank.files import write_file
 
     write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
     _remember(folder)

@@ -28,8 +28,8 @@ from sbi_active.campaign.storage.damage import (
 from sbi_active.campaign.storage.log import TrialLog, keep_aside, mend_log
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.telling import LOST, recorded
+from sbi_active.simulation.bank.files import write_file
 from sbi_active.simulation.bank.lock import WriterLock
-from sbi_active.simulation.bank.segments import write_file
 
 #: Names that a saved belief has; a user's own file has another.
 OWN_BELIEF = re.compile(r"belief-[0-9a-f]{16}\.bin")

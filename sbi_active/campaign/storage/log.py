@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign.storage.damage import DamagedCampaignError, LogChangedError
-from sbi_active.simulation.bank.lock import require_no_link
-from sbi_active.simulation.bank.segments import synchronize, write_file
+from sbi_active.simulation.bank.damage import require_no_link
+from sbi_active.simulation.bank.files import synchronize, write_file
 
 BEGINNING = b'{"line": '  # of each line
 

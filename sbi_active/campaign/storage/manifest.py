@@ -22,8 +22,8 @@ from sbi_active.campaign.storage.described import (
     describe_prior,
 )
 from sbi_active.campaign.storage.drawn import draws_of
+from sbi_active.simulation.bank.files import write_file
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
-from sbi_active.simulation.bank.segments import write_file
 
 MANIFEST, COPY = "campaign.json", "campaign.json.copy"
 FORMAT, SCHEMA = "sbi-active campaign", 1

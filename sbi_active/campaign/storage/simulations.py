@@ -9,7 +9,7 @@ from typing import Any
 
 from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.header import has_header
+from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.store import RowStore
 
@@ -21,7 +21,7 @@ def num_rows(folder: str | None) -> int:
         folder: None for none.
     """
     drawn = None if folder is None else Path(folder, "drawn")
-    return 0 if drawn is None or not has_header(drawn) else len(Bank(drawn))
+    return 0 if drawn is None or not (drawn / NAME).exists() else len(Bank(drawn))
 
 
 class CampaignBanks:

@@ -9,40 +9,10 @@ from pathlib import Path
 
 import filelock
 
-from sbi_active.messages import Explained
-from sbi_active.simulation.bank.segments import write_file
+from sbi_active.simulation.bank.damage import LockedError, require_no_link
+from sbi_active.simulation.bank.files import write_file
 
 _inherited: list[filelock.BaseFileLock] = []
-
-
-class LockedError(Explained, OSError):
-    """Somebody else is writing.
-
-    Attributes:
-        pid: Process that holds the lock, None where it did not say.
-    """
-
-    def __init__(self, folder: Path, pid: int | None, host: str) -> None:
-        self.pid = pid
-        here = " (this one)" if pid == os.getpid() and host == platform.node() else ""
-        super().__init__(
-            f"expected no other writer of {folder}; got process {pid}{here} on "
-            f"{host}; wait for it, call close() there, or write to a bank of your "
-            "own: any number of readers may go on"
-        )
-
-
-def require_no_link(path: Path) -> None:
-    """Raise where a file that is written to is a link: it would lead elsewhere.
-
-    Raises:
-        OSError: If the path is a symbolic link.
-    """
-    if path.is_symlink():
-        raise OSError(
-            f"expected {path} as a file; got a link to {path.readlink()}; remove it, "
-            "after a look at where the folder comes from"
-        )
 
 
 class WriterLock:

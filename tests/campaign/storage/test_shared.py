@@ -12,7 +12,7 @@ from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.campaign.storage import DamagedCampaignError
 from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.campaign.storage.damage import LogChangedError
-from sbi_active.simulation.bank.lock import LockedError
+from sbi_active.simulation.bank.damage import LockedError
 from tests.campaign.storage.campaigns import (
     MODEL,
     facts,
