@@ -137,6 +137,20 @@ def inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def migrate(arguments: argparse.Namespace) -> int:
+    """Bring a folder of an earlier release up to date."""
+    from sbi_active.migration import migrate
+
+    found = migrate(arguments.folder)
+    number = found.pop("log", None)
+    if number is not None:
+        print(f"log: {number} events")
+    for name, num_rows in found.items():
+        print(f"bank {name}: {num_rows} rows")
+    print(f"the files of before are in {arguments.folder / 'version-1'}")
+    return 0
+
+
 def _shown(text: str) -> str:
     """Return a text from a file so that it cannot steer the terminal."""
     return text if text.isprintable() else ascii(text)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.campaign.storage.manifest import MANIFEST, has_manifest
+from sbi_active.campaign.storage.manifest import has_manifest
 from sbi_active.cli import campaign
 from sbi_active.cli.check import actions_of, prior_of, with_noise
 from sbi_active.cli.folder import effects_of, read_config
@@ -25,6 +25,7 @@ from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import TrialTable
 from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.tasks import get_task  # pyright: ignore
 
 
@@ -36,7 +37,7 @@ def criticize(arguments: argparse.Namespace) -> int:
         if not [*arguments.trials.glob("*.csv")]:
             raise ValueError(
                 f"expected a campaign or recordings in {arguments.trials}; got neither "
-                f"{MANIFEST} nor a file *.csv; make a campaign by sbi-active init, or "
+                f"{NAME} nor a file *.csv; make a campaign by sbi-active init, or "
                 "write one table of all trials, or one a trial"
             )
         read_problem(arguments)

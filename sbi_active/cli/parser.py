@@ -49,6 +49,11 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_run(commands)
     _add_bank(commands)
+    migrate = commands.add_parser(
+        "migrate", help="bring a campaign or bank of release 0.1 up to date"
+    )
+    migrate.set_defaults(command=("bank", "migrate"))
+    migrate.add_argument("folder", type=Path, help="of the campaign or bank")
     _add_check(commands)
     _add_criticize(commands)
     add_campaign_commands(commands, METHODS)
