@@ -11,6 +11,7 @@ import errno
 import os
 import secrets
 import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -73,8 +74,11 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
     )
 
 
-def opened(path: Path, what: str) -> tuple[sqlite3.Connection, int]:
-    """Return a connection to a store, and the name that is in its file.
+def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
+    """Return a connection to a store, and whether it is for one look alone.
+
+    That is so where not even the notes of a reader can be written beside the file: it
+    is then read as it is, and others have to wait.
 
     Args:
         path: The file.
@@ -87,44 +91,48 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, int]:
     try:
         size = regular_size(path)
     except (FileNotFoundError, NotADirectoryError) as error:
-        given = "simulator" if what == "bank" else "directory"
+        make = "make one by Campaign(..., directory=...)"
+        make = "give simulator= to make one" if what == "bank" else make
         raise ValueError(
-            f"expected a {what}; got no {path}; "
-            f"{advice(path.parent, f'give {given}= to make one')}"
+            f"expected a {what}; got no {path}; {advice(path.parent, make)}"
         ) from error
     require(path, size > 0, "an empty file")
     log = path.with_name(f"{NAME}-wal")
     for beside in (log, path.with_name(f"{NAME}-shm")):
         require_no_link(beside)
     has_log = log.exists() and log.stat().st_size
-    try:
-        return _checked(connected(path, "rw", timeout=PATIENCE), path, what)
-    except sqlite3.OperationalError:
-        # Nobody writes to it where not even a reader's notes can be written.
-        mode = "ro" if has_log else "ro&immutable=1"
-        return _checked(connected(path, mode, timeout=PATIENCE), path, what)
+    last = ("rw", "locking_mode = EXCLUSIVE") if has_log else ("ro&immutable=1", "")
+    for mode, setting in (("rw", ""), ("ro", ""), last):
+        connection = connected(path, mode, timeout=PATIENCE)
+        try:
+            _check(connection, path, what, (setting, *SETTINGS))
+        except sqlite3.OperationalError:
+            connection.close()
+            if (mode, setting) == last:
+                raise
+        except BaseException:
+            connection.close()
+            raise
+        else:
+            return connection, (mode, setting) == last
+    raise AssertionError
 
 
-def _checked(
-    connection: sqlite3.Connection, path: Path, what: str
-) -> tuple[sqlite3.Connection, int]:
-    try:
-        for setting in SETTINGS:
-            connection.execute(f"PRAGMA {setting}")
-        found = connection.execute("SELECT name, sql FROM sqlite_master").fetchall()
-        plain = {(name, sql) for name, sql in found if sql is not None}
-        own = plain == {*SCHEMA.items()} and len(found) == 2 * len(SCHEMA)
-        require(path, own, "tables that are not those of a store")
-        form = connection.execute("PRAGMA user_version").fetchone()[0]
-        if form != FORMAT:
-            raise ValueError(
-                f"expected a {what} of format {FORMAT}; got {form} in {path}; use the "
-                "release of sbi-active that wrote it"
-            )
-        return connection, connection.execute("PRAGMA application_id").fetchone()[0]
-    except BaseException:
-        connection.close()
-        raise
+def _check(
+    connection: sqlite3.Connection, path: Path, what: str, settings: Sequence[str]
+) -> None:
+    for setting in filter(None, settings):
+        connection.execute(f"PRAGMA {setting}")
+    found = connection.execute("SELECT name, sql FROM sqlite_master").fetchall()
+    plain = {(name, sql) for name, sql in found if sql is not None}
+    own = plain == {*SCHEMA.items()} and len(found) == 2 * len(SCHEMA)
+    require(path, own, "tables that are not those of a store")
+    form = connection.execute("PRAGMA user_version").fetchone()[0]
+    if form != FORMAT:
+        raise ValueError(
+            f"expected a {what} of format {FORMAT}; got {form} in {path}; use the "
+            "release of sbi-active that wrote it"
+        )
 
 
 def made(folder: Path, what: str) -> None:

@@ -70,6 +70,7 @@ class Store:
         self._connection: sqlite3.Connection | None = None
         self._lock: sqlite3.Connection | None = None
         self._signature: tuple[int, ...] = ()
+        self._depth, self._is_alone = 0, False
         _OPEN.add(self)
         if make and not self.path.exists():
             made(folder, what)
@@ -111,7 +112,13 @@ class Store:
                 if not is_open or not self.held and self._is_replaced():
                     self._open()
                 assert self._connection is not None
-                yield self._connection
+                self._depth += 1
+                try:
+                    yield self._connection
+                finally:
+                    self._depth -= 1
+                if self._is_alone and not self._depth:
+                    self._disconnect()
             except sqlite3.Error as error:
                 if "locked" in str(error):
                     raise LockedError(self.folder, *self._holder()) from error
@@ -353,7 +360,9 @@ class Store:
 
     def _open(self) -> None:
         self._disconnect()
-        self._connection, self._id = opened(self.path, self._what)
+        self._connection, self._is_alone = opened(self.path, self._what)
+        name = self._connection.execute("PRAGMA application_id")
+        self._id = name.fetchone()[0]
         self._signature = self._found()
 
     def _holder(self) -> tuple[int | None, str]:
