@@ -94,8 +94,6 @@ def entry(case: tuple[str, int]) -> None:
     owner = last["trial"] if key in last.get("trial", {}) else last
     owner[key] = SPOILS[k]
     crafted_record(FOLDER, "events", "log", number, last)
-    if key == "x" and SPOILS[k] is None:
-        whole = [*whole[:-1], whole[-1][:1]]  # a trial without an outcome is one
     same_or_refused(whole)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -175,14 +176,14 @@ class CampaignDirectory:
             ValueError: If it is damaged, another release wrote it, or it is not there
                 any more.
         """
-        try:
-            content = self.store.get(OBJECTS, BELIEF) or b""
-        except CorruptSegmentError as error:
-            raise ValueError(str(error)) from error
+        content = b""
+        with suppress(CorruptSegmentError):
+            content = self.store.get(OBJECTS, BELIEF) or content
         if hashlib.sha256(content).hexdigest() != name:
             raise ValueError(
-                f"expected the belief {name:.8} in {self.store.path}; got another, as "
-                "after another process went on with the campaign; load it again"
+                f"expected the belief {name:.8} in {self.store.path}; got another or a "
+                "damaged one, as after another process went on with the campaign; load "
+                "it again"
             )
         return decode(content, known=known)
 
