@@ -28,7 +28,7 @@ from sbi_active.campaign.storage.damage import (
 )
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.telling import LOST, recorded
-from sbi_active.simulation.bank.damage import CorruptSegmentError, parsed
+from sbi_active.simulation.bank.damage import CorruptSegmentError, parsed, require
 from sbi_active.simulation.bank.sqlite import EVENTS, OBJECTS
 from sbi_active.simulation.bank.store import Store
 
@@ -60,11 +60,18 @@ class CampaignDirectory:
         self.path, self.notes = path, []
         with naming():
             self.store = Store(path, "campaign")
-        if repair:
+            if repair and self.store.problems():
+                self.store.salvage()
+            self._entries, lost = self._lines()
+        if lost and not repair:
+            total = len(self._entries) + len(lost)
+            reason = (
+                f"{lost[0]}, {len(lost)} of {total} lines damaged, the others whole"
+            )
+            raise DamagedCampaignError(self.store.path, reason)
+        if lost:
             self._mend()
         self.manifest = read_manifest(self.store, repair=repair)
-        with reading(self.store.path):
-            self._entries = self._read()
         self._saved = self._saved_state()
         with reading(self.store.path):
             self._require_whole(repair=repair)
@@ -218,68 +225,35 @@ class CampaignDirectory:
 
     def _line(self, number: int) -> dict[str, Any]:
         content = self.store.get(EVENTS, LOG, number)
-        if content is None:
-            raise CorruptSegmentError(self.store.path, f"no line {number} of the log")
-        line = parsed(self.store.path, content)
-        if line.get("line") != number or type(line.get("event")) is not str:
-            reason = f"a line {number} of the log that no campaign writes"
-            raise CorruptSegmentError(self.store.path, reason)
+        line = parsed(self.store.path, content or b"")
+        is_own = line.get("line") == number and type(line.get("event")) is str
+        require(self.store.path, is_own, f"a line {number} of the log that none writes")
         return line
 
-    def _read(self) -> list[dict[str, Any]]:
-        found, wrong = [], []
-        total = self.store.length(EVENTS, LOG)
-        for number in range(1, total + 1):
+    def _lines(self) -> tuple[list[dict[str, Any]], list[str]]:
+        """Return the lines of the log that are whole, and what is left of others."""
+        whole, lost = [], []
+        for number in range(1, self.store.length(EVENTS, LOG) + 1):
             try:
-                found.append(self._line(number))
+                whole.append(self._line(number))
             except CorruptSegmentError as error:
-                wrong.append(error.reason)
-        if wrong:
-            raise DamagedCampaignError(
-                self.store.path,
-                f"{wrong[0]}, {len(wrong)} of {total} lines damaged, the others whole",
-            )
-        return found
+                left = self.store.remains(EVENTS, LOG, number)
+                lost.append(error.reason)
+                self.notes.append(f"given up, tell it again: {left or error.reason}")
+        return whole, lost
 
     def _mend(self) -> None:
-        """Give up what is damaged, and keep a copy of the file."""
-        total, kept, lost = 0, [], []
-        try:
-            total = self.store.length(EVENTS, LOG)
-        except CorruptSegmentError as error:
-            lost.append(error.reason)
-        for number in range(1, total + 1):
-            try:
-                kept.append(self._line(number))
-            except CorruptSegmentError as error:
-                lost.append(self._text(number) or error.reason)
-        if not lost and not self.store.problems():
-            return
-        self.store.salvage()
-        with reading(self.store.path):
-            if not total:  # how many there were is lost too
-                total = self.store.length(EVENTS, LOG)
-                numbers = range(1, total + 1)
-                whole = [self.store.get(EVENTS, LOG, number) for number in numbers]
-                kept = [parsed(self.store.path, line) for line in whole if line]
+        """Give up lines that are damaged, and keep a copy of the file."""
+        with naming():
+            self.store.salvage()
             with self.store.writing():
-                for number, line in enumerate(kept, 1):
-                    self.store.put(EVENTS, LOG, number, {**line, "line": number})
-                self.store.cut((EVENTS, LOG), len(kept))
-        self.notes += [f"given up, tell it again: {text}" for text in lost]
+                for number, line in enumerate(self._entries, 1):
+                    line["line"] = number
+                    self.store.put(EVENTS, LOG, number, line)
+                num = len(self._entries)
+                self.store.delete(EVENTS, LOG, first=num + 1)
+                self.store.put(OBJECTS, f"{EVENTS} of {LOG}", 0, {"length": num})
         self.store.close()
-
-    def _text(self, number: int) -> str:
-        """Return what is left of a damaged line."""
-        try:
-            with self.store.reading() as connection:
-                found = connection.execute(
-                    "SELECT content FROM events WHERE kind = ? AND number = ?",
-                    (LOG, number),
-                ).fetchone()
-            return found[0].decode(errors="replace")
-        except Exception:  # whatever is there, or nothing
-            return ""
 
     def _saved_state(self) -> dict[str, Any] | None:
         try:

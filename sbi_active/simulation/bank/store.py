@@ -133,7 +133,7 @@ class Store:
             ).fetchone()
         where = f"{table} {kind!r} {number}"
         if found is None:  # or not found, as a page is damaged
-            wrong = self.problems(table) if table == OBJECTS else []
+            wrong = self._structure(table) if table == OBJECTS else []
             require(self.path, not wrong, f"no {where} ({wrong})")
             return None
         content, digest = found
@@ -145,9 +145,20 @@ class Store:
 
     def size(self, table: str, kind: str, number: int = 0) -> int | None:
         """Return the bytes of a record without reading it; None where there is none."""
+        return self._look("length(content)", table, kind, number)
+
+    def remains(self, table: str, kind: str, number: int) -> str:
+        """Return what is left of a damaged record, for people."""
+        try:
+            left = self._look("content", table, kind, number)
+            return left.decode(errors="replace")
+        except Exception:  # whatever is there, or nothing
+            return ""
+
+    def _look(self, what: str, table: str, kind: str, number: int) -> Any:
         with self.reading() as connection:
             found = connection.execute(
-                f"SELECT length(content) FROM {table} WHERE kind = ? AND number = ?",
+                f"SELECT {what} FROM {table} WHERE kind = ? AND number = ?",
                 (kind, number),
             ).fetchone()
         return None if found is None else found[0]
@@ -219,21 +230,12 @@ class Store:
                     if connection.in_transaction:
                         connection.execute("ROLLBACK")
 
-    def delete(self, table: str, kind: str, number: int = 0) -> None:
-        """Remove a record; for use in :meth:`writing`."""
+    def delete(self, table: str, kind: str, *, first: int = 0) -> None:
+        """Remove records from a number on; for use in :meth:`writing`."""
         assert self._connection is not None
         self._connection.execute(
-            f"DELETE FROM {table} WHERE kind = ? AND number = ?", (kind, number)
+            f"DELETE FROM {table} WHERE kind = ? AND number >= ?", (kind, first)
         )
-
-    def cut(self, series: tuple[str, str], length: int) -> None:
-        """Remove the records of a series from a number on, but for the first ones."""
-        table, name = series
-        assert self._connection is not None
-        self._connection.execute(
-            f"DELETE FROM {table} WHERE kind = ? AND number > ?", (name, length)
-        )
-        self.put(OBJECTS, f"{table} of {name}", 0, {"length": length})
 
     def acquire(self) -> None:
         """Take the right to write, which ends with :meth:`close` or the process.
@@ -282,11 +284,21 @@ class Store:
             self._connection.close()
         self._connection, self._signature = None, ()
 
-    def problems(self, table: str = "9") -> list[str]:
-        """Return what SQLite finds wrong with the file, or a table, one line each."""
+    def problems(self) -> list[str]:
+        """Return what is wrong with the file and its objects, one line each."""
+        wrong = self._structure("9")  # as many as are listed
+        for kind in [] if wrong else self.kinds():
+            try:
+                self.get(OBJECTS, kind)
+            except CorruptSegmentError as error:
+                wrong.append(error.reason)
+        return wrong
+
+    def _structure(self, what: str) -> list[str]:
+        """Return what SQLite finds wrong with the file, or a table of it."""
         try:
             with self.reading() as connection:
-                check = f"PRAGMA integrity_check({table})"
+                check = f"PRAGMA integrity_check({what})"
                 found = connection.execute(check).fetchall()
         except CorruptSegmentError as error:
             return [error.reason]
