@@ -85,6 +85,7 @@ FLOORS = (
     "campaign.telling",
     "campaign.storage",
     "campaign",
+    "migration",
     "export",
     "plots",
     "tasks",

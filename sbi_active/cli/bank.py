@@ -150,6 +150,19 @@ def inspect(folder: Path) -> int:
     return 0
 
 
+def migrate(folder: Path) -> None:
+    """Bring a folder of an earlier release up to date."""
+    from sbi_active.migration import migrate
+
+    found = migrate(folder)
+    number = found.pop("log", None)
+    if number is not None:
+        print(f"log: {number} events")
+    for name, num_rows in found.items():
+        print(f"bank {name}: {num_rows} rows")
+    print(f"the files of before are in {folder / 'version-1'}")
+
+
 def _shown(text: str) -> str:
     """Return a text from a file so that it cannot steer the terminal."""
     return text if text.isprintable() else ascii(text)

@@ -244,6 +244,12 @@ def _call_on_campaign(name: str, folder: Path, *, json: bool, **options: Any) ->
         return session.call(name, **options)
 
 
+_add(
+    "migrate",
+    "bank.migrate",
+    [DIR],
+    "Bring a campaign or bank of release 0.1 up to date.",
+)
 _add("run", "run.run", RUN, "Run a campaign on a task.")
 _add("build", "bank.build", BUILD, "Simulate into a bank, from where it ended.", bank)
 _add("inspect", "bank.inspect", [DIR], "Show outcomes, and compare checksums.", bank)

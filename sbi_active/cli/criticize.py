@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.campaign.storage.manifest import MANIFEST, has_manifest
+from sbi_active.campaign.storage.manifest import has_manifest
 from sbi_active.cli.given import (
     actions_of,
     effects_of,
@@ -33,6 +33,7 @@ from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import TrialTable
 from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
+from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.tasks import get_task  # pyright: ignore
 
 #: What a folder of recordings may hold, and what of its simulator that may name.
@@ -49,7 +50,7 @@ def criticize(trials: Path, **options: Any) -> None:
         if not [*trials.glob("*.csv")]:
             raise ValueError(
                 f"expected a campaign or recordings in {trials}; got neither "
-                f"{MANIFEST} nor a file *.csv; make a campaign by sbi-active init, or "
+                f"{NAME} nor a file *.csv; make a campaign by sbi-active init, or "
                 "write one table of all trials, or one a trial"
             )
         _take_problem(given)

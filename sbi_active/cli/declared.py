@@ -19,7 +19,7 @@ from typing import Any
 #: How the command line made the campaign: where its simulator is.
 DECLARED = "command.json"
 #: What else makes a folder a campaign's, see :mod:`sbi_active.campaign.storage`.
-MANIFESTS = ("campaign.json", "campaign.json.copy")
+MANIFESTS = ("store.db", "campaign.json")
 
 TEXTS = ("simulator", "noise", "prior", "actions", "folder", "task")
 LISTS = ("effects", "options")

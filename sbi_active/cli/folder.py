@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign import Campaign
+from sbi_active.campaign.storage.damage import naming
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.declared import named, read_declared, require_trust
 from sbi_active.cli.given import (
@@ -17,6 +18,7 @@ from sbi_active.cli.given import (
     with_generic,
 )
 from sbi_active.criticism import Effect
+from sbi_active.simulation.bank.store import Store
 
 
 def open_campaign(
@@ -63,7 +65,8 @@ def _given(
     folder: Path, declared: Mapping[str, Any], *, trusts: bool
 ) -> dict[str, Any]:
     """Return the prior and the actions that no file describes, from their programs."""
-    manifest = read_manifest(folder)
+    with naming():
+        manifest = read_manifest(Store(folder, "campaign"))
     lacking = [what for what in ("prior", "actions") if manifest[what] is None]
     if lacking and declared.get("task") is not None:
         task = _task_of(declared, folder, trusts=trusts)

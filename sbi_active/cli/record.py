@@ -14,20 +14,20 @@ import json
 import math
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from sbi_active.campaign.storage.log import TrialLog
+from sbi_active.campaign.storage.damage import naming
 from sbi_active.cli.declared import read_declared
 from sbi_active.cli.options import flat
-from sbi_active.simulation.bank.lock import WriterLock
+from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
+from sbi_active.simulation.bank.store import Store
 
 SUMMARY = "status.json"
-#: What a campaign is, what was computed, and what was asked and told.
-FILES = MANIFEST, STATE, LOG = "campaign.json", "state.bin", "trials.jsonl"
-HEAD = 64  # bytes of the state's file: the checksum of the others
+LOG, STATE = "log", "state"  # records of a campaign, see its storage
 UNSCORED = {"information_gained": None, "surprise": None}
 
 
@@ -56,13 +56,23 @@ def digest(folder: Path) -> str:
     Args:
         folder: Of the campaign.
     """
-    found = hashlib.sha256()
-    for name in FILES:
-        path, size = folder / name, HEAD if name == STATE else -1
-        with contextlib.suppress(OSError, ValueError), open(path, "rb") as file:
-            found.update(file.read(size))
-        found.update(name.encode())
-    return found.hexdigest()
+    with contextlib.suppress(OSError, ValueError), _stored(folder) as store:
+        num = store.length(EVENTS, LOG)
+        last = store.get(EVENTS, LOG, num) if num else None
+        parts = (str(num).encode(), last or b"", store.get(OBJECTS, STATE) or b"")
+        return hashlib.sha256(b"".join(parts)).hexdigest()
+    return ""
+
+
+@contextlib.contextmanager
+def _stored(folder: Path) -> Iterator[Store]:
+    if not (folder / NAME).exists():
+        raise Unsure
+    store = Store(folder, "campaign")
+    try:
+        yield store
+    finally:
+        store.close()
 
 
 class Record:
@@ -138,12 +148,14 @@ class Record:
         )
 
     def _require_same(self) -> None:
-        if self._summary["of"] != digest(self.directory):
+        if not self._summary["of"] or self._summary["of"] != digest(self.directory):
             raise Unsure
 
     def _facts(self) -> list[dict[str, Any]]:
         """Return each trial as the log has it last."""
-        entries = TrialLog(self.directory / LOG).entries
+        with naming(), _stored(self.directory) as store:
+            numbers = range(1, store.length(EVENTS, LOG) + 1)
+            entries = [json.loads(store.get(EVENTS, LOG, k) or b"{}") for k in numbers]
         facts = {e["trial"]["index"]: e["trial"] for e in entries if "trial" in e}
         if [*sorted(facts)] != [*range(len(self.state.trials))]:
             raise Unsure
@@ -176,9 +188,12 @@ class Record:
         return all(low <= a <= high for low, a, high in limits)
 
     def _write(self, event: str, facts: dict[str, Any]) -> dict[str, Any]:
-        with WriterLock(self.directory):
-            self._require_same()
-            TrialLog(self.directory / LOG).append({"event": event, "trial": facts})
+        time = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        with naming(), _stored(self.directory) as store:
+            with store.writing((EVENTS, LOG)) as number:
+                self._require_same()
+                line = {"line": number, "time": time, "event": event, "trial": facts}
+                store.put(EVENTS, LOG, number, line)
             return self._noted(facts)
 
     def _noted(self, facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -56,29 +56,6 @@ def test_draws_come_back_with_the_folder(tmp_path):
     assert all(torch.equal(again[i], kept[i]) for i in kept)
 
 
-def test_a_folder_without_draws_loads(tmp_path, monkeypatch):
-    campaign = told(1, tmp_path / "c")
-    disk, put = campaign._storage.disk, []
-    from sbi_active.campaign.storage import directory
-
-    encode = directory.encode
-
-    def as_before(value, *, known):
-        if isinstance(value, dict) and value.pop("draws", None):
-            put.append(True)
-        return encode(value, known=known)
-
-    monkeypatch.setattr(directory, "encode", as_before)
-    disk.save(campaign.state, campaign.belief, {"simulator": MODEL, "prior": PRIOR})
-    campaign.close()
-    assert put
-    again = Campaign.load(tmp_path / "c", simulator=MODEL)
-    assert again.state.draws == {}
-    go_on(again, 2)
-    again.update()
-    assert [*again.state.draws] == [1]
-
-
 def test_what_is_computed_again_is_drawn_again():
     campaign = told(2)
     before = dict(campaign.state.draws)

@@ -1,4 +1,5 @@
 import os
+from pathlib import Path
 
 import pytest
 import torch
@@ -7,6 +8,7 @@ from sbi_active import Bank
 from sbi_active.cli import bank as command
 from sbi_active.cli import main
 from sbi_active.tasks import get_task
+from tests.simulation.bank.filled import remove
 
 MODULE = """
 import torch
@@ -88,8 +90,8 @@ def test_inspect_bins_actions_that_differ(monkeypatch, capsys):
 
 def test_inspect_names_a_damaged_file(capsys):
     build("bank", 300, task="numerical")
-    (path,) = (Bank("bank").path / "segments").glob("*.h5")
-    path.write_bytes(path.read_bytes()[:1000])
+    remove(Path("bank"), 1)
+    path = Path("bank", "store.db")
     assert main(["bank", "inspect", "bank"]) == 1
     printed = capsys.readouterr().out
     assert "checksums: NOT ok" in printed
@@ -132,7 +134,7 @@ def test_another_simulator_is_refused(robot, capsys):
     )
     assert build("bank", 20, task="numerical", option="variant=sinh") == 2
     assert main(["bank", "inspect", "nowhere"]) == 2
-    assert "got no nowhere/bank.json" in capsys.readouterr().err
+    assert "got no nowhere/store.db" in capsys.readouterr().err
 
 
 def test_workers_simulate_the_same_rows(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """``tell``, ``correct``, ``withdraw`` and ``status`` without torch, as with it."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -96,11 +97,8 @@ SERIES = [
 
 
 def log(folder):
-    lines = (folder / "trials.jsonl").read_text().splitlines()
-    return [
-        {k: v for k, v in json.loads(line).items() if k not in ("time", "crc")}
-        for line in lines
-    ]
+    events = Campaign.load(folder).events
+    return [{k: v for k, v in event.items() if k != "time"} for event in events]
 
 
 @pytest.mark.parametrize("series", SERIES, ids=lambda s: s[0][:40])
@@ -129,16 +127,6 @@ def test_a_trial_that_somebody_else_told_is_seen(camp, capsys):
     assert json.loads(capsys.readouterr().out)["not_in_belief"] == [1]
 
 
-def test_lost_lines_of_the_log_are_noticed(camp, capsys):
-    path = camp / "trials.jsonl"
-    lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join(lines[:-1]))
-    for words in (["status", "camp"], ["tell", "camp", "0.4", "0.8", "--action", "1"]):
-        assert main(words) == 2
-        assert "trials.jsonl as it was written" in capsys.readouterr().err
-    assert path.read_bytes() == b"".join(lines[:-1])
-
-
 @pytest.mark.parametrize("content", ["", "{", "[]", "3", '{"of": 1}', "[" * 99_999])
 def test_a_summary_that_is_none_is_not_asked(camp, content, capsys):
     (camp / "status.json").write_text(content)
@@ -160,7 +148,9 @@ def test_a_summary_is_never_written_through_a_link(camp, tmp_path):
 
 
 def test_one_writer_at_a_time(camp, capsys):
-    with record.WriterLock(camp):
+    store = record.Store(camp, "campaign")
+    store.acquire()
+    with contextlib.closing(store):
         assert main(["tell", "camp", "0.4", "0.8"]) == 2
     assert "expected no other writer" in capsys.readouterr().err
     assert main(["tell", "camp", "0.4", "0.8"]) == 0

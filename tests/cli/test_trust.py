@@ -178,7 +178,7 @@ def test_a_file_that_the_command_line_did_not_write(mine, capsys, content):
 
 def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     """A file called as a library, in a folder that somebody has just entered."""
-    for name in ("torch", "h5py", "sled"):
+    for name in ("torch", "sqlite3", "sled"):
         text = f"from pathlib import Path\n{RUN.format(tmp_path / 'stood')}"
         (tmp_path / "camp" / f"{name}.py").write_text(text)
     for words in (

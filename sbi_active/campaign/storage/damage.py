@@ -1,4 +1,4 @@
-"""The error of a campaign's files that are not what was written."""
+"""The error of a campaign's file that is not what was written."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sbi_active.messages import Explained
+from sbi_active.simulation.bank.damage import CorruptSegmentError
 
 
 class DamagedCampaignError(Explained, OSError):
@@ -27,10 +28,10 @@ class DamagedCampaignError(Explained, OSError):
 
 
 class LogChangedError(Explained, ValueError):
-    """Another writer added to a campaign's log since it was loaded here.
+    """Another writer added to a campaign since it was loaded here.
 
     Attributes:
-        path: The log.
+        path: The file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,8 +44,21 @@ class LogChangedError(Explained, ValueError):
 
 
 @contextmanager
+def naming() -> Iterator[None]:
+    """Turn damage of the store into damage of the campaign.
+
+    Raises:
+        DamagedCampaignError: In place of the error of a bank.
+    """
+    try:
+        yield
+    except CorruptSegmentError as error:
+        raise DamagedCampaignError(error.path, error.reason) from error
+
+
+@contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what fails while a file's content is made sense of into damage of the file.
+    """Turn what fails while a file is read and made sense of into damage of the file.
 
     Args:
         path: The file.
@@ -53,7 +67,8 @@ def reading(path: Path) -> Iterator[None]:
         DamagedCampaignError: In place of any other error, which names no file.
     """
     try:
-        yield
+        with naming():
+            yield
     except OSError:
         raise
     except Exception as error:  # what a crafted file leads to has no end

@@ -1,17 +1,17 @@
 """The folder of a campaign: what it is, what happened, and what follows from it.
 
-``campaign.json`` says what the campaign is and never changes. ``trials.jsonl`` is what
-was asked, told and decided, and is only ever added to. From these two and the simulator
-all else can be computed again: ``state.bin`` and ``belief-*.bin`` save that work, and
-``simulations/`` saves the simulator's.
+All is in one file, ``store.db``. What the campaign is never changes; what was asked,
+told and decided is only ever added to. From these two and the simulator all else can be
+computed again: the state and the belief save that work, and the rows of simulations the
+simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,16 @@ from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
 from sbi_active.campaign.storage.damage import (
     DamagedCampaignError,
     LogChangedError,
+    naming,
     reading,
 )
-from sbi_active.campaign.storage.log import TrialLog, keep_aside, mend_log
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.telling import LOST, recorded
-from sbi_active.simulation.bank.files import write_file
-from sbi_active.simulation.bank.lock import WriterLock
+from sbi_active.simulation.bank.damage import CorruptSegmentError, parsed, require
+from sbi_active.simulation.bank.sqlite import EVENTS, OBJECTS
+from sbi_active.simulation.bank.store import Store
 
-#: Names that a saved belief has; a user's own file has another.
-OWN_BELIEF = re.compile(r"belief-[0-9a-f]{16}\.bin")
-LOG, STATE, BELIEF, SIMULATIONS = "trials.jsonl", "state.bin", "belief", "simulations"
+LOG, STATE, BELIEF = "log", "state", "belief"
 
 
 class CampaignDirectory:
@@ -43,35 +42,43 @@ class CampaignDirectory:
     write, which ends with :meth:`close` or the process.
 
     Args:
-        path: Folder with a manifest.
+        path: Folder with a campaign.
         repair: Give up what is damaged.
 
     Attributes:
         path: The folder.
+        store: Its file.
         manifest: What the campaign is.
         notes: What was given up, a sentence each.
 
     Raises:
         ValueError: If the folder holds no campaign, or one of another schema.
-        DamagedCampaignError: If a file does not hold what was written.
+        DamagedCampaignError: If the file does not hold what was written.
     """
 
     def __init__(self, path: Path, *, repair: bool = False) -> None:
         self.path, self.notes = path, []
-        self.manifest = read_manifest(path, repair=repair)
-        lost = mend_log(path / LOG) if repair else []
-        self.notes += [f"given up, tell it again: {text}" for text in lost]
-        self._log = TrialLog(path / LOG)
-        self._lock = WriterLock(path)
+        with naming():
+            self.store = Store(path, "campaign")
+            if repair and self.store.problems():
+                self.store.salvage()
+            self._entries, lost = self._lines()
+        if lost and not repair:
+            total = len(self._entries) + len(lost)
+            reason = (
+                f"{lost[0]}, {len(lost)} of {total} lines damaged, the others whole"
+            )
+            raise DamagedCampaignError(self.store.path, reason)
+        if lost:
+            self._mend()
+        self.manifest = read_manifest(self.store, repair=repair)
         self._saved = self._saved_state()
-        with reading(path / STATE):
-            self._require_whole(repair=repair, mended=bool(lost))
+        with reading(self.store.path):
+            self._require_whole(repair=repair)
         self._belief_written: tuple[int, str | None] = (-1, None)
         self._kept: Any = None
-        with reading(path / LOG):
-            for entry in self._log.entries:
-                if entry["event"] == "simulator changed":
-                    self.manifest["simulator"] = entry["simulator"]
+        for entry in self._changes:
+            self.manifest["simulator"] = entry["simulator"]
 
     def write(self, event: str, trial: Trial | None = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
@@ -81,20 +88,25 @@ class CampaignDirectory:
             trial: The trial as it is afterwards.
             **entries: JSON data.
         """
-        self.acquire()
         facts = {} if trial is None else {"trial": _facts(trial)}
-        self._log.append({"event": event, **facts, **entries})
+        time = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        line = {"line": len(self._entries) + 1, "time": time, "event": event}
+        self.acquire()
+        with naming(), self.store.writing((EVENTS, LOG)) as number:
+            if number != line["line"]:
+                raise LogChangedError(self.store.path)
+            self.store.put(EVENTS, LOG, number, {**line, **facts, **entries})
+        self._entries.append({**line, **facts, **entries})
 
     @property
     def events(self) -> Sequence[Mapping[str, Any]]:
         """The lines of the log so far."""
-        return (*self._log.entries,)
+        return (*self._entries,)
 
     @property
-    def simulations(self) -> Path:
-        """Folder of the simulations of the current simulator."""
-        changes = [e for e in self._log.entries if e["event"] == "simulator changed"]
-        return self.path / (SIMULATIONS + (f"-{len(changes)}" if changes else ""))
+    def num_changes(self) -> int:
+        """How often another simulator took the place of the one before."""
+        return len(self._changes)
 
     def save(self, state: CampaignState, belief: Any, known: Mapping[str, Any]) -> None:
         """Write what follows from the log so far.
@@ -106,24 +118,16 @@ class CampaignDirectory:
             belief: After ``state.processed``; None where that is the prior.
             known: What the reader has too, see :func:`.encode`.
         """
-        self.acquire()
-        if belief is None:
-            name = None
-        elif self._belief_written[0] == id(belief):
-            name = self._belief_written[1]
-        else:
+        content = None
+        name = self._belief_written[1] if belief is not None else None
+        if belief is not None and self._belief_written[0] != id(belief):
             try:
                 content = encode(belief, known=known)
-                # Another name for another belief: the state says which one is meant.
-                name = f"{BELIEF}-{hashlib.sha256(content).hexdigest()[:16]}.bin"
-                self._put(name, content)
+                name = hashlib.sha256(content).hexdigest()
             except NotStorableError:
                 name = ""  # it has to be computed again
-            self._kept = belief  # so that no other object gets its identity
-            self._belief_written = id(belief), name
         saved = {
-            "lines": len(self._log),
-            "digest": self._log.digest(len(self._log)),
+            "lines": len(self._entries),
             "trials": state.trials,
             "processed": state.processed,
             "draws": state.draws,
@@ -133,11 +137,17 @@ class CampaignDirectory:
             "num_simulated": state.meter.spent,
             "belief": name,
         }
-        self._put(STATE, encode(saved, known={}))
-        for old in self.path.glob(f"{BELIEF}-*.bin"):
-            if old.name != name and OWN_BELIEF.fullmatch(old.name):
-                with suppress(OSError):
-                    old.unlink()
+        encoded = encode(saved, known={})
+        self.acquire()
+        with naming(), self.store.writing():
+            if self.store.length(EVENTS, LOG) != len(self._entries):
+                raise LogChangedError(self.store.path)
+            self.store.put(OBJECTS, STATE, 0, encoded)
+            if content is not None:
+                self.store.put(OBJECTS, BELIEF, 0, content)
+        if belief is not None:
+            self._kept = belief  # so that no other object gets its identity
+            self._belief_written = id(belief), name
 
     def restore(self, state: CampaignState) -> str | None:
         """Bring a new state to where the log ends.
@@ -146,45 +156,47 @@ class CampaignDirectory:
             state: Changed in place; ``is_stale`` where beliefs must be computed again.
 
         Returns:
-            The file of the belief; None where it is the prior, or to be computed.
+            The name of the belief; None where it is the prior, or to be computed.
         """
         saved, self._saved = self._saved, None
         name, lines = None, 0
-        if saved is not None:
-            with reading(self.path / STATE):
+        with reading(self.store.path):
+            if saved is not None:
                 lines, name = saved["lines"], saved["belief"]
                 state.trials[:] = saved["trials"]
                 state.processed[:] = saved["processed"]
-                state.draws |= saved.get("draws", {})  # earlier files have none
+                state.draws |= saved["draws"]
                 state.versions[:] = saved["versions"]
-                state.batches[:] = saved.get("batches", [])
-                state.meter.spent = saved.get("num_simulated", 0)
+                state.batches[:] = saved["batches"]
+                state.meter.spent = saved["num_simulated"]
                 state.is_stale = saved["is_stale"]
-        with reading(self.path / LOG):
-            for entry in self._log.entries[lines:]:
+            for entry in self._entries[lines:]:
                 apply(state, entry)
         if name == "" and state.processed or saved is None and len(state.versions) > 1:
             state.is_stale = True
         return name or None
 
     def belief(self, name: str, known: Mapping[str, Any]) -> Any:
-        """Return a belief from its file.
+        """Return a belief by its name.
 
         Raises:
             ValueError: If it is damaged, another release wrote it, or it is not there
                 any more.
         """
-        try:
-            return decode(self._get(name), known=known)
-        except FileNotFoundError:
+        content = b""
+        with suppress(CorruptSegmentError):
+            content = self.store.get(OBJECTS, BELIEF) or content
+        if hashlib.sha256(content).hexdigest() != name:
             raise ValueError(
-                f"expected {name} in {self.path}; got none, as after another process "
-                "went on with the campaign; load it again"
-            ) from None
+                f"expected the belief {name:.8} in {self.store.path}; got another or a "
+                "damaged one, as after another process went on with the campaign; load "
+                "it again"
+            )
+        return decode(content, known=known)
 
     def close(self) -> None:
         """Let others write."""
-        self._lock.release()
+        self.store.close()
 
     def acquire(self) -> None:
         """Take the right to write.
@@ -193,66 +205,93 @@ class CampaignDirectory:
             LockedError: If another process has it.
             LogChangedError: If another process wrote since the campaign was loaded.
         """
-        if self._lock.held:
+        if self.store.held:
             return
-        self._lock.acquire()
-        if TrialLog(self.path / LOG).entries != self._log.entries:
-            self._lock.release()
-            raise LogChangedError(self.path / LOG)
+        with naming():
+            self.store.acquire()
+            last = len(self._entries)
+            try:
+                if self.store.length(EVENTS, LOG) != last or (
+                    last and self._line(last) != self._entries[-1]
+                ):
+                    raise LogChangedError(self.store.path)
+            except BaseException:
+                self.store.close()
+                raise
+
+    @property
+    def _changes(self) -> list[dict[str, Any]]:
+        return [e for e in self._entries if e["event"] == "simulator changed"]
+
+    def _line(self, number: int) -> dict[str, Any]:
+        content = self.store.get(EVENTS, LOG, number)
+        line = parsed(self.store.path, content or b"")
+        is_own = line.get("line") == number and type(line.get("event")) is str
+        require(self.store.path, is_own, f"a line {number} of the log that none writes")
+        return line
+
+    def _lines(self) -> tuple[list[dict[str, Any]], list[str]]:
+        """Return the lines of the log that are whole, and what is left of others."""
+        whole, lost = [], []
+        for number in range(1, self.store.length(EVENTS, LOG) + 1):
+            try:
+                whole.append(self._line(number))
+            except CorruptSegmentError as error:
+                left = self.store.remains(EVENTS, LOG, number)
+                lost.append(error.reason)
+                self.notes.append(f"given up, tell it again: {left or error.reason}")
+        return whole, lost
+
+    def _mend(self) -> None:
+        """Give up lines that are damaged, and keep a copy of the file."""
+        with naming():
+            self.store.salvage()
+            with self.store.writing():
+                for number, line in enumerate(self._entries, 1):
+                    line["line"] = number
+                    self.store.put(EVENTS, LOG, number, line)
+                num = len(self._entries)
+                self.store.delete(EVENTS, LOG, first=num + 1)
+                self.store.put(OBJECTS, f"{EVENTS} of {LOG}", 0, {"length": num})
+        self.store.close()
 
     def _saved_state(self) -> dict[str, Any] | None:
         try:
-            saved = decode(self._get(STATE), known={})
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
+            content = self.store.get(OBJECTS, STATE)
+            return None if content is None else decode(content, known={})
+        except (CorruptSegmentError, ValueError) as error:
             self.notes.append(f"{STATE} is computed again: {error}")
             return None
-        return saved
 
-    def _require_whole(self, *, repair: bool, mended: bool) -> None:
+    def _require_whole(self, *, repair: bool) -> None:
         """Raise where the log lacks lines that the saved state has counted.
 
         A repair takes their trials from the state, and has all else computed again.
         """
         saved = self._saved
-        if saved is None:
-            return
-        lines, known = saved["lines"], saved.get("digest")  # earlier files have none
-        if lines <= len(self._log) and known in (None, self._log.digest(lines)):
+        mended = any(note.startswith("given up") for note in self.notes)
+        if saved is None or saved["lines"] <= len(self._entries) and not mended:
             return
         told = [t for t in saved["trials"] if t.status != "pending"]
         if not repair:
             raise DamagedCampaignError(
-                self.path / LOG,
-                f"{len(self._log)} lines, and not the {lines} that {STATE} has counted "
-                f"with {len(told)} trials that were told",
+                self.store.path,
+                f"{len(self._entries)} lines of the log, and not the {saved['lines']} "
+                f"that the state has counted with {len(told)} trials that were told",
             )
-        if not mended:
-            keep_aside(self.path / LOG)
         state = CampaignState("asbi", 0, CampaignOptions())
-        for entry in self._log.entries:
+        for entry in self._entries:
             if "trial" in entry:
                 apply(state, entry)
-        lacking = [t for t in told if not _has(state, t)]
         self._saved = None
-        (self.path / STATE).rename(self.path / f"{STATE}.damaged")
-        for trial in lacking:
+        with self.store.writing():
+            self.store.delete(OBJECTS, STATE)
+        for trial in [t for t in told if not _has(state, t)]:
             self.write("restored", trial)
             self.notes.append(
                 f"restored from {STATE}: trial {trial.index}, x = {trial.x}"
             )
         self.close()
-
-    def _put(self, name: str, content: bytes) -> None:
-        digest = hashlib.sha256(content).hexdigest()
-        write_file(self.path / name, digest.encode() + b"\n" + content)
-
-    def _get(self, name: str) -> bytes:
-        digest, _, content = (self.path / name).read_bytes().partition(b"\n")
-        if hashlib.sha256(content).hexdigest().encode() != digest:
-            raise ValueError(f"expected {name} as written; got another checksum")
-        return content
 
 
 def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:

@@ -28,7 +28,7 @@ from sbi_active.campaign.storage.described import (
 )
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.drawn import drawn_from, stood_for
-from sbi_active.campaign.storage.manifest import MANIFEST, require_same_simulator
+from sbi_active.campaign.storage.manifest import require_same_simulator
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
@@ -138,7 +138,7 @@ def load(
     reads = simulator is None
     space: ActionSpace = _given("actions", actions, disk, actions_from, reads=reads)
     first_prior: Distribution = _given("prior", prior, disk, prior_from, reads=reads)
-    with reading(disk.path / MANIFEST):
+    with reading(disk.store.path):
         state = CampaignState(
             manifest["method"],
             manifest["seed"],
@@ -207,9 +207,9 @@ def _given(
     """
     if given is not None:
         return given
-    with reading(disk.path / MANIFEST):
+    with reading(disk.store.path):
         described, text = disk.manifest[what], disk.manifest[f"{what}_text"]
-        drawn = disk.manifest.get("drawn", {}).get(what)  # earlier files have none
+        drawn = disk.manifest["drawn"].get(what)
         if reads and drawn is not None:
             return drawn_from(drawn)
     if described is None:
@@ -217,5 +217,5 @@ def _given(
             f"expected {what}=, which only its author can make again; got None; pass "
             f"what the campaign was made with: {text:.200}"
         )
-    with reading(disk.path / MANIFEST):
+    with reading(disk.store.path):
         return made(described)

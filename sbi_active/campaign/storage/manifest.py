@@ -1,8 +1,7 @@
-"""What a campaign is, in a file that a person can read and nothing changes."""
+"""What a campaign is: written once, with a copy, and in words for people."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -22,11 +21,19 @@ from sbi_active.campaign.storage.described import (
     describe_prior,
 )
 from sbi_active.campaign.storage.drawn import draws_of
+from sbi_active.simulation.bank.damage import CorruptSegmentError
 from sbi_active.simulation.bank.files import write_file
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
+from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
+from sbi_active.simulation.bank.store import Store
 
-MANIFEST, COPY = "campaign.json", "campaign.json.copy"
-FORMAT, SCHEMA = "sbi-active campaign", 1
+MANIFEST, FOR_PEOPLE = "campaign", "campaign.toml"
+FORMAT, SCHEMA = "sbi-active campaign", 2  # schema 1 was a folder of files
+PLAIN = (
+    *("created", "method", "seed", "parameter_names", "channel_names", "x_shape"),
+    *("effects", "has_cost", "has_constraint"),
+)
+DESCRIBED = ("prior", "actions", "options")
 PACKAGES = ("sbi-active", "sbi", "torch", "numpy")
 
 
@@ -86,73 +93,68 @@ def new_manifest(
 
 
 def has_manifest(folder: Path) -> bool:
-    """Return whether a folder holds a campaign."""
-    return (folder / MANIFEST).exists() or (folder / COPY).exists()
+    """Return whether a folder holds a campaign, damaged or of before or not."""
+    if not (folder / NAME).exists():
+        return (folder / "campaign.json").exists()
+    try:
+        return Store(folder, "campaign").size(OBJECTS, MANIFEST) is not None
+    except OSError:
+        return True
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write a manifest and its copy.
+    """Write a manifest, its copy, and ``campaign.toml`` for people.
 
     Raises:
         ValueError: If the folder holds anything.
         OSError: If it cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        found = sorted(path.name for path in folder.iterdir())
-    except OSError as error:
-        raise type(error)(
-            error.errno,
-            f"expected a folder that can be made for a campaign; got "
-            f"{error.strerror!r}; choose a place that can be written",
-            str(folder),
-        ) from error
-    if has_manifest(folder):
+    store = Store(folder, "campaign", make=True)
+    if {*store.kinds()} - {"writer"}:
         raise ValueError(
             f"expected an empty folder for a new campaign; got {folder} with a "
             "campaign; go on with it by Campaign.load(directory, simulator=...), or "
             "choose another folder"
         )
-    other = [name for name in found if not name.startswith(".")]
-    if other:
-        raise ValueError(
-            f"expected an empty folder for a new campaign; got {folder} with "
-            f"{other[0]!r}; choose another folder"
-        )
-    text = json.dumps({**manifest, "sha256": _digest(manifest)}, indent=2) + "\n"
-    for name in (COPY, MANIFEST):
-        write_file(folder / name, text.encode())
+    content = json.dumps(manifest).encode()
+    with store.writing():
+        for table in (OBJECTS, EVENTS):  # a copy, on other pages of the file
+            store.put(table, MANIFEST, 0, content)
+    write_file(folder / FOR_PEOPLE, _in_words(manifest).encode())
+    store.close()
 
 
-def read_manifest(folder: Path, *, repair: bool = False) -> dict[str, Any]:
+def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
     """Return a manifest.
 
     Args:
-        folder: Of the campaign.
+        store: Of the campaign.
         repair: Take the copy where the manifest is damaged, and write it again.
 
     Raises:
         ValueError: If there is none, or one of another schema.
         DamagedCampaignError: If it does not hold what was written.
     """
-    path = folder / MANIFEST
-    if not has_manifest(folder):
+    found = {table: _read(store, table) for table in (OBJECTS, EVENTS)}
+    manifest = found[OBJECTS]
+    if repair and not manifest and (manifest := found[EVENTS]):
+        with store.writing():
+            store.put(OBJECTS, MANIFEST, 0, json.dumps(manifest).encode())
+        store.close()
+    if manifest is None and found[EVENTS] is None:
         raise ValueError(
-            f"expected a folder with a campaign; got {folder} without {MANIFEST}; make "
-            "one by Campaign(..., directory=...)"
+            f"expected a folder with a campaign; got {store.folder} without one; make "
+            "it by Campaign(..., directory=...)"
         )
-    manifest = _read(path)
-    if manifest is None and repair and (manifest := _read(folder / COPY)):
-        write_file(path, (folder / COPY).read_bytes())
-    if manifest is None:
+    if not manifest:
         raise DamagedCampaignError(
-            path, "a manifest with another checksum, the log of the trials untouched"
+            store.path, "a manifest with another checksum, the log of the trials apart"
         )
     if manifest.get("format") != FORMAT or manifest.get("schema") != SCHEMA:
         raise ValueError(
             f"expected a campaign of schema {SCHEMA}; got "
-            f"{manifest.get('format')!r} of schema {manifest.get('schema')} in {path}; "
-            "use the release of sbi-active that wrote it: "
+            f"{manifest.get('format')!r} of schema {manifest.get('schema')} in "
+            f"{store.path}; use the release of sbi-active that wrote it: "
             f"{manifest.get('packages', {}).get('sbi-active', 'unknown')}"
         )
     return manifest
@@ -175,18 +177,23 @@ def require_same_simulator(
         )
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(store: Store, table: str) -> dict[str, Any] | None:
+    """Return what is there; None for nothing, and nothing in it for damage."""
     try:
-        manifest = json.loads(path.read_bytes())
-        digest = manifest.pop("sha256")
-    except (OSError, ValueError, RecursionError, KeyError, AttributeError, TypeError):
-        return None
-    return manifest if digest == _digest(manifest) else None
+        content = store.get(table, MANIFEST)
+        found = None if content is None else json.loads(content)
+    except (CorruptSegmentError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict | None) else {}
 
 
-def _digest(manifest: Mapping[str, Any]) -> str:
-    text = json.dumps(manifest, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+def _in_words(manifest: Mapping[str, Any]) -> str:
+    """Return a manifest as TOML; a text of JSON is one of TOML."""
+    texts = {name: manifest[f"{name}_text"] for name in DESCRIBED}
+    plain = {name: manifest[name] for name in PLAIN if manifest[name] is not None}
+    lines = [f"{k} = {json.dumps(v)}" for k, v in {**plain, **texts}.items()]
+    heading = f"# What this campaign is, for people. All is kept in {NAME}; this is not"
+    return "\n".join([f"{heading} read.", *lines, ""])
 
 
 def _packages() -> dict[str, str]:

@@ -9,19 +9,24 @@ from typing import Any
 
 from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.header import has_header
+from sbi_active.simulation.bank.sqlite import NAME
+from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.store import RowStore
 
+OWN = "drawn"  # rows of the simulator itself
+
 
 def num_rows(folder: str | None) -> int:
-    """Return how many rows of the simulator itself a folder of banks has.
+    """Return how many rows of the simulator itself a bank of campaigns has.
 
     Args:
         folder: None for none.
     """
-    drawn = None if folder is None else Path(folder, "drawn")
-    return 0 if drawn is None or not has_header(drawn) else len(Bank(drawn))
+    if folder is None or not Path(folder, NAME).exists():
+        return 0
+    store = Store(Path(folder))
+    return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.kinds() else 0
 
 
 class CampaignBanks:
@@ -32,11 +37,12 @@ class CampaignBanks:
     used, are not stored.
 
     Args:
-        folder: Of the banks.
+        place: The file that they are in, or its folder, made when it is needed.
+        suffix: Of their names, after another simulator took the place of the first.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, place: Store | Path, suffix: str = "") -> None:
+        self._place, self._suffix = place, suffix
         self._own: Callable[..., Any] | None = None
         self._model = 0
         self._banks: dict[str, Bank] = {}
@@ -55,11 +61,14 @@ class CampaignBanks:
         form = self._form(simulator)
         return None if form is None else self.bank(simulator, form)
 
-    def bank(self, simulator: Callable[..., Any], form: str = "drawn") -> Bank:
+    def bank(self, simulator: Callable[..., Any], form: str) -> Bank:
         """Return the bank of a form of the current simulator, open for writing."""
         name = form if self._model == 0 else f"{form}-model-{self._model}"
+        name += self._suffix
         if name not in self._banks:
-            self._banks[name] = Bank(self.folder / name, simulator=simulator)
+            if isinstance(self._place, Path):
+                self._place = Store(self._place, make=True)
+            self._banks[name] = Bank(self._place, simulator=simulator, name=name)
         return self._banks[name]
 
     def close(self) -> None:
@@ -71,7 +80,7 @@ class CampaignBanks:
     def _form(self, simulator: Callable[..., Any]) -> str | None:
         own = self._own
         if own is None or simulator is own:
-            return None if own is None else "drawn"
+            return None if own is None else OWN
         if isinstance(simulator, IndexedSimulator):
             return "by-index" if simulator.simulator is own else None
         if not isinstance(own, SimulatorModel):

@@ -46,7 +46,7 @@ class Storage:
 
     Args:
         disk: The folder; None keeps the campaign in memory alone.
-        bank: Folder of the simulations; None is one in the campaign's.
+        bank: Folder of the simulations; None keeps them in the campaign's file.
         prior: That the campaign began with.
     """
 
@@ -57,9 +57,13 @@ class Storage:
         prior: Distribution | None = None,
     ) -> None:
         self.disk, self.prior = disk, prior
-        folder = None if disk is None else disk.simulations
-        folder = folder if bank is None else Path(bank)
-        self._banks = None if folder is None else CampaignBanks(folder)
+        self._banks: CampaignBanks | None = None
+        if bank is not None:
+            self._banks = CampaignBanks(Path(bank))
+        elif disk is not None:
+            changes = disk.num_changes
+            suffix = f"-changed-{changes}" if changes else ""
+            self._banks = CampaignBanks(disk.store, suffix)
 
     @property
     def path(self) -> Path | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,19 +12,16 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.simulation.bank.damage import CorruptSegmentError
-from sbi_active.simulation.bank.fingerprint import fingerprint, simulator_name
-from sbi_active.simulation.bank.header import (
-    has_header,
-    make_folder,
-    new_header,
-    read_header,
-    require_same_simulator,
-    write_header,
+from sbi_active.simulation.bank.fingerprint import (
+    differences,
+    fingerprint,
+    simulator_name,
 )
 from sbi_active.simulation.bank.labeled import LabeledStore
-from sbi_active.simulation.bank.lock import WriterLock
-from sbi_active.simulation.bank.rows import StoredIndex, positions
-from sbi_active.simulation.bank.shelf import COLUMN_NAMES, Shelf
+from sbi_active.simulation.bank.rows import Rows, positions
+from sbi_active.simulation.bank.segments import COLUMNS, SEGMENT_BYTES, write_segment
+from sbi_active.simulation.bank.sqlite import OBJECTS
+from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.store import StoredRows, run_digest
 
@@ -44,12 +40,14 @@ class Bank:
     be added, by one process at a time, from the first row added until :meth:`close`.
 
     Args:
-        path: Folder; made where there is none and ``simulator`` is given.
+        path: Folder, in which the bank is the file ``store.db``; made where there is
+            none and ``simulator`` is given. Or the store of a campaign.
         simulator: Whose rows these are. Its name, settings and source are compared
             with those in the bank.
         version: Of the simulator, yours; given, it stands for the source code.
         parameter_names: One a parameter; None takes those of the simulator.
         created: Date to note in a new bank.
+        name: Of the bank in its file, which may hold several, as a campaign's does.
 
     Attributes:
         path: The folder.
@@ -57,7 +55,7 @@ class Bank:
     Raises:
         ValueError: If the folder holds no bank, one of another format, or one of
             another simulator.
-        CorruptSegmentError: Here and wherever rows are read, if a file does not hold
+        CorruptSegmentError: Here and wherever rows are read, if the file does not hold
             what was written, or is not there.
 
     Example:
@@ -75,36 +73,43 @@ class Bank:
 
     def __init__(
         self,
-        path: str | Path,
+        path: str | Path | Store,
         *,
         simulator: Callable[..., Any] | None = None,
         version: str = "",
         parameter_names: Sequence[str] | None = None,
         created: str | None = None,
+        name: str = "rows",
     ) -> None:
-        self.path = Path(path)
-        self._writable = simulator is not None
-        self._stored: StoredIndex | None = None  # of the run being written
-        self._lock = WriterLock(self.path)
+        makes = simulator is not None
+        self._store = path if isinstance(path, Store) else Store(Path(path), make=makes)
+        self.path, self._writable = self._store.folder, makes
+        self._rows = Rows(self._store, name)
+        self._stored: tuple[str, np.ndarray] = ("", np.zeros(0, bool))  # of a run
         if simulator is None:
-            self._shelf = Shelf(self.path / "segments", read_header(self.path))
+            _ = self.header
             return
         if parameter_names is None:
             parameter_names = getattr(simulator, "parameter_names", None)
-        names = None if parameter_names is None else [*parameter_names]
-        header = new_header(
-            fingerprint(simulator, version=version), names=names, created=created
-        )
-        if not has_header(self.path):
-            make_folder(self.path, "segments")
-            with self._lock:
-                if not has_header(self.path):  # nobody was faster
-                    write_header(self.path, header)
-        self._shelf = Shelf(self.path / "segments", read_header(self.path))
-        require_same_simulator(self.path, self.header, header)
+        mine = {
+            "created": created,
+            **fingerprint(simulator, version=version),
+            "parameter_names": None if parameter_names is None else [*parameter_names],
+            "shapes": None,
+            "lost": [],  # segments that were given up
+        }
+        key = self._rows.key
+        if self._store.text(key) is None:
+            is_held = self._store.held
+            with self._store.writing():
+                if self._store.text(key) is None:  # nobody was faster
+                    self._store.put(OBJECTS, key, 0, mine)
+            if not is_held:
+                self._store.close()
+        self._require_same_simulator(mine)
 
     def __len__(self) -> int:
-        return sum(segment.num_rows for segment in self._shelf.segments())
+        return sum(segment.num_rows for segment in self._rows.segments())
 
     def __enter__(self) -> Bank:
         return self
@@ -120,8 +125,8 @@ class Bank:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Format, simulator, shapes and names, as last read."""
-        return dict(self._shelf.header)
+        """Simulator, shapes and names, as they are on the disk."""
+        return self._rows.header
 
     @property
     def simulator_name(self) -> str:
@@ -131,20 +136,19 @@ class Bank:
     @property
     def counts(self) -> dict[str, int]:
         """Number of rows by outcome."""
-        segments = self._shelf.segments()
-        counts = {o: sum(s.meta["counts"][o] for s in segments) for o in Outcome}
-        return {outcome.name.lower(): count for outcome, count in counts.items()}
+        counts = zip(*(s.counts for s in self._rows.segments()), strict=True)
+        sums = [*map(sum, counts)] or [0] * len(Outcome)
+        return {o.name.lower(): n for o, n in zip(Outcome, sums, strict=True)}
 
     @property
     def labels(self) -> list[str]:
         """Names of the proposals, in order of appearance; "" where not known."""
-        runs = (run for segment in self._shelf.segments() for run in segment.runs)
-        return [*dict.fromkeys(run["label"] for run in runs)]
+        return [*dict.fromkeys(segment.label for segment in self._rows.segments())]
 
     @property
     def num_bytes(self) -> int:
         """Size on the disk."""
-        return sum(segment.num_bytes for segment in self._shelf.segments())
+        return self._store.num_bytes
 
     def append(
         self,
@@ -215,13 +219,10 @@ class Bank:
             None where there is nothing.
         """
         parts = []
-        for segment in self._shelf.segments():
-            codes = [c for c, r in enumerate(segment.runs) if r["digest"] == run]
-            if not codes:
-                continue
-            columns = segment.read(["run", "index", "x", "status"])
-            mine = np.isin(columns["run"], codes)
-            parts.append([columns[name][mine] for name in ("index", "x", "status")])
+        for segment in self._rows.segments():
+            if segment.run == run:
+                columns = self._rows.columns(segment, ("index", "x", "status"))
+                parts.append([columns[n] for n in ("index", "x", "status")])
         if not parts:
             return None
         index, x, status = (
@@ -253,14 +254,12 @@ class Bank:
                 over all rows. None reads everything into memory.
         """
         names = ["theta", "action", "x", "status"]
-        columns = self._shelf.gather(names, positions(rows, len(self)))
-        theta, action, x, status = (torch.from_numpy(columns[n]) for n in names)
-        return Simulations(theta, action, x, status)
+        return Simulations(*self._rows.gather(names, positions(rows, len(self))))
 
     def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
         """Yield all rows in order, at most ``size`` at a time.
 
-        Memory holds one segment, 64 MiB, and what is yielded. Rows added meanwhile are
+        Memory holds one segment, 4 MiB, and what is yielded. Rows added meanwhile are
         not seen.
         """
         if size < 1:
@@ -278,98 +277,114 @@ class Bank:
                 ``row_seeds(seed, 1, first=index)``), ``log_proposal``, ``log_action``
                 and ``label`` (an index into :attr:`labels`).
         """
-        if unknown := {*names} - COLUMN_NAMES:
+        readable = {*COLUMNS} | {"seed", "label"}
+        if unknown := {*names} - readable:
             raise ValueError(
-                f"expected columns among {sorted(COLUMN_NAMES)}; got "
+                f"expected columns among {sorted(readable)}; got "
                 f"{sorted(unknown)}; name those"
             )
-        columns = self._shelf.gather([*names], None)
-        return {name: torch.from_numpy(columns[name]) for name in names}
+        return dict(zip(names, self._rows.gather([*names], None), strict=True))
 
     def verify(self) -> list[str]:
-        """Return what is wrong with the files, one line each; none where all is well.
+        """Return what is wrong with the file, one line each; none where all is well.
 
         Every byte of every column is compared with its checksum.
         """
-        return self._shelf.verify()
+        wrong = [*self._store.problems(), *self._rows.damaged().values()]
+        return [f"{self._store.path}: {reason}" for reason in wrong]
 
     def compact(self) -> None:
-        """Merge small segments, as is done by itself now and then; safe at any moment.
+        """Give room that is not used back to the disk; safe at any moment.
 
         Raises:
             LockedError: If somebody else is writing.
         """
         self._require_lock()
-        self._shelf.compact()
+        self._store.vacuum()
 
     def repair(self) -> list[str]:
-        """Give up files that are damaged or lost, so that the others count again.
+        """Give up segments that are damaged or lost, so that the others count again.
 
-        Damaged ones are renamed to end in ".damaged". The rows after those that are
-        lost move up; ``simulate(..., store=bank)`` simulates lost ones again. Returns
-        what was wrong, as :meth:`verify` does; raises as :meth:`compact` does.
+        The file before is kept, its name ending in ".damaged". The rows after those
+        that are lost move up; ``simulate(..., store=bank)`` simulates lost ones again.
+        Returns what was wrong, as :meth:`verify` does; raises as :meth:`compact` does.
         """
-        self._require_lock(clean=False)
+        self._require_lock()
         problems = self.verify()
-        self._shelf.set_aside()
-        self._note(num_segments=self._shelf.last_number())
-        self._note(lost=self._shelf.lost())
-        self._stored = None
+        self._store.salvage()
+        lost = sorted({*self.header["lost"], *self._rows.damaged()})
+        self._rows.note(lost=lost)
         return problems
 
     def close(self) -> None:
         """Let others write. Reading goes on to work."""
-        if self._lock.held:
-            # From now on it is noticed if the last of them are not there.
-            number = max(self._shelf.last_number(), self.header["num_segments"])
-            with suppress(OSError):  # a full disk must not keep the lock
-                self._note(num_segments=number)
-            self._lock.release()
+        self._store.close()
 
-    def _note(self, **entries: Any) -> None:
-        """Change entries of the header, here and on the disk."""
-        header = {**self._shelf.header, **entries}
-        if header != self._shelf.header:
-            write_header(self.path, header)
-            self._shelf.header = header
+    def store(self, run: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
+        """Write those rows of a run that are not there; see :meth:`save`."""
+        self._require_lock()
+        index, name = columns["index"], run["run"]
+        self._require_shapes(columns)
+        if self._stored[0] != name:
+            before = self.load(name)
+            self._stored = name, _mask(np.zeros(0, bool), before and before[0].numpy())
+        mask = np.pad(self._stored[1], (0, _room(self._stored[1], index)))
+        fresh = np.zeros(len(index), bool)
+        fresh[np.unique(index, return_index=True)[1]] = True
+        rows = np.flatnonzero(fresh & ~mask[index])
+        row_bytes = sum(column[:1].nbytes for column in columns.values())
+        size = max(1, SEGMENT_BYTES // max(row_bytes, 1))
+        for start in range(0, len(rows), size):
+            some = rows[start : start + size]
+            part = {key: column[some] for key, column in columns.items()}
+            write_segment(self._store, self._rows.name, run, part)
+        self._stored = name, _mask(mask, index)
 
-    def _require_lock(self, *, clean: bool = True) -> None:
+    def _require_same_simulator(self, mine: dict[str, Any]) -> None:
+        header = self.header
+        lines = differences(header, mine)
+        names = header["parameter_names"], mine["parameter_names"]
+        if None not in names and names[0] != names[1]:
+            lines.append(f"parameter names {names[0]} there, {names[1]} here")
+        if lines:
+            raise ValueError(
+                f"expected the simulator of the bank {self.path}; got another: "
+                f"{'; '.join(lines)}; make a bank for each simulator, or, where x is "
+                "the same, give the same version= each time and keep what changes from "
+                "call to call in attributes with a leading underscore"
+            )
+
+    def _require_lock(self) -> None:
         if not self._writable:
             raise ValueError(
                 f"expected a bank opened with its simulator, to write to; got "
                 f"Bank({str(self.path)!r}), which reads; open it by "
                 f"Bank({str(self.path)!r}, simulator=...)"
             )
-        if not self._lock.held:
-            self._lock.acquire()
-            # Others may have written meanwhile.
-            self._stored = None
-            self._shelf.header = read_header(self.path)
-            if clean:
-                self._shelf.clean()
-
-    def store(self, run: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
-        """Write those rows of a run that are not there; see :meth:`save`."""
-        self._require_lock()
-        self._require_shapes(columns)
-        if self._stored is None or self._stored.run != run["digest"]:
-            self._stored = StoredIndex(run["digest"])
-            before = self.load(run["digest"])
-            if before is not None:
-                self._stored.add(before[0].numpy())
-        fresh = self._stored.unseen(columns["index"])
-        if fresh.any():
-            self._shelf.add(run, {name: c[fresh] for name, c in columns.items()})
-            self._stored.add(columns["index"])
+        if not self._store.held:
+            self._store.acquire()
+            self._stored = ("", np.zeros(0, bool))  # others may have written meanwhile
 
     def _require_shapes(self, columns: dict[str, np.ndarray]) -> None:
+        header = self.header
         shapes = {k: [*columns[k].shape[1:]] for k in ("theta", "action", "x")}
-        if self.header["shapes"] == shapes:
+        if header["shapes"] == shapes:
             return
-        if self.header["shapes"] is None or not len(self):
-            self._note(shapes=shapes)
-            return
-        raise ValueError(
-            f"expected rows of shapes {self.header['shapes']}, as in the bank "
-            f"{self.path}; got {shapes}; make a bank of its own for them"
-        )
+        if header["shapes"] is not None and len(self):
+            raise ValueError(
+                f"expected rows of shapes {header['shapes']}, as in the bank "
+                f"{self.path}; got {shapes}; make a bank of its own for them"
+            )
+        self._rows.note(shapes=shapes)
+
+
+def _room(mask: np.ndarray, index: np.ndarray) -> int:
+    return max(0, int(index.max(initial=-1)) + 1 - len(mask))
+
+
+def _mask(mask: np.ndarray, index: np.ndarray | None) -> np.ndarray:
+    """Return a mask over the rows of a run that are stored, with more of them."""
+    if index is not None:
+        mask = np.pad(mask, (0, _room(mask, index)))
+        mask[index] = True
+    return mask

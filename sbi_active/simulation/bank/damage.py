@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 import stat
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,36 @@ class CorruptSegmentError(Explained, OSError):
             f"expected {path} as it was written; got {reason}; restore it from a copy, "
             "or open the bank with its simulator and call repair(), which gives up "
             "rows that are lost: they can be simulated again"
+        )
+
+
+class LockedError(Explained, OSError):
+    """Somebody else is writing.
+
+    Attributes:
+        pid: Process that holds the lock, None where it did not say.
+    """
+
+    def __init__(self, folder: Path, pid: int | None, host: str) -> None:
+        self.pid = pid
+        here = " (this one)" if pid == os.getpid() and host == platform.node() else ""
+        super().__init__(
+            f"expected no other writer of {folder}; got process {pid}{here} on "
+            f"{host}; wait for it, call close() there, or write to a folder of your "
+            "own: any number of readers may go on"
+        )
+
+
+def require_no_link(path: Path) -> None:
+    """Raise where a file that is written to is a link: it would lead elsewhere.
+
+    Raises:
+        OSError: If the path is a symbolic link.
+    """
+    if path.is_symlink():
+        raise OSError(
+            f"expected {path} as a file; got a link to {path.readlink()}; remove it, "
+            "after a look at where the folder comes from"
         )
 
 

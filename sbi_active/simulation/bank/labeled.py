@@ -76,6 +76,6 @@ class LabeledStore:
             "log_action": log_action.expand(len(index)),
         }
         self._bank.store(
-            {"digest": run, "seed": int(seed), "label": self._label},
+            {"run": run, "seed": int(seed), "label": self._label},
             {name: c.detach().cpu().numpy() for name, c in stored.items()},
         )

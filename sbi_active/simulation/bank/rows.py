@@ -1,10 +1,138 @@
-"""Rows of a bank: those that are meant, and those of a run that are stored."""
+"""The rows of a bank in order: found, read by position, and looked at for damage."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.simulation.bank.damage import CorruptSegmentError, require
+from sbi_active.simulation.bank.segments import (
+    COLUMNS,
+    Segment,
+    find_segment,
+    read_columns,
+    require_header,
+)
+from sbi_active.simulation.bank.sqlite import OBJECTS, SEGMENTS
+from sbi_active.simulation.bank.store import Store
+
+
+class Rows:
+    """The segments of one bank in a store.
+
+    Args:
+        store: The file.
+        name: Of the bank.
+
+    Attributes:
+        store: As given.
+        name: As given.
+        key: Of the bank's header.
+    """
+
+    def __init__(self, store: Store, name: str) -> None:
+        self.store, self.name, self.key = store, name, f"bank {name}"
+        self._found: list[Segment] = []
+        self._generation = -1
+        self._last: tuple[int, dict[str, np.ndarray]] = (0, {})
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """Simulator, shapes and names, as they are on the disk."""
+        found = self.store.text(self.key)
+        if found is None:
+            kinds = [kind for kind in self.store.kinds() if kind.startswith("bank ")]
+            raise ValueError(
+                f"expected the {self.key} in {self.store.path}; got "
+                f"{', '.join(kinds) or 'none'}; give name= of one there, or simulator= "
+                "to make one"
+            )
+        require_header(self.store.path, found)
+        return found
+
+    def note(self, **entries: Any) -> None:
+        """Change entries of the header."""
+        with self.store.writing():
+            self.store.put(OBJECTS, self.key, 0, {**self.header, **entries})
+        self._generation = -1
+
+    def segments(self) -> list[Segment]:
+        """Return the segments as they are on the disk now."""
+        with self.store.reading():
+            total = self.store.length(SEGMENTS, self.name)
+            if self._generation != self.store.generation or total < len(self._found):
+                self._found, self._last = [], (0, {})
+                self._generation = self.store.generation
+                self._lost = {*self.header["lost"]}
+            first = self._found[-1].number if self._found else 0
+            for number in range(first + 1, total + 1):
+                if number not in self._lost:
+                    found = find_segment(self.store, self.name, number)
+                    self._found.append(found)
+            return self._found[:]
+
+    def damaged(self) -> dict[int, str]:
+        """Return the segments that are not whole, and why."""
+        wrong: dict[int, str] = {}
+        try:
+            numbers = range(1, self.store.length(SEGMENTS, self.name) + 1)
+            lost = self.header["lost"]
+        except CorruptSegmentError as error:
+            return {0: error.reason}
+        for number in numbers:
+            try:
+                if number not in lost:
+                    found = find_segment(self.store, self.name, number)
+                    self.columns(found, (*COLUMNS,))
+            except CorruptSegmentError as error:
+                wrong[number] = error.reason
+        return wrong
+
+    def columns(self, segment: Segment, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Return columns of a segment, which cannot be written to."""
+        if self._last[0] != segment.number:
+            self._last = segment.number, {}
+        kept = self._last[1]
+        if lacking := [name for name in names if name not in kept]:
+            shapes = self.header["shapes"]
+            path = self.store.path
+            require(path, shapes is not None, "segments and no shapes of their rows")
+            kept |= read_columns(self.store, self.name, segment, lacking, shapes)
+        return kept
+
+    def gather(self, names: list[str], rows: np.ndarray | None) -> list[Tensor]:
+        """Return columns at positions; None takes all rows."""
+        segments = self.segments()
+        ends = np.cumsum([0, *(segment.num_rows for segment in segments)])
+        rows = np.arange(ends[-1]) if rows is None else rows
+        if not segments:
+            raise ValueError(
+                f"expected rows in {self.store.folder}; got none; simulate into it"
+            )
+        order = np.argsort(rows, kind="stable")
+        bounds = np.searchsorted(rows[order], ends)
+        labels = [*dict.fromkeys(segment.label for segment in segments)]
+        result: dict[str, np.ndarray] = {}
+        for k, segment in enumerate(segments):
+            here = order[bounds[k] : bounds[k + 1]]
+            if not len(here) and (result or k < len(segments) - 1):
+                continue
+            own = {"seed": segment.seed, "label": labels.index(segment.label)}
+            stored = self.columns(segment, [n for n in names if n not in own])
+            for name in names:
+                if name in own:
+                    value: Any = _whole_number(own[name])
+                else:
+                    value = stored[name][rows[here] - ends[k]]
+                if name not in result:
+                    shape, dtype = np.shape(value)[1:], np.asarray(value).dtype
+                    result[name] = np.empty((len(rows), *shape), dtype)
+                result[name][here] = value
+        return [torch.from_numpy(result[name]) for name in names]
 
 
 def positions(rows: Any, total: int) -> np.ndarray | None:
@@ -33,29 +161,11 @@ def positions(rows: Any, total: int) -> np.ndarray | None:
     return found
 
 
-class StoredIndex:
-    """A mask over the rows of one run, which grows as they are added.
-
-    Args:
-        run: Name of the run.
-    """
-
-    def __init__(self, run: str) -> None:
-        self.run = run
-        self._mask = np.zeros(0, bool)
-
-    def unseen(self, index: np.ndarray) -> np.ndarray:
-        """Return which entries are neither stored nor repeated, shape (k,), bool."""
-        fresh = np.zeros(len(index), bool)
-        fresh[np.unique(index, return_index=True)[1]] = True
-        known = index < len(self._mask)
-        fresh[known] &= ~self._mask[index[known]]
-        return fresh
-
-    def add(self, index: np.ndarray) -> None:
-        """Note rows as stored."""
-        if len(index) and index.max() >= len(self._mask):
-            # Doubled, so that all growth together copies each entry a few times.
-            room = max(2 * len(self._mask), int(index.max()) + 1)
-            self._mask = np.pad(self._mask, (0, room - len(self._mask)))
-        self._mask[index] = True
+def _whole_number(value: int) -> np.int64:
+    try:
+        return np.int64(value)
+    except OverflowError as error:
+        raise ValueError(
+            "expected seeds below 2**63 for a column of them; got one of "
+            f"{value.bit_length()} bits; read the other columns"
+        ) from error

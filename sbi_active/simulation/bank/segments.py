@@ -1,197 +1,183 @@
-"""Immutable files of rows: written whole or not at all, and checked at each read.
+"""Segments of rows in a store: columns as bytes, and what is known of them.
 
-HDF5 keeps no journal, so a file that is open for writing when its process dies may be
-lost altogether. A segment is therefore built in memory, written under another name,
-synchronized with the disk, and only then renamed; nothing is ever written to it again.
+A segment belongs to one run, and is never changed. What a file holds is compared with
+what a bank writes: anybody can make records whose checksums are right.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
-from sbi_active.simulation.bank.damage import (
-    CorruptSegmentError,
-    is_count,
-    parsed,
-    regular_size,
-    require,
-)
-from sbi_active.simulation.bank.files import TEMPORARY, write_file
+from sbi_active.simulation.bank.damage import is_count, parsed, require
+from sbi_active.simulation.bank.sqlite import SEGMENTS
+from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.outcomes import Outcome
 
-#: Compare with ``meta`` in the file, which holds the checksums of all columns.
-META, CHECKSUM = "meta", "sha256"
-
+#: Bytes of a segment: what reading one row may cost in memory. With 16 MiB, ten rows of
+#: 1 MB one by one take four times the CPU, and nothing else takes less
+#: (``python -m benchmarks cost.store``).
+SEGMENT_BYTES = 4 * 2**20
 COLUMNS = {
-    "index": np.dtype(np.int64),
-    "theta": np.dtype(np.float32),
-    "action": np.dtype(np.float32),
-    "x": np.dtype(np.float32),
-    "status": np.dtype(np.int8),
-    "log_proposal": np.dtype(np.float64),
-    "log_action": np.dtype(np.float64),
-    "run": np.dtype(np.int32),
+    "index": np.dtype("<i8"),
+    "theta": np.dtype("<f4"),
+    "action": np.dtype("<f4"),
+    "x": np.dtype("<f4"),
+    "status": np.dtype("i1"),
+    "log_proposal": np.dtype("<f8"),
+    "log_action": np.dtype("<f8"),
 }
+TABLES = ("theta", "action", "x")  # of more than one number a row
 
-#: Those of more than one number a row.
-TABLES = ("theta", "action", "x")
 
-#: Bytes of a segment of several rows that are read at most; none is written as large.
-LARGEST = 2**30
+@dataclass(frozen=True)
+class Segment:
+    """What is known of a segment without its columns.
+
+    Attributes:
+        number: Its place among those of the bank, from 1.
+        num_rows: Rows in it.
+        counts: Of rows by outcome.
+        run: Name of the run that its rows belong to.
+        seed: Of the run.
+        label: Of the run's proposal; "" where it is not known.
+    """
+
+    number: int
+    num_rows: int
+    counts: Sequence[int]
+    run: str
+    seed: int
+    label: str
 
 
 def write_segment(
-    path: Path, columns: Mapping[str, np.ndarray], meta: Mapping[str, Any]
+    store: Store, name: str, run: Mapping[str, Any], columns: Mapping[str, np.ndarray]
 ) -> None:
     """Write a segment; it is on the disk, whole, when this returns.
 
     Args:
-        path: New file.
-        columns: Arrays of the same length n, by name.
-        meta: Anything JSON holds, read without the columns.
+        store: The file.
+        name: Of the bank.
+        run: Its ``run``, ``seed`` and ``label``.
+        columns: Arrays of the same length, by name.
+    """
+    counts = [int((columns["status"] == outcome).sum()) for outcome in Outcome]
+    known = {**run, "num_rows": len(columns["index"]), "counts": counts}
+    with store.writing((SEGMENTS, name)) as number:
+        store.put(SEGMENTS, name, number, known)
+        for key, kind in COLUMNS.items():
+            content = np.ascontiguousarray(columns[key], kind).reshape(-1)
+            content = content.view(np.uint8).data
+            store.put(SEGMENTS, f"{name}/{key}", number, content)
+
+
+def find_segment(store: Store, name: str, number: int) -> Segment:
+    """Return what is known of a segment.
 
     Raises:
-        OSError: If the disk is full or cannot be written; no file is left.
+        CorruptSegmentError: If it is not there, or not what a bank writes.
     """
-    checksums = {name: _checksum(array) for name, array in columns.items()}
-    text = json.dumps({**meta, "checksums": checksums}).encode()
-    buffer = io.BytesIO()
-    # From 1.8 on all of HDF5's own structure has checksums; without them a flipped bit
-    # can make it read for ever.
-    with h5py.File(buffer, "w", libver=("v108", "v108")) as file:
-        for name, array in columns.items():
-            file.create_dataset(name, data=array)
-        file.create_dataset(META, data=np.frombuffer(text, np.uint8))
-        file.attrs[CHECKSUM] = hashlib.sha256(text).hexdigest()
-    write_file(path, buffer.getvalue())
+    where = f"segment {number} of {name!r}"
+    content = store.get(SEGMENTS, name, number)
+    require(store.path, content is not None, f"no {where}: a gap")
+    known = parsed(store.path, content or b"")
+    keys = known.keys() == {"num_rows", "counts", "run", "seed", "label"}
+    require(store.path, keys and _is_known(known), f"{where} that no bank writes")
+    size = store.size(SEGMENTS, f"{name}/index", number)
+    same = size == COLUMNS["index"].itemsize * known["num_rows"]
+    require(store.path, same, f"{where} with another number of rows")
+    return Segment(number, **known)
 
 
-def read_segment(
-    path: Path, names: Sequence[str] | None
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return columns, each compared with its checksum, and the meta data.
-
-    A file made by somebody else is read without harm: it can name no other file and
-    no filter to load, and takes no more memory than its size.
+def read_columns(
+    store: Store,
+    name: str,
+    segment: Segment,
+    names: Sequence[str],
+    shapes: Mapping[str, Sequence[int]],
+) -> dict[str, np.ndarray]:
+    """Return columns of a segment, which cannot be written to.
 
     Args:
-        path: A segment.
-        names: Columns to read; None reads all.
-
-    Returns:
-        The columns, and the meta data with the ``shapes`` of theta, action and x.
+        store: The file.
+        name: Of the bank.
+        segment: Which one.
+        names: Of the columns.
+        shapes: Of theta, action and x, of a row.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        CorruptSegmentError: If the file is not what was written.
+        CorruptSegmentError: If one is not what was written.
     """
-    size = regular_size(path)
-    try:
-        # HDF5 looks its path up more than once, and the file may be gone by then.
-        with open(path, "rb") as opened, h5py.File(opened, "r") as file:
-            meta = _meta(path, file, size)
-            wanted = COLUMNS if names is None else names
-            looked_at = {*wanted, *TABLES}
-            datasets = {n: _dataset(path, file, n, size) for n in looked_at}
-            _require_rows(path, datasets, meta)
-            meta["shapes"] = {name: [*datasets[name].shape[1:]] for name in TABLES}
-            columns = {name: datasets[name][()] for name in wanted}
-    except (FileNotFoundError, CorruptSegmentError):
-        raise
-    except Exception as error:  # HDF5 has many
-        reason = f"a file that HDF5 cannot read ({error or type(error).__name__})"
-        raise CorruptSegmentError(path, reason) from error
-    for name, array in columns.items():
-        same = _checksum(array) == meta["checksums"][name]
-        require(path, same, f"{name!r} with another checksum")
-        require(path, _is_possible(name, array, meta), f"{name!r} that no bank holds")
-    return columns, meta
+    columns = {}
+    for key in names:
+        where = f"{key!r} of segment {segment.number} of {name!r}"
+        content = store.get(SEGMENTS, f"{name}/{key}", segment.number)
+        require(store.path, content is not None, f"no {where}")
+        assert content is not None
+        shape = segment.num_rows, *(shapes[key] if key in TABLES else ())
+        size = prod(shape) * COLUMNS[key].itemsize
+        require(store.path, len(content) == size, f"{len(content)} bytes as {where}")
+        array = np.frombuffer(content, COLUMNS[key]).reshape(shape)
+        _require_possible(store.path, where, key, array, segment)
+        columns[key] = array
+    return columns
 
 
-def _meta(path: Path, file: h5py.File, size: int) -> dict[str, Any]:
-    text = _dataset(path, file, META, size)[()].tobytes()
-    same = hashlib.sha256(text).hexdigest() == str(file.attrs[CHECKSUM])
-    require(path, same, "meta data with another checksum")
-    meta = parsed(path, text)
-    keys = meta.keys() >= {"num_rows", "counts", "runs", "checksums"}
-    require(path, keys and _is_meta(meta), "meta data that no bank writes")
-    return meta
-
-
-def _is_meta(meta: Mapping[str, Any]) -> bool:
-    counts, runs, checksums = meta["counts"], meta["runs"], meta["checksums"]
-    numbers = meta.get("numbers", [])
-    return (
-        all(isinstance(value, list) for value in (counts, runs, numbers))
-        and all(map(is_count, [*counts, *numbers, meta["num_rows"]]))
-        and len(counts) == len(Outcome)
-        and sum(counts) == meta["num_rows"]
-        and all(isinstance(run, dict) and _is_run(run) for run in runs)
-        and isinstance(checksums, dict)
-        and checksums.keys() == COLUMNS.keys()
-    )
-
-
-def _is_run(run: Mapping[str, Any]) -> bool:
-    named = all(isinstance(run.get(name), str) for name in ("digest", "label"))
-    return named and type(run.get("seed")) is int
-
-
-def _dataset(path: Path, file: h5py.File, name: str, size: int) -> h5py.Dataset:
-    """Return a dataset without reading it: plain numbers within this very file."""
-    link = file.get(name, getlink=True)
-    require(path, isinstance(link, h5py.HardLink), f"{name!r} in another place")
-    dataset = file[name]
-    assert isinstance(dataset, h5py.Dataset)
-    kind = COLUMNS.get(name, np.dtype(np.uint8))
-    plan = dataset.id.get_create_plist()
-    is_plain = (
-        dataset.dtype == kind
-        and plan.get_layout() in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT)
-        and not plan.get_external_count()
-        and not plan.get_nfilters()
-        and dataset.shape is not None
-    )
-    require(path, is_plain, f"{name!r} of another kind")
-    num_rows = dataset.shape[0] if dataset.shape else 0
-    few = dataset.nbytes <= (size if num_rows <= 1 else min(size, LARGEST))
-    require(path, few, f"{name!r} of {dataset.nbytes} bytes")
-    return dataset
-
-
-def _require_rows(
-    path: Path, datasets: Mapping[str, h5py.Dataset], meta: Mapping[str, Any]
+def _require_possible(
+    path: Path, where: str, key: str, array: np.ndarray, segment: Segment
 ) -> None:
-    for name, dataset in datasets.items():
-        long = dataset.shape[:1] == (meta["num_rows"],)
-        fits = long and (name in TABLES or len(dataset.shape) == 1)
-        require(path, fits, f"{name!r} of shape {dataset.shape}")
-
-
-def _is_possible(name: str, array: np.ndarray, meta: Mapping[str, Any]) -> bool:
-    if name == "status":
+    if key == "status":
         counts = [int((array == outcome).sum()) for outcome in Outcome]
-        return counts == meta["counts"]
-    if name == "run":
-        return bool(((array >= 0) & (array < len(meta["runs"]))).all())
-    return name != "index" or bool((array >= 0).all())
+        require(path, counts == [*segment.counts], f"{where} that no bank writes")
+    if key == "index":
+        require(path, bool((array >= 0).all()), f"{where} that no bank writes")
 
 
-def leftovers(folder: Path) -> Iterator[Path]:
-    """Yield files of writers that died while writing."""
-    yield from folder.glob(f"{TEMPORARY}*")
+def _is_known(known: Mapping[str, Any]) -> bool:
+    counts = known["counts"]
+    return (
+        all(isinstance(known[key], str) for key in ("run", "label"))
+        and type(known["seed"]) is int
+        and isinstance(counts, list)
+        and all(map(is_count, [*counts, known["num_rows"]]))
+        and len(counts) == len(Outcome)
+        and sum(counts) == known["num_rows"]
+    )
 
 
-def _checksum(array: np.ndarray) -> str:
-    array = np.ascontiguousarray(array)
-    digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
-    digest.update(array.reshape(-1).view(np.uint8).data)
-    return digest.hexdigest()
+def require_header(path: Path, header: Mapping[str, Any]) -> None:
+    """Raise where the header of a bank is none that a bank writes.
+
+    Raises:
+        CorruptSegmentError: It names the entry.
+    """
+    for name, is_valid in _ENTRIES.items():
+        require(path, name in header, f"no entry {name!r}")
+        require(path, is_valid(header[name]), f"an entry {name!r} that none writes")
+
+
+def _are(kind: type | Callable[[Any], bool], value: Any) -> bool:
+    test = (lambda v: isinstance(v, kind)) if isinstance(kind, type) else kind
+    return isinstance(value, list) and all(map(test, value))
+
+
+def _are_shapes(value: Any) -> bool:
+    return isinstance(value, dict) and (
+        value.keys() == {*TABLES} and all(_are(is_count, v) for v in value.values())
+    )
+
+
+_ENTRIES: dict[str, Callable[[Any], bool]] = {
+    "created": lambda value: value is None or isinstance(value, str),
+    "version": lambda value: isinstance(value, str),
+    "simulator": lambda value: isinstance(value, dict | str),
+    "parameter_names": lambda value: value is None or _are(str, value),
+    "shapes": lambda value: value is None or _are_shapes(value),
+    "lost": lambda value: _are(is_count, value),
+}

@@ -1,12 +1,12 @@
 """Full disks, flipped bits, files of others: a clear error, and nothing lost."""
 
 import contextlib
-import json
 import os
 import pickle
 import resource
 import shutil
 import stat
+import sys
 import zlib
 
 import pytest
@@ -14,10 +14,16 @@ import torch
 
 from sbi_active import Campaign
 from sbi_active.campaign.storage import DamagedCampaignError
-from sbi_active.campaign.storage.log import TrialLog
+from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
+from tests.simulation.bank.filled import crafted, execute, flip
 
-LOG = "trials.jsonl"
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+FILE = "store.db"
 
 
 @pytest.fixture(scope="module")
@@ -35,16 +41,29 @@ def folder(made, tmp_path):
     return shutil.copytree(made[0], tmp_path / "c")
 
 
-def flip(path, position):
-    content = bytearray(path.read_bytes())
-    content[position] ^= 4
-    path.write_bytes(bytes(content))
+def line(folder, number):
+    """Return the place of a line of the log in the file, and its bytes."""
+    ((text,),) = execute(
+        folder, "SELECT content FROM events WHERE kind = 'log' AND number = ?", number
+    )
+    return (folder / FILE).read_bytes().index(text), text
 
 
-def test_a_last_line_that_was_not_finished_is_no_line(made, folder):
-    whole = (folder / LOG).read_bytes()
-    for num_bytes in (1, 40, len(whole.splitlines()[-1])):
-        (folder / LOG).write_bytes(whole + whole.splitlines()[-1][:num_bytes])
+def flip_line(folder, number, share=0.5):
+    start, text = line(folder, number)
+    flip(folder / FILE, start + int(share * len(text)))
+
+
+def test_what_was_not_committed_is_not_there(made, folder):
+    with Campaign.load(folder, simulator=drawn) as campaign:
+        campaign._storage.disk.acquire()
+        campaign.tell([0.1, 0.2, 0.3, 0.4])
+        log = (folder / "store.db-wal").read_bytes()
+        before = (folder / FILE).read_bytes()
+    for num_bytes in (0, 20, 40, len(log) // 2, len(log) - 1):
+        (folder / FILE).write_bytes(before)
+        (folder / "store.db-wal").write_bytes(log[:num_bytes])
+        (folder / "store.db-shm").unlink(missing_ok=True)
         campaign = Campaign.load(folder, simulator=drawn)
         assert facts(campaign) == facts(made[1])
     campaign.tell([0.1, 0.2, 0.3, 0.4])
@@ -52,26 +71,27 @@ def test_a_last_line_that_was_not_finished_is_no_line(made, folder):
     assert len(Campaign.load(folder).history) == 3
 
 
-def test_every_byte_of_the_log_is_looked_at(folder):
-    content = (folder / LOG).read_bytes()
-    for position in range(0, len(content) - 1, 97):
-        flip(folder / LOG, position)
-        with pytest.raises(DamagedCampaignError, match="line . with another checksum"):
+@pytest.mark.parametrize("number", [1, 3, 5])
+def test_every_byte_of_the_log_is_looked_at(folder, number):
+    start, text = line(folder, number)
+    content = (folder / FILE).read_bytes()
+    for position in range(start, start + len(text), 23):
+        flip(folder / FILE, position)
+        with pytest.raises(DamagedCampaignError, match=rf"'log' {number} with anoth"):
             Campaign.load(folder)
-        flip(folder / LOG, position)
+        (folder / FILE).write_bytes(content)
     Campaign.load(folder)
 
 
 def test_a_damaged_line_is_given_up_by_name(made, folder):
-    lines = (folder / LOG).read_text().splitlines()
-    flip(folder / LOG, len(lines[0]) + len(lines[1]) // 2)  # the first tell
+    flip_line(folder, 2)  # the first tell
     with pytest.raises(
         DamagedCampaignError, match=r"1 of 5 lines damaged.*repair=True"
     ):
         Campaign.load(folder)
     with pytest.warns(UserWarning, match="given up, tell it again: .*told"):
         campaign = Campaign.load(folder, simulator=drawn, repair=True)
-    assert (folder / "trials.damaged").exists()
+    assert (folder / "store.db.damaged").exists()
     assert campaign.history[-1].x is not None
     campaign.tell(made[1].history[0].x, trial=0)
     campaign.update()
@@ -83,8 +103,7 @@ def test_a_trial_without_any_line_leaves_a_gap(tmp_path):
     for action, x in (([0.8], 0.3), ([1.0], 0.4), ([1.9], 0.6)):
         campaign.attach(action, [x] * 4)
     campaign.close()
-    lines = (tmp_path / "c" / LOG).read_text().splitlines()
-    flip(tmp_path / "c" / LOG, len(lines[0]) // 2)
+    flip_line(tmp_path / "c", 1)
     with pytest.warns(UserWarning, match="given up, tell it again: .*attached"):
         again = Campaign.load(tmp_path / "c", simulator=drawn, repair=True)
     assert [t.status for t in again.history] == ["withdrawn", "ok", "ok"]
@@ -100,21 +119,23 @@ def test_a_trial_without_any_line_leaves_a_gap(tmp_path):
     assert Campaign.load(tmp_path / "c", repair=True).history[0].status == "ok"
 
 
-@pytest.mark.parametrize("name", ["state.bin", "belief"])
+@pytest.mark.parametrize("name", ["state", "belief"])
 def test_what_can_be_computed_again_is(made, folder, name):
-    path = next(folder.glob(f"{name}*"))
-    for damage in (lambda f: flip(f, 100), lambda f: f.write_bytes(b""), os.unlink):
-        damage(path)
+    for change in (
+        "UPDATE objects SET content = x'00' WHERE kind = ?",
+        "UPDATE objects SET digest = x'00' WHERE kind = ?",
+        "DELETE FROM objects WHERE kind = ?",
+    ):
+        execute(folder, change, name)
         campaign = Campaign.load(folder, simulator=drawn)
         campaign.update()
         assert torch.equal(draws(campaign), draws(made[1]))
         campaign.close()
-        path = next(folder.glob(f"{name}*"))
 
 
 def test_a_manifest_has_a_copy(made, folder):
-    flip(folder / "campaign.json", 200)
-    with pytest.raises(DamagedCampaignError, match="the log of the trials untouched"):
+    execute(folder, "UPDATE objects SET content = x'00' WHERE kind = 'campaign'")
+    with pytest.raises(DamagedCampaignError, match="the log of the trials apart"):
         Campaign.load(folder)
     campaign = Campaign.load(folder, simulator=drawn, repair=True)
     assert facts(campaign) == facts(made[1])
@@ -122,17 +143,19 @@ def test_a_manifest_has_a_copy(made, folder):
 
 
 def test_another_schema_names_the_release(folder):
-    import hashlib
-
-    manifest = json.loads((folder / "campaign.json").read_text())
-    del manifest["sha256"]
-    manifest["schema"] = 2
+    manifest = {**Campaign.load(folder)._storage.disk.manifest, "schema": 9}
     manifest["packages"]["sbi-active"] = "9.9"
-    text = json.dumps(manifest, sort_keys=True)
-    manifest["sha256"] = hashlib.sha256(text.encode()).hexdigest()
-    (folder / "campaign.json").write_text(json.dumps(manifest))
-    with pytest.raises(ValueError, match=r"schema 1; got .* of schema 2.*9\.9"):
+    crafted(folder, "objects", "campaign", 0, manifest)
+    with pytest.raises(ValueError, match=r"schema 2; got .* of schema 9.*9\.9"):
         Campaign.load(folder)
+
+
+def test_people_read_what_it_is(folder):
+    found = tomllib.loads((folder / "campaign.toml").read_text())
+    assert (found["method"], found["seed"], found["x_shape"]) == ("nsbi", 0, [4])
+    assert "BoxUniform" in found["prior"]
+    (folder / "campaign.toml").unlink()  # which nothing reads
+    Campaign.load(folder)
 
 
 class Bomb:
@@ -148,24 +171,30 @@ def short(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", ["state.bin", "belief", "campaign.json", LOG])
-def test_nothing_is_executed(short, tmp_path, name):
-    import hashlib
-
+@pytest.mark.parametrize(
+    ("table", "kind", "number"),
+    [
+        ("objects", "state", 0),
+        ("objects", "belief", 0),
+        ("objects", "campaign", 0),
+        ("events", "log", 1),
+    ],
+)
+def test_nothing_is_executed(short, tmp_path, table, kind, number):
     folder = shutil.copytree(short, tmp_path / "c")
-    path = next(folder.glob(f"{name}*"))
     for content in (
         pickle.dumps(Bomb()),
         zlib.compress(pickle.dumps(Bomb())),
         zlib.compress(_saved({"structure": "{}", "arrays": Bomb()})),
     ):
-        digest = hashlib.sha256(content).hexdigest().encode()
-        for prefix in (b"", digest + b"\n"):
-            path.write_bytes(prefix + content)
-            with contextlib.suppress(ValueError, OSError):
-                Campaign.load(folder, simulator=drawn).update()
-            path = folder / path.name
-            assert not (tmp_path / "exploded").exists()
+        crafted(folder, table, kind, number, content)
+        with contextlib.suppress(ValueError, OSError):
+            Campaign.load(folder, simulator=drawn).update()
+        assert not (tmp_path / "exploded").exists()
+    (folder / FILE).write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(DamagedCampaignError):
+        Campaign.load(folder)
+    assert not (tmp_path / "exploded").exists()
 
 
 def _saved(value):
@@ -177,22 +206,24 @@ def _saved(value):
 
 
 def test_a_full_disk_refuses_and_loses_nothing(made, folder):
-    size = (folder / LOG).stat().st_size
+    size = (folder / FILE).stat().st_size
     pid = os.fork()
     if pid == 0:
         import signal
 
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         campaign = Campaign.load(folder, simulator=drawn)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, size + 50))
+        campaign._storage.disk.acquire()
+        log = (folder / "store.db-wal").stat().st_size
+        resource.setrlimit(resource.RLIMIT_FSIZE, (log + 50, log + 50))
         try:
             campaign.tell([0.1, 0.2, 0.3, 0.4])
         except OSError as error:
-            told = "what was told before is whole" in str(error)
+            told = "what was stored before is whole" in str(error)
             os._exit(0 if told and campaign.pending is not None else 2)
         os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-    assert (folder / LOG).stat().st_size == size
+    assert (folder / FILE).stat().st_size == size
     campaign = Campaign.load(folder, simulator=drawn)
     assert facts(campaign) == facts(made[1])
     campaign.tell([0.1, 0.2, 0.3, 0.4])
@@ -202,10 +233,10 @@ def test_a_directory_that_cannot_be_written(made, folder, monkeypatch):
     campaign = Campaign.load(folder, simulator=drawn)
     if os.geteuid() == 0:  # whom no permission stops
 
-        def refuse(self, entry):
+        def refuse(self):
             raise PermissionError(13, "Permission denied", str(self.path))
 
-        monkeypatch.setattr(TrialLog, "append", refuse)
+        monkeypatch.setattr(Store, "acquire", refuse)
     else:
         folder.chmod(stat.S_IRUSR | stat.S_IXUSR)
     with pytest.raises(OSError):

@@ -1,6 +1,5 @@
 """Threads, processes and crafted folders: nothing that was told is lost."""
 
-import json
 import os
 import threading
 
@@ -12,7 +11,7 @@ from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.campaign.storage import DamagedCampaignError
 from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.campaign.storage.damage import LogChangedError
-from sbi_active.simulation.bank.lock import LockedError
+from sbi_active.simulation.bank import LockedError, store
 from tests.campaign.storage.campaigns import (
     MODEL,
     facts,
@@ -20,8 +19,9 @@ from tests.campaign.storage.campaigns import (
     mean,
     new,
 )
+from tests.simulation.bank.filled import crafted, execute
 
-LOG = "trials.jsonl"
+FILE = "store.db"
 
 
 def told(folder, **options):
@@ -60,10 +60,15 @@ def test_two_writers_without_locks_refuse_before_they_write(tmp_path, monkeypatc
     folder = tmp_path / "c"
     a = new(folder)
     a.attach([1.0], number(1))
-    # As on a file system whose locks do nothing.
-    monkeypatch.setattr("filelock.FileLock.acquire", lambda self, **_: None)
     b = Campaign.load(folder)
-    b.attach([1.0], number(2))
+
+    def unlocked(path, mode, *, timeout):  # as on a file system whose locks do nothing
+        return connected(path.with_name(f"{path.name}-of-b"), mode, timeout=timeout)
+
+    with monkeypatch.context() as patch:
+        connected = store.connected
+        patch.setattr(store, "connected", unlocked)
+        b.attach([1.0], number(2))
     with pytest.raises(LogChangedError, match="another process told since"):
         a.attach([2.0], number(3))
     assert told(folder) == [number(1), number(2)]
@@ -73,7 +78,7 @@ def test_a_lock_file_that_is_removed_cuts_nothing_off(tmp_path):
     folder = tmp_path / "c"
     a = new(folder)
     a.attach([1.0], number(1))
-    os.remove(folder / "writer.lock")
+    os.remove(folder / "store.lock")
     b = Campaign.load(folder)
     b.attach([1.0], number(2))
     with pytest.raises(LogChangedError):
@@ -107,32 +112,38 @@ def test_a_forked_child_does_not_hold_the_lock(tmp_path):
     assert told(folder) == [number(1), number(3)]
 
 
-@pytest.mark.parametrize("harm", ["removed", "cut", "nuls"])
-def test_a_log_that_is_harmed_meanwhile_is_not_written_to(tmp_path, harm):
+@pytest.mark.parametrize("harm", ["removed", "cut", "nuls", "another"])
+def test_a_file_that_is_harmed_meanwhile_is_not_written_to(tmp_path, harm):
     folder = tmp_path / "c"
     c = new(folder)
     c.attach([1.0], number(1))
-    content = (folder / LOG).read_bytes()
-    left = {"removed": None, "cut": content[:50], "nuls": b"\0" * len(content)}[harm]
-    (folder / LOG).unlink()
+    content = (folder / FILE).read_bytes()
+    left = {
+        "removed": None,
+        "cut": content[:5000],
+        "nuls": b"\0" * len(content),
+        "another": b"hello" * 1000,
+    }[harm]
+    if harm in ("removed", "another"):
+        (folder / FILE).unlink()
     if left is not None:
-        (folder / LOG).write_bytes(left)
+        (folder / FILE).write_bytes(left)
     with pytest.raises(DamagedCampaignError, match="nothing was written to it now"):
         c.attach([2.0], number(2))
-    assert ((folder / LOG).read_bytes() if left is not None else None) == left
+    assert ((folder / FILE).read_bytes() if left is not None else None) == left
     assert len(c.history) == 1  # and the second is not taken for recorded
 
 
 @pytest.mark.filterwarnings("ignore:restored", "ignore:given up", "ignore:the belief")
-@pytest.mark.parametrize("harm", ["empty", "nuls", "older"])
+@pytest.mark.parametrize("harm", ["empty", "uncounted", "older"])
 def test_a_log_shorter_than_the_state_is_damage_and_is_repaired(tmp_path, harm):
     folder = tmp_path / "c"
     c = go_on(new(folder), 3)
     c.close()
-    content = (folder / LOG).read_bytes()
-    older = content[: content.index(b"\n") + 1]
-    left = {"empty": b"", "nuls": b"\0" * 900, "older": older}[harm]
-    (folder / LOG).write_bytes(left)
+    left = {"empty": 0, "uncounted": 0, "older": 1}[harm]
+    execute(folder, "DELETE FROM events WHERE kind = 'log' AND number > ?", left)
+    if harm != "empty":
+        crafted(folder, "objects", "events of log", 0, {"length": left})
     with pytest.raises(DamagedCampaignError):
         Campaign.load(folder)
     with Campaign.load(folder, repair=True) as again:
@@ -160,14 +171,15 @@ def test_small_numbers_are_corrected(tmp_path):
 
 def test_links_lead_nowhere(tmp_path):
     mine = tmp_path / "mine.txt"
-    for name in ("writer.json", "writer.lock", LOG, "trials.damaged"):
+    beside = ("store.lock", "store.db-wal", "store.db-shm", "store.db.damaged")
+    for name in (FILE, *beside):
         mine.write_text("precious")
         folder = tmp_path / f"c-{name}"
         go_on(new(folder), 1).close()
         (folder / name).unlink(missing_ok=True)
         (folder / name).symlink_to(mine)
         try:
-            with Campaign.load(folder) as c:
+            with Campaign.load(folder, repair=True) as c:
                 c.attach([1.0], number(1))
         except OSError:
             pass
@@ -180,7 +192,8 @@ def test_files_of_the_user_stay(tmp_path):
     (folder / "belief-mine.bin").write_text("precious")
     go_on(c, 2).close()
     assert (folder / "belief-mine.bin").read_text() == "precious"
-    assert len([*folder.glob("belief-*.bin")]) == 2
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"belief-mine.bin", "campaign.toml", FILE, "store.lock"}
 
 
 def test_a_small_file_that_fills_memory_is_refused():
@@ -209,41 +222,29 @@ SPOILS = [
 @pytest.mark.filterwarnings("ignore")
 def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
     """Whatever stands in the place of an entry: the same trials, or one error."""
-    from sbi_active.campaign.storage.log import _opened, _sealed
-    from sbi_active.campaign.storage.manifest import COPY, MANIFEST, _digest
-
     folder = tmp_path / "c"
     whole = go_on(new(folder, MODEL), 2)
     whole.close()
-    files = {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
-    manifest = json.loads(files[MANIFEST])
-    entries = [_opened(line) for line in files[LOG].splitlines()]
+    content = (folder / FILE).read_bytes()
+    manifest = whole._storage.disk.manifest
     rng = np.random.default_rng(0)
-    crafted = []
+    changes = []
     for key in manifest:
         for k in rng.choice(len(SPOILS), 2, replace=False):
-            spoiled = {**manifest, key: SPOILS[k]}
-            spoiled.pop("sha256", None)
-            try:
-                spoiled["sha256"] = _digest(spoiled)
-                text = json.dumps(spoiled).encode()
-            except (ValueError, UnicodeError):
-                continue
-            crafted.append({MANIFEST: text, COPY: text})
-    for entry in entries:
-        assert entry is not None
-        places = [(entry, key) for key in entry if key != "line"]
-        places += [(entry.get("trial", {}), key) for key in entry.get("trial", {})]
-        for owner, key in places:
-            before = owner[key]
-            owner[key] = SPOILS[rng.integers(len(SPOILS))]
-            crafted.append({LOG: b"".join(map(_sealed, entries))})
-            owner[key] = before
-    assert len(crafted) > 60
+            changes.append(("objects", "campaign", 0, {**manifest, key: SPOILS[k]}))
+    for entry in whole.events:
+        line, trial = entry["line"], entry.get("trial", {})
+        for key in entry.keys() - {"line"}:
+            spoil = SPOILS[rng.integers(len(SPOILS))]
+            changes.append(("events", "log", line, {**entry, key: spoil}))
+        for key in trial:
+            spoil = {**trial, key: SPOILS[rng.integers(len(SPOILS))]}
+            changes.append(("events", "log", line, {**entry, "trial": spoil}))
+    assert len(changes) > 60
     survived = 0
-    for own in crafted:
-        for name, content in {**files, **own}.items():
-            (folder / name).write_bytes(content)
+    for table, kind, number, spoiled in changes:
+        (folder / FILE).write_bytes(content)
+        crafted(folder, table, kind, number, spoiled)
         try:
             found = Campaign.load(folder)
             found.history, found.health, str(found.belief)  # noqa: B018
@@ -253,4 +254,4 @@ def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
         except ValueError as error:  # what a reader has to give again
             survived += str(error).startswith("expected")
     # What describes and decides nothing may hold anything: a reason, a time.
-    assert survived >= 0.9 * len(crafted)
+    assert survived >= 0.9 * len(changes)

@@ -1,17 +1,33 @@
-"""Directories that earlier releases wrote are read as they were meant."""
+"""Folders that earlier releases wrote are brought up to date, and go on."""
 
+import json
 import shutil
+import sys
 
+import numpy as np
 import pytest
 import torch
 
-from sbi_active import Campaign
+from sbi_active import Bank, Campaign
+from sbi_active.campaign.storage import DamagedCampaignError
+from sbi_active.cli import main
+from sbi_active.migration import migrate
+from sbi_active.simulation.bank import CorruptSegmentError
 from tests.campaign.storage.version_1 import FOLDER, simulator
+
+BANK = FOLDER / "simulations" / "drawn"
+ROWS = 1156
 
 
 @pytest.fixture
-def folder(tmp_path):
+def old(tmp_path):
     return shutil.copytree(FOLDER, tmp_path / "c")
+
+
+@pytest.fixture
+def folder(old):
+    migrate(old)
+    return old
 
 
 def require_trials(campaign):
@@ -21,6 +37,24 @@ def require_trials(campaign):
     assert history[1].x.tolist() == pytest.approx([0.62, 0.88, 1.21])
     assert history[2].x.isnan().tolist() == [False, True, False]
     assert campaign.pending.index == 3
+
+
+def test_what_is_to_be_done_is_said(old, capsys):
+    with pytest.raises(ValueError, match="sbi-active migrate"):
+        Campaign.load(old)
+    assert main(["migrate", str(old)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "log: 5 events",
+        f"bank drawn: {ROWS} rows",
+        f"the files of before are in {old / 'version-1'}",
+    ]
+    names = sorted(path.name for path in old.iterdir())
+    assert names == ["campaign.toml", "store.db", "version-1"]
+    for path in FOLDER.rglob("*.*"):
+        copy = old / "version-1" / path.relative_to(FOLDER)
+        assert not path.is_file() or path.read_bytes() == copy.read_bytes()
+    assert main(["migrate", str(old)]) == 2
+    assert "expected a bank or campaign of release 0.1" in capsys.readouterr().err
 
 
 def test_read(folder):
@@ -48,9 +82,99 @@ def test_gone_on_with(folder):
         assert bool(((belief.mean - truth).abs() < 0.15).all())
 
 
+def test_gone_on_with_to_the_last_bit(folder):
+    def finished(campaign):
+        campaign.tell([0.4, 0.7, 1.0])
+        campaign.update()
+        campaign.tell([0.5, 0.8, 1.1], action=[1.2])
+        torch.manual_seed(0)
+        return campaign.update().sample((300,))
+
+    with Campaign.load(folder, simulator=simulator) as campaign:
+        draws = finished(campaign)
+    anew = Campaign(
+        *(simulator, campaign.first_prior, campaign.actions),
+        method="nsbi",
+        options=campaign.state.options,
+        seed=1,
+    )
+    anew.attach([1.0], [0.31, 0.62, 0.9])
+    anew.attach([2.0], [62.0, 88.0, 121.0])
+    anew.correct(1, [0.62, 0.88, 1.21], reason="told in cm")
+    anew.attach([1.5], [0.4, float("nan"), 1.0])
+    anew.ask()
+    assert torch.equal(draws, finished(anew))
+
+
+def test_what_was_simulated_is_there_row_by_row(folder):
+    h5py = pytest.importorskip("h5py")
+    bank = Bank(folder, name="drawn")
+    assert bank.verify() == []
+    columns = bank.columns("theta", "x", "index", "log_proposal")
+    for name, column in columns.items():
+        files = sorted(BANK.glob("segments/*.h5"))
+        parts = []
+        for path in files:
+            with h5py.File(path) as file:
+                parts.append(file[name][()])
+        assert np.array_equal(np.concatenate(parts), column.numpy(), equal_nan=True)
+    header = json.loads((BANK / "bank.json").read_text())
+    assert bank.header["simulator"] == header["simulator"]
+
+
+def test_a_bank_alone_and_several_in_a_folder(tmp_path):
+    shutil.copytree(BANK, tmp_path / "bank")
+    assert migrate(tmp_path / "bank") == {"rows": ROWS}
+    assert len(Bank(tmp_path / "bank")) == ROWS
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        assert bank.counts["ok"] == ROWS
+    for name in ("drawn", "noise-free"):
+        shutil.copytree(BANK, tmp_path / "banks" / name)
+    assert migrate(tmp_path / "banks") == {"drawn": ROWS, "noise-free": ROWS}
+    assert len(Bank(tmp_path / "banks", name="noise-free")) == ROWS
+
+
+def test_one_that_was_cut_short_is_done_again(old, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("sbi_active.migration.folders.copy_bank", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            migrate(old)
+    assert {p.name for p in FOLDER.iterdir()} <= {p.name for p in old.iterdir()}
+    migrate(old)
+    require_trials(Campaign.load(old))
+    (old / "version-1" / "campaign.json").rename(old / "campaign.json")
+    assert migrate(old) == {}
+    assert not (old / "campaign.json").exists()
+
+
+@pytest.mark.parametrize("name", ["trials.jsonl", "campaign.json", "a segment"])
+def test_damage_is_named_and_nothing_is_moved(old, name):
+    if name == "a segment":
+        path = next(old.glob("simulations/drawn/segments/*.h5"))
+    else:
+        path = old / name
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+    if name == "campaign.json":
+        (old / "campaign.json.copy").unlink()
+    with pytest.raises((DamagedCampaignError, CorruptSegmentError), match=path.name):
+        migrate(old)
+    assert not (old / "store.db").exists()
+    assert (old / "campaign.json").exists()
+
+
+def test_without_h5py_it_says_what_to_install(old, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match=r"pip install 'sbi-active\[migrate\]'"):
+        migrate(old)
+    assert not (old / "store.db").exists()
+
+
 def test_computed_again_from_its_log(folder):
-    for path in folder.glob("*.bin"):
-        path.unlink()
+    from tests.simulation.bank.filled import execute
+
+    execute(folder, "DELETE FROM objects WHERE kind IN ('state', 'belief')")
     with Campaign.load(folder, simulator=simulator) as campaign:
         campaign.update()
         mean = campaign.belief.mean.tolist()

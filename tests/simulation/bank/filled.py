@@ -1,9 +1,16 @@
-"""A small bank of four segments, for what damages it."""
+"""A small bank of four segments, and what damages it."""
+
+import sqlite3
+from contextlib import closing
 
 import torch
 
 from sbi_active import Bank
 from sbi_active.simulation import Simulations
+from sbi_active.simulation.bank.segments import COLUMNS
+from sbi_active.simulation.bank.store import Store
+
+FILE = "store.db"
 
 
 def simulator(theta, action):
@@ -21,10 +28,6 @@ def fill(bank, seeds=(0, 1, 2, 3)):
         bank.append(rows, seed=seed, proposal=prior(), label="prior")
 
 
-def segment(folder, first, last=None):
-    return folder / "segments" / f"{first:08d}-{last or first:08d}.h5"
-
-
 def appended(folder):
     with Bank(folder, simulator=simulator) as bank:
         fill(bank, (9,))
@@ -35,3 +38,33 @@ def filled(path):
     with Bank(path, simulator=simulator) as bank:
         fill(bank)
     return bank.path
+
+
+def execute(folder, statement, *values):
+    """Change the file as anybody can who has SQLite."""
+    with closing(sqlite3.connect(folder / FILE, isolation_level=None)) as connection:
+        found = connection.execute(statement, values).fetchall()
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return found
+
+
+def crafted(folder, table, kind, number, content):
+    """Put a record with the right checksum."""
+    store = Store(folder)
+    with store.writing():
+        store.put(table, kind, number, content)
+    store.close()
+
+
+def kinds():
+    return ["rows", *(f"rows/{name}" for name in COLUMNS)]
+
+
+def remove(folder, number):
+    execute(folder, "DELETE FROM segments WHERE number = ?", number)
+
+
+def flip(path, position):
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1 << position % 8
+    path.write_bytes(content)

@@ -18,7 +18,6 @@ import torch
 
 from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation.bank import shelf
 from sbi_active.simulation.workers import Recorder
 
 #: An outcome of 80 kB, so that writing takes most of the time.
@@ -82,7 +81,6 @@ def kill_after(seconds, path, num_workers):
 def main(folder, num_moments, seed, num_workers):
     torch.set_num_threads(1)
     Recorder.INTERVAL = 0.0  # a segment a batch: more writing than simulating
-    shelf.MANY = 8  # and mergers all the time
     expected = run()
     start = time.perf_counter()
     with Bank(folder / "whole", simulator=simulator) as bank:
@@ -94,11 +92,11 @@ def main(folder, num_moments, seed, num_workers):
         reported, was_killed = kill_after(
             moments.uniform(0, duration), path, num_workers
         )
-        names = [f.name for f in path.glob("segments/*")]
+        log = path / "store.db-wal"
         record = {
             "killed": was_killed,
             "reported": sum(len(index) for _, index in reported),
-            "half_written": sum(name.startswith(".") for name in names),
+            "bytes_in_log": log.stat().st_size if log.exists() else 0,
         }
         with Bank(path, simulator=simulator) as bank:
             record["problems"] = bank.verify()

@@ -1,4 +1,3 @@
-import json
 import os
 import signal
 import subprocess
@@ -13,7 +12,8 @@ import torch
 from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
-from sbi_active.simulation.bank import LockedError, shelf
+from sbi_active.simulation.bank import LockedError
+from sbi_active.simulation.bank import bank as module
 
 
 def simulator(theta, action, seeds):
@@ -78,7 +78,7 @@ def test_part_of_a_run_is_completed(bank):
     theta, action = draw(300)
     whole = simulate(simulator, theta, action, seed=0)
     with_store = simulate(simulator, theta, action, seed=0, store=bank)
-    run = bank._shelf.segments()[0].runs[0]["digest"]
+    run = bank._rows.segments()[0].run
     other = Bank(bank.path.parent / "other", simulator=simulator)
     some = torch.arange(0, 300, 7)
     rows = {k: getattr(whole, k)[some] for k in ("theta", "action", "x", "status")}
@@ -98,10 +98,10 @@ def test_same_rows_are_stored_once(bank):
 
 
 def test_rows_by_position_slice_and_mask(bank, monkeypatch):
-    monkeypatch.setattr(shelf, "SEGMENT_BYTES", 60 * 60)  # about 60 rows a segment
+    monkeypatch.setattr(module, "SEGMENT_BYTES", 60 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
     bank.append(rows, seed=0)
-    assert len(bank._shelf.segments()) > 2
+    assert len(bank._rows.segments()) > 2
     some = torch.tensor([199, 3, 3, 70])
     assert torch.equal(bank.read(some).theta, rows.theta[some])
     assert torch.equal(bank.read(slice(50, 150)).theta, rows.theta[50:150])
@@ -144,7 +144,7 @@ def test_memory_is_bounded_by_a_segment(tmp_path):
     assert growth < 130
 
 
-def test_small_segments_are_merged_and_rows_keep_their_places(bank):
+def test_many_small_sets_keep_their_places(bank):
     for seed in range(70):
         theta, action = draw(4)
         simulate(simulator, theta, action, seed=seed, store=bank)
@@ -152,40 +152,46 @@ def test_small_segments_are_merged_and_rows_keep_their_places(bank):
             before = bank.read()
             reader = Bank(bank.path)
             assert len(reader) == 240
-    assert len(bank._shelf.segments()) < 10
     assert same(reader.read(torch.arange(240)), before)
     bank.compact()
-    assert len(bank._shelf.segments()) == 1
     assert bank.columns("seed")["seed"].tolist() == [
         s for s in range(70) for _ in "abcd"
     ]
-    assert len(bank.load(bank._shelf.segments()[0].runs[5]["digest"])[0]) == 4
+    assert len(bank.load(bank._rows.segments()[5].run)[0]) == 4
+    assert same(reader.read(torch.arange(240)), before)
     assert bank.verify() == []
+    assert bank.num_bytes < 500_000
 
 
-def test_a_merger_that_was_cut_short_changes_nothing(bank, monkeypatch):
-    for seed in range(5):
-        simulate(simulator, *draw(4), seed=seed, store=bank)
-    before = bank.read()
-
-    def die(path):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(type(bank.path), "unlink", die)
-        with pytest.raises(KeyboardInterrupt):
-            bank.compact()
-    assert len([*(bank.path / "segments").glob("*.h5")]) == 6
-    assert same(Bank(bank.path).read(), before)
-    (bank.path / "segments" / ".writing-1-00000009-00000009.h5").write_bytes(b"half")
+def test_what_a_writer_that_died_left_is_removed(bank):
+    simulate(simulator, *draw(4), seed=0, store=bank)
     bank.close()
+    (bank.path / ".writing-1-store.db").write_bytes(b"half")
     with Bank(bank.path, simulator=simulator) as again:
         simulate(simulator, *draw(4), seed=9, store=again)
-        assert same(again.read(slice(0, 20)), before)
-    assert sorted(p.name for p in (bank.path / "segments").iterdir()) == [
-        "00000001-00000005.h5",
-        "00000006-00000006.h5",
-    ]
+        assert len(again) == 8
+    names = sorted(p.name for p in bank.path.iterdir())
+    assert names == ["store.db", "store.lock"]
+
+
+def test_the_file_alone_holds_all_once_it_is_closed(bank, tmp_path):
+    simulate(simulator, *draw(40), seed=0, store=bank)
+    reader = Bank(bank.path)
+    assert len(reader) == 40
+    bank.close()
+    (tmp_path / "copy").mkdir()
+    (tmp_path / "copy" / "store.db").write_bytes((bank.path / "store.db").read_bytes())
+    assert same(Bank(tmp_path / "copy").read(), reader.read())
+
+
+def test_several_banks_in_one_file(tmp_path):
+    with Bank(tmp_path, simulator=simulator, name="a") as bank:
+        simulate(simulator, *draw(4), seed=0, store=bank)
+    with Bank(tmp_path, simulator=draw, name="b") as other:
+        other.append(Simulations(*draw(3), torch.rand(3, 7)), seed=0)
+    assert [len(Bank(tmp_path, name=name)) for name in "ab"] == [4, 3]
+    with pytest.raises(ValueError, match="expected the bank rows in .* bank a, bank b"):
+        Bank(tmp_path)
 
 
 def test_second_writer_is_told_who_writes_and_readers_go_on(bank):
@@ -199,9 +205,7 @@ def test_second_writer_is_told_who_writes_and_readers_go_on(bank):
     second.close()
 
 
-def test_readers_go_on_while_another_process_writes_and_merges(bank, monkeypatch):
-    monkeypatch.setattr(shelf, "MANY", 3)
-
+def test_readers_go_on_while_another_process_writes(bank):
     def write():
         own = Bank(bank.path, simulator=simulator)
         for seed in range(60):
@@ -238,10 +242,9 @@ def test_the_lock_goes_with_its_process(bank):
         time.sleep(60)
 
     with forked(hold) as is_running:
-        holder = bank.path / "writer.json"
-        while not holder.exists() or not holder.read_text().endswith("}"):
-            assert is_running()
         other = Bank(bank.path, simulator=simulator)
+        while (other._store.text("writer") or {}).get("pid") != is_running.pid:
+            assert is_running()
         text = f"got process {is_running.pid} on"
         with pytest.raises(LockedError, match=text) as raised:
             other.compact()
@@ -256,8 +259,7 @@ def test_names_and_settings_are_in_the_header(tmp_path):
     model = SimulatorModel(
         simulator, noise=GaussianNoise(0.5), parameter_names=["mass", "friction"]
     )
-    Bank(tmp_path / "bank", simulator=model, created="2026-01-31")
-    header = json.loads((tmp_path / "bank" / "bank.json").read_text())
+    header = Bank(tmp_path / "bank", simulator=model, created="2026-01-31").header
     assert header["parameter_names"] == ["mass", "friction"]
     assert header["created"] == "2026-01-31"
     assert header["simulator"]["noise"]["sd"] == 0.5

@@ -1,13 +1,10 @@
-"""Damaged, crafted and old files of a bank: one error names them."""
+"""Damaged, crafted and strange files of a bank: one error names them."""
 
-import copy
-import hashlib
 import json
 import os
 from contextlib import suppress
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import torch
@@ -15,12 +12,8 @@ import torch
 from sbi_active import Bank
 from sbi_active.cli import main
 from sbi_active.simulation import Simulations
-from sbi_active.simulation.bank import CorruptSegmentError, read_segment, write_segment
-from tests.simulation.bank.filled import (
-    filled,
-    segment,
-    simulator,
-)
+from sbi_active.simulation.bank import CorruptSegmentError
+from tests.simulation.bank.filled import FILE, crafted, execute, filled, simulator
 
 
 @pytest.fixture
@@ -30,185 +23,168 @@ def folder(tmp_path):
 
 HEADERS = {
     "deep": b"[" * 100_000 + b"]" * 100_000,
-    "deep in simulator": b'{"format": 1, "simulator": ' + b'{"a":' * 500 + b"1",
+    "deep in simulator": b'{"simulator": ' + b'{"a":' * 500 + b"1",
     "list": b"[]",
     "null": b"null",
     "empty": b"",
     "bytes": bytes(range(256)),
-    "large number": b'{"format": ' + b"1" * 5_000 + b"}",
-    "infinite": b'{"format": Infinity}',
-    "text": b'{"format": "1"}',
-    "true": b'{"format": true}',
-    "only the format": b'{"format": 1}',
+    "large number": b'{"created": ' + b"1" * 5_000 + b"}",
+    "infinite": b'{"created": Infinity}',
+    "only a date": b'{"created": null}',
 }
 
 
 @pytest.mark.parametrize("content", HEADERS.values(), ids=HEADERS.keys())
 def test_crafted_headers(folder, content):
-    (folder / "bank.json").write_bytes(content)
-    with pytest.raises(CorruptSegmentError, match=r"bank\.json as it was written"):
+    crafted(folder, "objects", "bank rows", 0, content)
+    with pytest.raises(CorruptSegmentError, match=r"store\.db as it was written"):
         Bank(folder)
     assert main(["bank", "inspect", str(folder)]) == 2
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, "sparse"])
-def test_headers_that_are_no_texts(folder, make):
-    path = folder / "bank.json"
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, "sparse", "empty", "text"])
+def test_files_that_are_no_store(folder, make):
+    path = folder / FILE
     path.unlink()
     if make == "sparse":
         with path.open("wb") as file:
             file.truncate(2**40)
+    elif isinstance(make, str):
+        path.write_text({"empty": "", "text": "hello" * 1000}[make])
     else:
         make(path)
-    with pytest.raises(CorruptSegmentError, match=r"bank\.json"):
+    for options in ({}, {"simulator": simulator}):
+        with pytest.raises(CorruptSegmentError, match=r"store\.db"):
+            Bank(folder, **options)
+
+
+ENTRIES = ["version", "simulator", "parameter_names", "shapes", "created", "lost"]
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_entries_of_other_types(folder, name):
+    header = Bank(folder).header
+    for value in (-1, 1.5, [1.5], [[[]]], {"theta": 3}):
+        if (name, value) == ("simulator", {"theta": 3}):
+            continue  # any object describes a simulator
+        crafted(folder, "objects", "bank rows", 0, {**header, name: value})
+        with pytest.raises(CorruptSegmentError, match=r"store\.db"):
+            Bank(folder)
+    del header[name]
+    crafted(folder, "objects", "bank rows", 0, header)
+    with pytest.raises(CorruptSegmentError, match=r"store\.db"):
         Bank(folder)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "version",
-        "simulator",
-        "parameter_names",
-        "shapes",
-        "created",
-        "num_segments",
-        "lost",
-        "id",
-    ],
-)
-def test_entries_of_other_types(folder, name):
-    header = json.loads((folder / "bank.json").read_text())
-    for value in (-1, float("nan"), [1], {"theta": 3}):
-        if (name, value) == ("simulator", {"theta": 3}):
-            continue  # any object describes a simulator
-        (folder / "bank.json").write_text(json.dumps({**header, name: value}))
-        with pytest.raises(CorruptSegmentError, match=r"bank\.json"):
-            Bank(folder)
-
-
-def crafted(path, change):
-    """Write a segment again with changed meta data and the right checksums."""
-    columns, meta = read_segment(path, None)
-    meta = {key: meta[key] for key in meta.keys() - {"shapes", "checksums"}}
-    meta = change(columns, copy.deepcopy(meta)) or meta
-    write_segment(path, columns, meta)
-
-
-def _set(key, value):
-    return lambda columns, meta: {**meta, key: value}
-
-
-def _put(column, value):
-    def change(columns, meta):
-        columns[column][0] = value
-
-    return change
-
-
-def _replace(column, value):
-    def change(columns, meta):
-        columns[column] = value
-
-    return change
-
-
-SEGMENTS = {
-    "negative rows": _set("num_rows", -5),
-    "many rows": _set("num_rows", 10**18),
-    "rows as a text": _set("num_rows", "5"),
-    "no runs": _set("runs", []),
-    "a run of nothing": _set("runs", [{}]),
-    "a run as a number": _set("runs", 3),
-    "a seed of a text": _set("runs", [{"digest": "", "seed": "1", "label": ""}]),
-    "other counts": _set("counts", [0, 5, 0]),
-    "negative counts": _set("counts", [10, -5, 0]),
-    "four counts": _set("counts", [5, 0, 0, 0]),
-    "nested": _set("numbers", json.loads("[" * 300 + "]" * 300)),
-    "an outcome of 7": _put("status", 7),
-    "a run of -1": _put("run", -1),
-    "an index of -1": _put("index", -1),
-    "a short column": _replace("x", np.zeros((2, 2), np.float32)),
-    "a column of float64": _replace("x", np.zeros((5, 2))),
-    "a wide column": _replace("x", np.zeros((5, 1), np.float32)),
-    "a number": _replace("x", np.float32(3)),
-    "a text": _replace("x", np.array([b"abc"] * 5)),
+KNOWN = {"run": "r", "seed": 1, "label": "", "num_rows": 5, "counts": [5, 0, 0]}
+SEGMENTS: dict[str, tuple[str, Any]] = {
+    "negative rows": ("rows", {**KNOWN, "num_rows": -5}),
+    "many rows": ("rows", {**KNOWN, "num_rows": 10**18, "counts": [10**18, 0, 0]}),
+    "rows as a text": ("rows", {**KNOWN, "num_rows": "5"}),
+    "a run as a number": ("rows", {**KNOWN, "run": 3}),
+    "a seed of a text": ("rows", {**KNOWN, "seed": "1"}),
+    "other counts": ("rows", {**KNOWN, "counts": [0, 5, 0]}),
+    "negative counts": ("rows", {**KNOWN, "counts": [10, -5, 0]}),
+    "four counts": ("rows", {**KNOWN, "counts": [5, 0, 0, 0]}),
+    "nested": ("rows", {**KNOWN, "label": json.loads("[" * 300 + "]" * 300)}),
+    "more": ("rows", {**KNOWN, "more": 1}),
+    "no JSON": ("rows", b"\xff\xfe"),
+    "deep": ("rows", b"[" * 100_000 + b"]" * 100_000),
+    "infinite": ("rows", b'{"num_rows": Infinity}'),
+    "an outcome of 7": ("rows/status", bytes([7, 0, 0, 0, 0])),
+    "an index of -1": ("rows/index", np.full(5, -1).tobytes()),
+    "a short column": ("rows/x", np.zeros((2, 2), np.float32).tobytes()),
+    "a column of float64": ("rows/x", np.zeros((5, 2)).tobytes()),
+    "nothing": ("rows/x", b""),
 }
 
 
 @pytest.mark.parametrize("change", SEGMENTS.values(), ids=SEGMENTS.keys())
 def test_crafted_segments(folder, change):
-    path = segment(folder, 2)
-    crafted(path, change)
-    with pytest.raises(CorruptSegmentError, match=str(path)):
+    kind, content = change
+    crafted(folder, "segments", kind, 2, content)
+    with pytest.raises(CorruptSegmentError, match=str(folder)):
         Bank(folder).columns("x", "status", "seed", "index")
-    assert any(str(path) in line for line in Bank(folder).verify())
+    (line,) = Bank(folder).verify()
+    assert line.startswith(f"{folder / FILE}: ")
 
 
-def _dataset(**options):
-    def change(file):
-        del file["x"]
-        file.create_dataset("x", **options)
-
-    return change
-
-
-def _link(link):
-    def change(file):
-        del file["x"]
-        file["x"] = link(file)
-
-    return change
-
-
-def _huge(file):
-    del file["x"]
-    file.create_dataset("x", shape=(5, 10**15), dtype="f4", chunks=(1, 10**4))
-
-
-def _meta_of(text):
-    def change(file):
-        del file["meta"]
-        file.create_dataset("meta", data=np.frombuffer(text, np.uint8))
-        file.attrs["sha256"] = hashlib.sha256(text).hexdigest()
-
-    return change
-
-
-FILES = {
-    "another file": _link(lambda file: h5py.ExternalLink("/etc/passwd", "/x")),
-    "itself": _link(lambda file: h5py.SoftLink("/x")),
-    "a name within": _link(lambda file: h5py.SoftLink("/theta")),
-    "a group": lambda file: (file.__delitem__("x"), file.create_group("x")),
-    "outside": _dataset(
-        shape=(5, 2), dtype="f4", external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)]
-    ),
-    "compressed": _dataset(data=np.zeros((5, 2), "f4"), compression="gzip"),
-    "objects": _dataset(data=[["a", "b"]] * 5, dtype=h5py.string_dtype()),
-    "nothing": _dataset(data=h5py.Empty("f4")),
-    "huge": _huge,
-    "deep": _meta_of(b"[" * 100_000 + b"]" * 100_000),
-    "infinite": _meta_of(b'{"num_rows": Infinity}'),
-    "no JSON": _meta_of(b"\xff\xfe"),
-    "checksum of numbers": lambda file: file.attrs.__setitem__("sha256", [1, 2]),
-    "no checksum": lambda file: file.attrs.__delitem__("sha256"),
+LARGE = "x'" + "00" * 1000 + "'"
+STATEMENTS = {
+    "a text": "UPDATE segments SET content = 'abc' WHERE kind = 'rows/x'",
+    "a number": "UPDATE segments SET content = 7 WHERE kind = 'rows'",
+    "another content": f"UPDATE segments SET content = {LARGE} WHERE kind = 'rows/x'",
+    "no checksum": "UPDATE segments SET digest = x'' WHERE kind = 'rows/x'",
+    "a checksum of text": "UPDATE segments SET digest = 'abc' WHERE kind = 'rows/x'",
+    "another name": "PRAGMA application_id = 7",
+    "no length": "DELETE FROM objects WHERE kind = 'segments of rows'",
+    "no header": "UPDATE objects SET content = 'a' WHERE kind = 'bank rows'",
+    "a trigger": "CREATE TRIGGER t AFTER INSERT ON segments BEGIN DELETE FROM segments;"
+    " END",
+    "a view": "CREATE VIEW v AS SELECT * FROM segments",
+    "another table": "CREATE TABLE t (a)",
+    "an index": "CREATE INDEX i ON segments (upper(kind))",
+    "no table": "DROP TABLE segments",
 }
 
 
-@pytest.mark.parametrize("change", FILES.values(), ids=FILES.keys())
-def test_files_that_only_hdf5_can_make(folder, change):
-    path = segment(folder, 2)
-    with h5py.File(path, "r+") as file:
-        change(file)
-    with pytest.raises(CorruptSegmentError, match=str(path)):
+@pytest.mark.parametrize("statement", STATEMENTS.values(), ids=STATEMENTS.keys())
+def test_what_anybody_can_do_with_sqlite(folder, statement):
+    execute(folder, statement)
+    if "segments of rows" in statement:  # as if none had been written
+        assert len(Bank(folder)) == 0
+        return
+    with pytest.raises(CorruptSegmentError, match=str(folder)):
         Bank(folder).columns("x")
-    assert any(str(path) in line for line in Bank(folder).verify())
 
 
-def test_a_flipped_bit_or_a_cut_gives_the_rows_or_the_error(folder):
-    path = segment(folder, 2)
+def test_a_view_in_place_of_a_table_is_not_read(folder):
+    execute(folder, "DROP TABLE segments")
+    endless = (
+        "CREATE VIEW segments AS WITH RECURSIVE n(kind) AS (SELECT 1 UNION ALL SELECT "
+        "kind + 1 FROM n) SELECT kind, kind AS number, x'' AS content, x'' AS digest "
+        "FROM n"
+    )
+    execute(folder, endless)
+    with pytest.raises(CorruptSegmentError, match="tables that are not those"):
+        Bank(folder)
+
+
+@pytest.mark.parametrize("name", [FILE, "store.db-wal", "store.db-shm", "store.lock"])
+def test_links_lead_nowhere(folder, tmp_path, name):
+    mine = tmp_path / "mine.txt"
+    for content in ("", "precious" * 1000):
+        mine.write_text(content)
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(mine)
+        with (
+            pytest.raises(OSError, match="got a link to"),
+            Bank(folder, simulator=simulator) as bank,
+        ):
+            bank.append(Simulations(*[torch.ones(1, 2)] * 3), seed=5)
+        assert mine.read_text() == content
+
+
+@pytest.mark.parametrize("name", ["store.db-journal", "store.lock-journal"])
+def test_a_journal_of_somebody_else_is_not_played_back(folder, tmp_path, name):
+    # One that names a file to be removed is removed with that file by SQLite.
+    (tmp_path / "mine.txt").write_text("precious")
+    super_journal = str(tmp_path / "mine.txt").encode()
+    (folder / name).write_bytes(b"\xd9\xd5\x05\xf9 \xa1c\xd7" + super_journal)
+    with (
+        pytest.raises(CorruptSegmentError, match="journal, which none leaves"),
+        Bank(folder, simulator=simulator) as bank,
+    ):
+        bank.append(Simulations(*[torch.ones(1, 2)] * 3), seed=5)
+    assert (tmp_path / "mine.txt").exists()
+    assert (folder / name).exists()
+
+
+@pytest.mark.parametrize("first", range(3))
+def test_a_flipped_bit_or_a_cut_gives_the_rows_or_the_error(folder, first):
+    path = folder / FILE
     expected, content = Bank(folder).read(), path.read_bytes()
-    for place in range(3, len(content), 997):
+    for place in range(3 + 331 * first, len(content), 997):
         flipped = bytearray(content)
         flipped[place] ^= 1 << place % 8
         for damaged in (bytes(flipped), content[:place]):
@@ -217,16 +193,19 @@ def test_a_flipped_bit_or_a_cut_gives_the_rows_or_the_error(folder):
                 assert torch.equal(Bank(folder).read().x, expected.x)
 
 
-def test_all_of_the_structure_has_checksums(folder):
-    # The older kind of file has none, and HDF5 reads some flipped ones for ever.
-    with segment(folder, 1).open("rb") as file:
-        assert file.read(9) == b"\x89HDF\r\n\x1a\n\x02"
+def test_the_log_of_another_file_is_noticed(folder, tmp_path):
+    other = Bank(filled(tmp_path / "other"), simulator=simulator)
+    other.append(Simulations(*[torch.ones(5, k) for k in (2, 1, 2)]), seed=8)
+    log = (other.path / "store.db-wal").read_bytes()
+    assert len(log) > 1000
+    (folder / "store.db-wal").write_bytes(log)
+    with pytest.raises(CorruptSegmentError):
+        Bank(folder).read()
 
 
 def test_control_characters_do_not_reach_the_terminal(folder, capsys):
-    header = json.loads((folder / "bank.json").read_text())
-    header["created"] = "\x1b[2J\ud800"
-    (folder / "bank.json").write_text(json.dumps(header))
+    header = {**Bank(folder).header, "created": "\x1b[2J\ud800"}
+    crafted(folder, "objects", "bank rows", 0, header)
     assert main(["bank", "inspect", str(folder)]) == 0
     assert r"created: '\x1b[2J\ud800'" in capsys.readouterr().out
 

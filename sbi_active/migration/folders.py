@@ -1,0 +1,157 @@
+"""A folder of release 0.1, a bank's or a campaign's, as the one file of today."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sbi_active.campaign.storage.codec import decode, encode
+from sbi_active.campaign.storage.damage import DamagedCampaignError
+from sbi_active.campaign.storage.directory import BELIEF, LOG, STATE
+from sbi_active.campaign.storage.manifest import FOR_PEOPLE, SCHEMA, write_manifest
+from sbi_active.migration.segments import copy_bank
+from sbi_active.simulation.bank.files import TEMPORARY, synchronize
+from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
+from sbi_active.simulation.bank.store import Store
+
+BEFORE = "version-1"  # gets the files of before
+#: What release 0.1 wrote into a folder.
+OWN = re.compile(
+    r"campaign\.json(\.copy)?|trials\.jsonl|trials\.damaged(-\d+)?|state\.bin(\.damaged)?"
+    r"|belief-[0-9a-f]+\.bin|simulations(-\d+)?|writer\.(lock|json)|bank\.json|segments"
+)
+#: Entries of a state that its first writers did not have.
+ADDED = {"draws": {}, "batches": [], "num_simulated": 0}
+
+
+def migrate(folder: Path) -> dict[str, int]:
+    """Bring a bank, several in a folder, or a campaign of release 0.1 up to date.
+
+    The files of before are kept, in a folder "version-1" within. A migration that was
+    cut short is done again.
+
+    Args:
+        folder: Of the campaign or bank, or that of ``CampaignOptions(bank=)``.
+
+    Returns:
+        Number of rows by bank; of a campaign also the number of its events, as "log".
+
+    Raises:
+        ValueError: If there is nothing of release 0.1 in it.
+        DamagedCampaignError: If the log or the manifest is not what was written.
+        CorruptSegmentError: If a bank is not.
+        ImportError: If there are rows, and no h5py to read them.
+    """
+    banks = _banks(folder)
+    is_campaign = (folder / "campaign.json").exists()
+    if not (banks or is_campaign):
+        raise ValueError(
+            f"expected a bank or campaign of release 0.1; got {folder} without one; "
+            "name its folder"
+        )
+    found: dict[str, int] = {}
+    if not (folder / NAME).exists():
+        made = folder / f"{TEMPORARY}{BEFORE}"
+        shutil.rmtree(made, ignore_errors=True)
+        if is_campaign:
+            found["log"] = _copy_campaign(folder, made)
+        store = Store(made, make=True)
+        for name, place in banks.items():
+            found[name] = copy_bank(place, store, name)
+        store.close()
+        for name in (FOR_PEOPLE, NAME):
+            if (made / name).exists():
+                os.replace(made / name, folder / name)
+        synchronize(folder)
+        shutil.rmtree(made)
+    (folder / BEFORE).mkdir(exist_ok=True)
+    within = [place.relative_to(folder) for place in banks.values() if place != folder]
+    tops = {place.parts[0] for place in within}
+    for path in [*folder.iterdir()]:
+        if OWN.fullmatch(path.name) or path.name in tops:
+            os.replace(path, folder / BEFORE / path.name)
+    synchronize(folder)
+    return found
+
+
+def _banks(folder: Path) -> dict[str, Path]:
+    """Return the banks in a folder by the names that they have in a store."""
+    found = {}
+    for path in sorted(folder.glob("**/bank.json")):
+        *above, name = ("rows", *path.relative_to(folder).parts[:-1])
+        change = re.fullmatch(r"simulations-(\d+)", above[-1] if above else "")
+        if BEFORE not in above and len(above) < 3:
+            found[f"{name}-changed-{change[1]}" if change else name] = path.parent
+    return found
+
+
+def _copy_campaign(folder: Path, made: Path) -> int:
+    manifest = _manifest(folder)
+    write_manifest(made, {"drawn": {}, **manifest, "schema": SCHEMA})
+    store = Store(made, "campaign")
+    entries = _entries(folder / "trials.jsonl")
+    for entry in entries:
+        with store.writing((EVENTS, LOG)) as number:
+            store.put(EVENTS, LOG, number, entry)
+    saved = _content(folder / "state.bin")
+    if saved is not None:
+        state = {**ADDED, **decode(saved, known={})}
+        state.pop("digest", None)
+        with store.writing():
+            if state["belief"]:
+                belief = _content(folder / state["belief"]) or b""
+                state["belief"] = hashlib.sha256(belief).hexdigest()
+                store.put(OBJECTS, BELIEF, 0, belief)
+            store.put(OBJECTS, STATE, 0, encode(state, known={}))
+    store.close()
+    return len(entries)
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / "campaign.json"
+    for place in (path, folder / "campaign.json.copy"):
+        try:
+            manifest = json.loads(place.read_bytes())
+            digest = manifest.pop("sha256")
+            text = json.dumps(manifest, sort_keys=True)
+            if digest == hashlib.sha256(text.encode()).hexdigest():
+                if manifest.get("schema") == 1:
+                    return manifest
+                raise ValueError(
+                    f"expected a campaign of schema 1; got {manifest.get('schema')} in "
+                    f"{place}; use the release of sbi-active that wrote it"
+                )
+        except (OSError, KeyError, AttributeError, TypeError, json.JSONDecodeError):
+            continue
+    raise DamagedCampaignError(path, "a manifest with another checksum")
+
+
+def _entries(path: Path) -> list[Mapping[str, Any]]:
+    """Return the lines of a log; a last one that was not finished is none."""
+    content = path.read_bytes() if path.exists() else b""
+    entries = []
+    for number, line in enumerate(content[: content.rfind(b"\n") + 1].splitlines(), 1):
+        head, _, tail = line.rpartition(b', "crc": "')
+        text = head + b"}"
+        if tail != f'{zlib.crc32(text):08x}"}}'.encode():
+            raise DamagedCampaignError(
+                path, f"line {number} with another checksum: repair it by release 0.1"
+            )
+        entries.append(json.loads(text))
+    return entries
+
+
+def _content(path: Path) -> bytes | None:
+    """Return what a file holds after its checksum; None where it is not that."""
+    if not path.exists():
+        return None
+    digest, _, content = path.read_bytes().partition(b"\n")
+    same = hashlib.sha256(content).hexdigest().encode() == digest
+    return content if same else None
