@@ -254,7 +254,9 @@ class Bank:
                 over all rows. None reads everything into memory.
         """
         names = ["theta", "action", "x", "status"]
-        return Simulations(*self._rows.gather(names, positions(rows, len(self))))
+        found = self._rows.gather(names, positions(rows, len(self)))
+        theta, action, x, status = found
+        return Simulations(theta, action, x, status)
 
     def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
         """Yield all rows in order, at most ``size`` at a time.

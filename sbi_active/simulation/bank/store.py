@@ -28,7 +28,7 @@ from sbi_active.simulation.bank.damage import (
     parsed,
     require,
 )
-from sbi_active.simulation.bank.files import TEMPORARY, synchronize
+from sbi_active.simulation.bank.files import TEMPORARY, keep_aside, synchronize
 from sbi_active.simulation.bank.sqlite import (
     LOCK,
     NAME,
@@ -119,7 +119,7 @@ class Store:
                     self._depth -= 1
                 if self._is_alone and not self._depth:
                     self._disconnect()
-            except sqlite3.Error as error:
+            except (sqlite3.Error, UnicodeDecodeError) as error:  # it quotes the file
                 if "locked" in str(error):
                     raise LockedError(self.folder, *self._holder()) from error
                 raise explained(error, self.path, self._what) from error
@@ -136,12 +136,9 @@ class Store:
             wrong = self._structure(table) if table == OBJECTS else []
             require(self.path, not wrong, f"no {where} ({wrong})")
             return None
-        content, digest = found
-        is_bytes = type(content) is bytes and type(digest) is bytes
-        require(self.path, is_bytes, f"{where} of another type")
-        same = digest == self._digest(table, kind, number, content)
+        same = self._is_whole(table, (kind, number, *found))
         require(self.path, same, f"{where} with another checksum")
-        return content
+        return found[0]
 
     def size(self, table: str, kind: str, number: int = 0) -> int | None:
         """Return the bytes of a record without reading it; None where there is none."""
@@ -336,11 +333,7 @@ class Store:
                             copy.execute(insert, row)
         finished(copy, fresh)
         self.close()
-        number, kept = 1, self.path.with_name(f"{NAME}.damaged")
-        while kept.exists():
-            number += 1
-            kept = self.path.with_name(f"{NAME}.damaged-{number}")
-        self.path.rename(kept)
+        keep_aside(self.path)
         os.replace(fresh, self.path)
         synchronize(self.folder)
         for (table, series), length in lengths.items():
@@ -350,10 +343,9 @@ class Store:
 
     def _is_whole(self, table: str, row: tuple[Any, ...]) -> bool:
         kind, number, content, digest = row
-        types = type(kind), type(number), type(content)
-        return types == (str, int, bytes) and (
-            digest == self._digest(table, kind, number, content)
-        )
+        if (type(kind), type(number), type(content)) != (str, int, bytes):
+            return False
+        return digest == self._digest(table, kind, number, content)
 
     def _digest(self, table: str, kind: str, number: int, content: Any) -> bytes:
         digest = hashlib.sha256(f"{self._id} {table} {kind} {number} ".encode())
