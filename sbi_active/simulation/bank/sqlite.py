@@ -37,6 +37,7 @@ PATIENCE = 10.0
 SETTINGS = (
     "trusted_schema = OFF",
     "cell_size_check = ON",
+    "journal_mode = WAL",
     "synchronous = FULL",
     "secure_delete = OFF",
     f"journal_size_limit = {64 * 2**20}",
