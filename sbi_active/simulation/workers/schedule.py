@@ -105,7 +105,8 @@ class Schedule:
 
     def restore(self, index: Tensor, x: Tensor, status: Tensor) -> int:
         """Take rows as finished that a store holds; return how many."""
-        known = status != Outcome.MISSING  # a fault is tried again
+        known = (status != Outcome.MISSING).nonzero()[:, 0]  # a fault is tried again
+        known = known[index[known].argsort()]  # several workers store them in any order
         index, x, status = index[known], x[known], status[known]
         if len(index):
             self._settle(index, x.to(torch.float32, copy=True), status.to(torch.int8))

@@ -57,7 +57,7 @@ class MemoryStore:
         rows = self.rows.get(run)
         if not rows:
             return None
-        index = torch.tensor(sorted(rows))
+        index = torch.tensor([*rows])  # in the order in which they were finished
         x = torch.stack([rows[int(i)][0] for i in index])
         return index, x, torch.tensor([rows[int(i)][1] for i in index])
 
@@ -185,8 +185,13 @@ def test_a_store_is_read_before_anything_is_simulated(rows):
         assert torch.equal(again.x, expected)
         assert torch.equal(again.status, first.status)
 
-        # Any part of them may be lacking.
+        # They come in any order, as several workers finish them.
         run = run_digest(3, *rows)
+        store.rows[run] = dict(reversed(store.rows[run].items()))
+        again = simulate(never, *rows, seed=3, store=store)
+        assert torch.equal(again.x, expected)
+
+        # Any part of them may be lacking.
         for row in (0, 5, 256, 300, 301, 699):
             del store.rows[run][row]
         some = simulate(simulator, *rows, seed=3, store=store, num_workers=2)
