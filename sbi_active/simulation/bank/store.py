@@ -108,8 +108,8 @@ class Store:
         """
         with self._guard:
             try:
-                is_open = self._connection is not None
-                if not is_open or not self.held and self._is_replaced():
+                is_same = self.held or self._found()[:1] == self._signature[:1]
+                if self._connection is None or not is_same:
                     self._open()
                 assert self._connection is not None
                 self._depth += 1
@@ -212,19 +212,23 @@ class Store:
         with self._guard:
             self.acquire()
             with self.reading() as connection:
-                same = self._found() == self._signature
-                require(self.path, same, "another file; nothing was written to it now")
-                connection.execute("BEGIN IMMEDIATE")
+                is_inner = connection.in_transaction  # of one that writes more
+                if not is_inner:
+                    same = self._found() == self._signature
+                    reason = "another file; nothing was written to it now"
+                    require(self.path, same, reason)
+                    connection.execute("BEGIN IMMEDIATE")
                 try:
                     number = 0 if series is None else self.length(*series) + 1
                     yield number
                     if series is not None:
                         key = "{} of {}".format(*series)
                         self.put(OBJECTS, key, 0, {"length": number})
-                    connection.execute("COMMIT")
-                    self._signature = self._found()
+                    if not is_inner:
+                        connection.execute("COMMIT")
+                        self._signature = self._found()
                 finally:
-                    if connection.in_transaction:
+                    if not is_inner and connection.in_transaction:
                         connection.execute("ROLLBACK")
 
     def delete(self, table: str, kind: str, *, first: int = 0) -> None:
@@ -253,9 +257,8 @@ class Store:
                 for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
                     left.unlink(missing_ok=True)
                 assert self._connection is not None
-                # Who writes need not outlive a loss of power.
                 self._connection.execute("PRAGMA synchronous = OFF")
-                # It may be taken to repair what cannot be written to.
+                # Only a note; and a file that cannot be written to may be repaired.
                 with suppress(CorruptSegmentError), self.writing():
                     holder = {"pid": os.getpid(), "host": platform.node()}
                     self.put(OBJECTS, "writer", 0, holder)
@@ -268,13 +271,13 @@ class Store:
     def close(self) -> None:
         """Let others write. The next call opens the file again."""
         with self._guard:
-            if self._lock is not None and self._connection is not None:
+            lock, self._lock = self._lock, None
+            if lock is not None and self._connection is not None:
                 with suppress(sqlite3.Error):  # a full disk must not keep the lock
                     self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._disconnect()
-            if self._lock is not None:
-                self._lock.close()
-                self._lock = None
+            if lock is not None:
+                lock.close()
 
     def _disconnect(self) -> None:
         if self._connection is not None:
@@ -358,9 +361,6 @@ class Store:
             state = self.path.stat()
             return state.st_ino, state.st_size, state.st_mtime_ns
         return ()
-
-    def _is_replaced(self) -> bool:
-        return self._found()[:1] != self._signature[:1]
 
     def _open(self) -> None:
         self._disconnect()
