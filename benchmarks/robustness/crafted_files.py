@@ -97,8 +97,10 @@ def entry(case: tuple[str, int]) -> None:
     same_or_refused(whole)
 
 
-RECORDS = dict.fromkeys(("state", "belief", "campaign"), "objects")
-RECORDS["log"] = "events"
+RECORDS: dict[str, str] = {
+    **dict.fromkeys(("state", "belief", "campaign"), "objects"),
+    "log": "events",
+}
 
 
 @ATTACKS.add(

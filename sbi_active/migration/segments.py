@@ -107,17 +107,16 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
 def _plain(h5py: Any, file: Any, name: str, path: Path) -> np.ndarray:
     """Return a dataset: plain numbers within this very file, no larger than it."""
     is_here = isinstance(file.get(name, getlink=True), h5py.HardLink)
-    dataset = file[name] if is_here else None
-    plan = None if dataset is None else dataset.id.get_create_plist()
+    require(path, is_here, f"{name!r} in another place")
+    dataset = file[name]
+    plan = dataset.id.get_create_plist()
     is_plain = (
-        plan is not None
-        and not plan.get_external_count()
+        not plan.get_external_count()
         and not plan.get_nfilters()
         and dataset.dtype.kind in "iuf"
         and dataset.nbytes <= path.stat().st_size
     )
     require(path, is_plain, f"{name!r} of another kind")
-    assert dataset is not None
     return dataset[()]
 
 

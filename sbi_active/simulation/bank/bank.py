@@ -254,7 +254,9 @@ class Bank:
                 over all rows. None reads everything into memory.
         """
         names = ["theta", "action", "x", "status"]
-        return Simulations(*self._rows.gather(names, positions(rows, len(self))))
+        found = self._rows.gather(names, positions(rows, len(self)))
+        theta, action, x, status = found
+        return Simulations(theta, action, x, status)
 
     def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
         """Yield all rows in order, at most ``size`` at a time.
@@ -334,10 +336,11 @@ class Bank:
         rows = np.flatnonzero(fresh & ~mask[index])
         row_bytes = sum(column[:1].nbytes for column in columns.values())
         size = max(1, SEGMENT_BYTES // max(row_bytes, 1))
-        for start in range(0, len(rows), size):
-            some = rows[start : start + size]
-            part = {key: column[some] for key, column in columns.items()}
-            write_segment(self._store, self._rows.name, run, part)
+        with self._store.writing():
+            for start in range(0, len(rows), size):
+                some = rows[start : start + size]
+                part = {key: column[some] for key, column in columns.items()}
+                write_segment(self._store, self._rows.name, run, part)
         self._stored = name, _mask(mask, index)
 
     def _require_same_simulator(self, mine: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from pathlib import Path
 
 TEMPORARY = ".writing-"
@@ -33,6 +34,18 @@ def write_file(path: Path, content: bytes) -> None:
             "stored before is whole",
             str(path),
         ) from error
+
+
+def keep_aside(path: Path) -> None:
+    """Keep a file under a name ending in ".damaged" too, beside those of before."""
+    number, copy = 1, path.with_name(f"{path.name}.damaged")
+    while copy.exists():
+        number += 1
+        copy = path.with_name(f"{path.name}.damaged-{number}")
+    try:
+        os.link(path, copy)
+    except OSError:  # a file system without
+        shutil.copy2(path, copy)
 
 
 def synchronize(folder: Path) -> None:

@@ -81,8 +81,8 @@ class Rows:
         try:
             numbers = range(1, self.store.length(SEGMENTS, self.name) + 1)
             lost = self.header["lost"]
-        except CorruptSegmentError as error:
-            return {0: error.reason}
+        except CorruptSegmentError:  # which is a problem of the store
+            return {}
         for number in numbers:
             try:
                 if number not in lost:

@@ -37,6 +37,7 @@ PATIENCE = 10.0
 SETTINGS = (
     "trusted_schema = OFF",
     "cell_size_check = ON",
+    "journal_mode = WAL",
     "synchronous = FULL",
     "secure_delete = OFF",
     f"journal_size_limit = {64 * 2**20}",
@@ -62,9 +63,9 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
         CorruptSegmentError: If there is a journal, which SQLite would write back, here
             and to whatever else it names.
     """
-    require_no_link(path)
     journal = path.with_name(f"{path.name}-journal")
     require(path, not os.path.lexists(journal), f"{journal.name}, which none leaves")
+    require_no_link(path)
     return sqlite3.connect(
         f"file:{quote(str(path.absolute()))}?mode={mode}",
         uri=True,
@@ -88,6 +89,9 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
         ValueError: If there is none, or one of another format.
         CorruptSegmentError: If it is no store.
     """
+    log = path.with_name(f"{NAME}-wal")
+    for file in (path, log, path.with_name(f"{NAME}-shm")):
+        require_no_link(file)
     try:
         size = regular_size(path)
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -97,9 +101,6 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
             f"expected a {what}; got no {path}; {advice(path.parent, make)}"
         ) from error
     require(path, size > 0, "an empty file")
-    log = path.with_name(f"{NAME}-wal")
-    for beside in (log, path.with_name(f"{NAME}-shm")):
-        require_no_link(beside)
     has_log = log.exists() and log.stat().st_size
     last = ("rw", "locking_mode = EXCLUSIVE") if has_log else ("ro&immutable=1", "")
     for mode, setting in (("rw", ""), ("ro", ""), last):
@@ -193,7 +194,7 @@ def finished(connection: sqlite3.Connection, path: Path) -> None:
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
-def explained(error: sqlite3.Error, path: Path, what: str) -> Exception:
+def explained(error: Exception, path: Path, what: str) -> Exception:
     """Return an error of SQLite as one of this library."""
     text = str(error)
     if isinstance(error, sqlite3.DataError) or "too big" in text:

@@ -28,7 +28,7 @@ from sbi_active.simulation.bank.damage import (
     parsed,
     require,
 )
-from sbi_active.simulation.bank.files import TEMPORARY, synchronize
+from sbi_active.simulation.bank.files import TEMPORARY, keep_aside, synchronize
 from sbi_active.simulation.bank.sqlite import (
     LOCK,
     NAME,
@@ -108,8 +108,8 @@ class Store:
         """
         with self._guard:
             try:
-                is_open = self._connection is not None
-                if not is_open or not self.held and self._is_replaced():
+                is_same = self.held or self._found()[:1] == self._signature[:1]
+                if self._connection is None or not is_same:
                     self._open()
                 assert self._connection is not None
                 self._depth += 1
@@ -119,7 +119,7 @@ class Store:
                     self._depth -= 1
                 if self._is_alone and not self._depth:
                     self._disconnect()
-            except sqlite3.Error as error:
+            except (sqlite3.Error, UnicodeDecodeError) as error:  # it quotes the file
                 if "locked" in str(error):
                     raise LockedError(self.folder, *self._holder()) from error
                 raise explained(error, self.path, self._what) from error
@@ -136,12 +136,9 @@ class Store:
             wrong = self._structure(table) if table == OBJECTS else []
             require(self.path, not wrong, f"no {where} ({wrong})")
             return None
-        content, digest = found
-        is_bytes = type(content) is bytes and type(digest) is bytes
-        require(self.path, is_bytes, f"{where} of another type")
-        same = digest == self._digest(table, kind, number, content)
+        same = self._is_whole(table, (kind, number, *found))
         require(self.path, same, f"{where} with another checksum")
-        return content
+        return found[0]
 
     def size(self, table: str, kind: str, number: int = 0) -> int | None:
         """Return the bytes of a record without reading it; None where there is none."""
@@ -215,19 +212,23 @@ class Store:
         with self._guard:
             self.acquire()
             with self.reading() as connection:
-                same = self._found() == self._signature
-                require(self.path, same, "another file; nothing was written to it now")
-                connection.execute("BEGIN IMMEDIATE")
+                is_inner = connection.in_transaction  # of one that writes more
+                if not is_inner:
+                    same = self._found() == self._signature
+                    reason = "another file; nothing was written to it now"
+                    require(self.path, same, reason)
+                    connection.execute("BEGIN IMMEDIATE")
                 try:
                     number = 0 if series is None else self.length(*series) + 1
                     yield number
                     if series is not None:
                         key = "{} of {}".format(*series)
                         self.put(OBJECTS, key, 0, {"length": number})
-                    connection.execute("COMMIT")
-                    self._signature = self._found()
+                    if not is_inner:
+                        connection.execute("COMMIT")
+                        self._signature = self._found()
                 finally:
-                    if connection.in_transaction:
+                    if not is_inner and connection.in_transaction:
                         connection.execute("ROLLBACK")
 
     def delete(self, table: str, kind: str, *, first: int = 0) -> None:
@@ -256,9 +257,8 @@ class Store:
                 for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
                     left.unlink(missing_ok=True)
                 assert self._connection is not None
-                # Who writes need not outlive a loss of power.
                 self._connection.execute("PRAGMA synchronous = OFF")
-                # It may be taken to repair what cannot be written to.
+                # Only a note; and a file that cannot be written to may be repaired.
                 with suppress(CorruptSegmentError), self.writing():
                     holder = {"pid": os.getpid(), "host": platform.node()}
                     self.put(OBJECTS, "writer", 0, holder)
@@ -271,13 +271,13 @@ class Store:
     def close(self) -> None:
         """Let others write. The next call opens the file again."""
         with self._guard:
-            if self._lock is not None and self._connection is not None:
+            lock, self._lock = self._lock, None
+            if lock is not None and self._connection is not None:
                 with suppress(sqlite3.Error):  # a full disk must not keep the lock
                     self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._disconnect()
-            if self._lock is not None:
-                self._lock.close()
-                self._lock = None
+            if lock is not None:
+                lock.close()
 
     def _disconnect(self) -> None:
         if self._connection is not None:
@@ -336,11 +336,7 @@ class Store:
                             copy.execute(insert, row)
         finished(copy, fresh)
         self.close()
-        number, kept = 1, self.path.with_name(f"{NAME}.damaged")
-        while kept.exists():
-            number += 1
-            kept = self.path.with_name(f"{NAME}.damaged-{number}")
-        self.path.rename(kept)
+        keep_aside(self.path)
         os.replace(fresh, self.path)
         synchronize(self.folder)
         for (table, series), length in lengths.items():
@@ -350,10 +346,9 @@ class Store:
 
     def _is_whole(self, table: str, row: tuple[Any, ...]) -> bool:
         kind, number, content, digest = row
-        types = type(kind), type(number), type(content)
-        return types == (str, int, bytes) and (
-            digest == self._digest(table, kind, number, content)
-        )
+        if (type(kind), type(number), type(content)) != (str, int, bytes):
+            return False
+        return digest == self._digest(table, kind, number, content)
 
     def _digest(self, table: str, kind: str, number: int, content: Any) -> bytes:
         digest = hashlib.sha256(f"{self._id} {table} {kind} {number} ".encode())
@@ -366,9 +361,6 @@ class Store:
             state = self.path.stat()
             return state.st_ino, state.st_size, state.st_mtime_ns
         return ()
-
-    def _is_replaced(self) -> bool:
-        return self._found()[:1] != self._signature[:1]
 
     def _open(self) -> None:
         self._disconnect()

@@ -255,6 +255,43 @@ def test_the_lock_goes_with_its_process(bank):
         other.close()
 
 
+def test_a_forked_child_reads_and_has_no_right_to_write(bank):
+    rows = simulate(simulator, *draw(10), seed=0, store=bank)
+    reader = Bank(bank.path)
+    assert len(reader) == 10
+
+    def work():
+        assert same(reader.read(), rows)
+        assert same(bank.read(), rows)
+        with pytest.raises(LockedError, match=f"got process {os.getppid()} on"):
+            bank.append(rows, seed=1)
+
+    with forked(work) as is_running:
+        assert is_running.join() == 0
+    assert bank.append(rows, seed=2) == 10
+    with pytest.raises(LockedError):  # the child's end gave nothing back
+        Bank(bank.path, simulator=simulator).append(rows, seed=3)
+    bank.close()
+
+    def write():
+        with bank:
+            assert bank.append(rows, seed=4) == 10
+
+    with forked(write) as is_running:
+        assert is_running.join() == 0
+    assert len(reader) == len(bank) == 30
+
+
+def test_what_is_stored_is_synchronized_with_the_disk(bank):
+    bank.append(simulate(simulator, *draw(10), seed=0), seed=0)
+    with bank._store.reading() as connection:
+        found = [
+            connection.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("synchronous", "journal_mode", "trusted_schema")
+        ]
+    assert found == [2, "wal", 0]  # 2: an fsync at each commit
+
+
 def test_names_and_settings_are_in_the_header(tmp_path):
     model = SimulatorModel(
         simulator, noise=GaussianNoise(0.5), parameter_names=["mass", "friction"]
