@@ -56,7 +56,7 @@ def digest(folder: Path) -> str:
     Args:
         folder: Of the campaign.
     """
-    with contextlib.suppress(OSError, ValueError), _stored(folder) as store:
+    with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
         num = store.length(EVENTS, LOG)
         last = store.get(EVENTS, LOG, num) if num else None
         parts = (str(num).encode(), last or b"", store.get(OBJECTS, STATE) or b"")

@@ -258,10 +258,12 @@ class RivalSet:
     def search(self, key: ModelKey) -> Found:
         """Return the modes of a rival, from where smaller ones ended."""
         rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
-        if key in self.best_fits:
-            return _searched(rival, self.best_fits[key][None], KNOWN, seed)
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
+        if key in self.best_fits:
+            # Of the bare model every mode counts, of others what is beside the best.
+            near = self.best_fits[key][None]
+            how = THOROUGH if key == ModelKey() else KNOWN
         how = how if self.is_smooth else ROUGH
         return _searched(rival, near, how, seed)
 

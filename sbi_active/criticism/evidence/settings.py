@@ -45,8 +45,7 @@ def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
         is_smooth: Whether derivatives mean anything; a mode is wider than they say
             otherwise, and a likelihood higher than at any that was found.
     """
-    # As many effective draws as are kept.
-    own = Settings(plenty=2.0, num_simulations=3 * MOST * num_trials)
+    own = Settings(plenty=4.0, num_simulations=3 * MOST * num_trials)
     if not is_bare:
         own = Settings(
             num_effective=50.0,
