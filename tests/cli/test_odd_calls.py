@@ -360,6 +360,6 @@ def test_stopped_while_it_simulates(camp, sent):
             break
         time.sleep(0.1)
     process.send_signal(sent)
-    _, error = process.communicate(timeout=30)
+    _, error = process.communicate(timeout=120)
     assert process.returncode == (130 if sent == signal.SIGINT else -signal.SIGTERM)
     assert "Traceback" not in error

@@ -168,6 +168,7 @@ def test_another_process_may_write_between_two_requests(server):
 def test_an_interrupt_ends_the_session(server):
     assert server.says({"command": "status"})["answer"]["trials"] == []
     server.process.send_signal(signal.SIGINT)
+    server.process.wait(timeout=60)  # before its input ends, which ends it too
     status, error = server.ends()
     assert status == 130
     assert error.splitlines()[-1].startswith("sbi-active: interrupted")
