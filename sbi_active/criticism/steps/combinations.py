@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import comb
 from typing import Any
 
@@ -72,7 +73,7 @@ def grow(
     return found
 
 
-def log_prior(names: tuple[str, ...], prior: dict[str, float]) -> float:
+def log_prior(names: tuple[str, ...], prior: Mapping[str, float]) -> float:
     r"""Return the log prior probability of a set of k of the n effects.
 
     In proportion to the mean of its effects' probabilities alone, :math:`p_i`. Over all

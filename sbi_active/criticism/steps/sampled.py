@@ -99,7 +99,7 @@ class Sampled:
             value = self.log_evidence(key)
             known = [part for part in key.parts if part in self.rivals.fits]
             if value > max(map(self.log_evidence, known)) + THRESHOLD:
-                found[key] = value + log_prior(key.effects, dict(prior))
+                found[key] = value + log_prior(key.effects, prior)
         return found
 
     def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
