@@ -206,6 +206,9 @@ class Criticism:
                     return self.misfit()
             self._found = Sampled(self.rivals, groups, self._linear)
             timed = self.rivals.measurements.is_sequence
+            jumps = not self.rivals.is_smooth or self.rivals.roughness.any()
+            if jumps and not self._is_large:  # which no linear model follows
+                timed = False
             if timed and self._linear is not None and self._misfit is None:
                 self._found = BySensor(self._linear, self.rivals, groups)
             self._is_searched = True

@@ -66,8 +66,8 @@ def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
     rough, around = local_roughness(rival, step=STEPS[-1], seed=own)
     if (rough < SMALL * noise.typical_sd).all():
         # It jumps somewhere in the prior, and not where the fit is.
-        fine, _ = probe_step(rival, around[:NUM_PROBED])
-        if fine is not None:
+        fine, is_steady = probe_step(rival, around[:NUM_PROBED])
+        if fine is not None and is_steady:
             return fine, True, none
     return STEPS[-1], False, rough
 

@@ -34,6 +34,7 @@ from sbi_active.criticism.results import (
     Evidence,
     ModelKey,
 )
+from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import scattered
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import (
@@ -74,7 +75,7 @@ class BySensor:
         log_z |= {key: c.posterior.log_sensor for key, c in found.items()}
         bare = found[ModelKey()]
         log_z[ModelKey(error=UNEXPLAINED)] = bare.posterior.log_process
-        noise = scattered(self.rivals.noise)
+        noise = scattered(NoiseGrid(self.search.cells))  # in units of the sensor
         scaled = log_scaled(bare, errors, noise.scales[:, None])
         log_z[ModelKey(error=SCATTER)] = float(
             log_sum_exp(scaled + noise.log_scale_prior)
@@ -123,13 +124,32 @@ class BySensor:
         """Return whether the bare model misses the trials."""
         level = LEVEL if self.rivals.has_known_noise else 0.0
         log_b = log_bayes_factor(self._log_z, self)
-        found = detection_of(self.search.found[ModelKey()], log_b, level)
-        noise = self.rivals.model.noise
-        if noise is None or noise.posterior is not None or self.rivals.roughness.any():
+        bare = self.search.found[ModelKey()]
+        square, p = self._chi_square(ModelKey())
+        found = detection_of(bare, log_b, level)
+        found = replace(found, chi_square=square, p_value=p)
+        noise, spare = (
+            self.rivals.model.noise,
+            len(bare.model.residual) - len(bare.model.u),
+        )
+        is_declared = noise is not None and noise.posterior is None and spare > 0
+        if not is_declared or self.rivals.roughness.any():
             return found
-        least, freedom = found.chi_square, found.degrees_of_freedom
-        p = float(chi2.cdf(least, freedom))
-        return replace(found, least_chi_square=least, lower_p_value=p)
+        lower = float(chi2.cdf(square, spare))
+        return replace(found, least_chi_square=square, lower_p_value=lower)
+
+    def _chi_square(self, key: ModelKey) -> tuple[float, float]:
+        """Return a model's chi-square and its tail, by all that is declared.
+
+        Where the correlation of errors is declared it counts; where it is unknown,
+        numbers count as independent.
+        """
+        model, cells = self.search.model(key), self.search.errors.cells
+        square, freedom, p = model.chi_square
+        if len(cells) == 1 and cells[0].rho.any():
+            square = float((cells[0].whiten(model.residual) ** 2).sum())
+            p = float(chi2.sf(square, freedom))
+        return square, p
 
     def log_evidence(self, key: ModelKey, *, factor: float = 1.0) -> float:
         """Return a model's log evidence, priors of effects as many times as wide."""
@@ -201,7 +221,7 @@ class BySensor:
 
     def p_value(self, key: ModelKey) -> float:
         """Return the tail probability of a model's chi-square."""
-        return self.search.model(self._predicting(key)).chi_square[2]
+        return self._chi_square(self._predicting(key))[1]
 
     def log_process(self, key: ModelKey) -> float:
         """Return the log Bayes factor of a residual process beside a model, nats."""

@@ -25,7 +25,6 @@ from sbi_active.criticism.steps.influence import needed_trials
 
 Array = NDArray[Any]
 
-
 #: Nats by which linear evidence puts a set behind the best, so that it is not sampled,
 #: and sets that are sampled at most.
 BEHIND, MOST = 10.0, 8
@@ -95,12 +94,22 @@ class Sampled:
         self.linear.fit_larger()
         self.rivals.best_fits |= self.linear.best_fits()
         found: dict[ModelKey, float] = {}
-        for key in self.linear.worthy(BEHIND)[:MOST]:
+        for key in [*self.linear.worthy(BEHIND)[:MOST], *self._noisy(singles)]:
             value = self.log_evidence(key)
-            known = [part for part in key.parts if part in self.rivals.fits]
-            if value > max(map(self.log_evidence, known)) + THRESHOLD:
+            if value > max(map(self.log_evidence, key.parts)) + THRESHOLD:
                 found[key] = value + log_prior(key.effects, prior)
         return found
+
+    def _noisy(self, singles: Mapping[str, float]) -> list[ModelKey]:
+        """Return the best effect with each on the noise, of which no column tells."""
+        effects = self.rivals.effects
+        noisy = [n for n, e in effects.items() if e.hook == "noise"]
+        others = [n for n in singles if n not in noisy]
+        if not others:
+            return []
+        best = max(others, key=singles.__getitem__)
+        pairs = ({best, name} for name in noisy)
+        return [ModelKey(tuple(n for n in effects if n in pair)) for pair in pairs]
 
     def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
         """Return whether known noise leaves no room for what a model leaves over."""
