@@ -182,7 +182,8 @@ class Criticism:
             self.rivals.warm_up = self._warm_up
             #: Effects that linear evidence set aside; None where all are fitted.
             self._linear, self.screening = linear_models(self.rivals)
-        self._is_large = is_large(self.rivals.library)
+        # Effects of a large library, told by linear models, are compared no further.
+        self._is_large = self._linear is not None and is_large(self.rivals.library)
         self._fewer = {"num_draws": FEW_DRAWS} if self._is_large else {}
         # Each model's held-out errors would take as much as the verdict.
         self._scored = None if self._is_large else trials.held_out
@@ -207,8 +208,7 @@ class Criticism:
             self._found = Sampled(self.rivals, groups, self._linear)
             timed = self.rivals.measurements.is_sequence
             jumps = not self.rivals.is_smooth or self.rivals.roughness.any()
-            if jumps and not self._is_large:  # which no linear model follows
-                timed = False
+            timed &= self._is_large or not jumps  # which no linear model follows
             if timed and self._linear is not None and self._misfit is None:
                 self._found = BySensor(self._linear, self.rivals, groups)
             self._is_searched = True
@@ -228,6 +228,8 @@ class Criticism:
         It depends on the simulator and the actions, not on what was measured; without
         permitted actions, on those of the trials.
         """
+        if self._is_large:  # the next action looks for what separates them
+            return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
                 self._equivalent = equivalent_effects(self.rivals, self.actions)
@@ -237,8 +239,7 @@ class Criticism:
         """Return whether the bare model misses the data."""
         if self._detection is None:
             misfit = self.misfit()
-            num = len(self.rivals.effects) + NUM_OTHERS
-            with self._fitting("models fitted", num):
+            with self._fitting("models fitted", len(self.rivals.effects) + NUM_OTHERS):
                 own = self._found.detected() if misfit is None else detected(misfit)
             self._detection = own
         return self._detection
@@ -257,6 +258,7 @@ class Criticism:
                     *(self._found, detection),
                     # What separates its effects, the next action looks for.
                     actions=None if self._is_large else self.actions,
+                    near=not self._is_large,
                 )
             given = self.rivals, groups, self._scored, self._linear
             tracing, self._misfit = beside_misfit(tracing, detection, *given)

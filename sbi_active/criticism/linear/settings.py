@@ -23,7 +23,7 @@ class FitSettings:
             residual's own variance.
         tried: Deviations of its prior by which a further effect is tried.
         faint: Share of them that hardly acts.
-        num_bases: Models beside which larger ones are looked for, by each order.
+        num_bases: Models beside which larger ones are looked for.
         num_pairs: Pairs that are fitted.
         num_larger: Larger sets that are fitted, of each size.
         max_effects: Effects of a set at most.

@@ -77,11 +77,9 @@ def equivalent_effects(
     where its strongest draw shows nothing, and is not compared with others.
 
     Args:
-        rivals: The models; of a large library nothing is compared.
+        rivals: The models.
         actions: The permitted ones; None compares on the trials at hand.
     """
-    if is_large(rivals.library):
-        return ()
     trials = rivals.trials if actions is None else every_action(rivals, actions)
     simulator = TrialSimulator(
         rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")

@@ -146,25 +146,25 @@ def trace(
     *,
     actions: ActionSpace | None = None,
     compare: bool = True,
+    near: bool = True,
 ) -> Tracing:
     """Return the probabilities of the rivals and the verdict.
 
     The scales of the effects' priors are unknown. After an alarm the verdict is first
     one of: declared effects, "unexplained", "scatter", each with all of its
     probability; then, of the effects, the most probable of the most probable families.
-    Where known noise refutes
-    that (its chi-square has p < .001), the residual process is tried beside it: then
-    "unexplained" is the process alone or with these effects, half and half. Of what
-    several effects of a trajectory explain, it has the share that they may imitate.
-    Effects
-    that rest on one trial are named only if that trial has hardly a gross error.
+    Where known noise refutes that (its chi-square has p < .001), the residual process
+    is tried beside it: then "unexplained" is the process alone or with these effects,
+    half and half. Of what several effects of a trajectory explain, it has the share
+    that they may imitate. Effects that rest on one trial are named only if that trial
+    has hardly a gross error.
 
     Args:
         found: The models' evidence.
         detection: Whether there is anything to trace.
         actions: The permitted ones, for what they hardly separate.
-        compare: Whether to look for effects that these trials do not separate, and that
-            are nearly the same over the permitted actions.
+        compare: Whether to look for effects that are nearly the same.
+        near: Whether to look for groups that these trials do not separate as well.
     """
     rivals, equivalent = found.rivals, found.equivalent
     # Without an alarm there is no trial to set aside.
@@ -196,11 +196,11 @@ def trace(
             beside = names
     p = beside_imitations(p)
     evidences = {str(key): found.record(key) for key in log_p}
-    near = equivalent_effects(rivals, None) if compare else ()
+    groups = equivalent_effects(rivals, None) if compare and near else ()
     aliases = ()
     if compare and detection.alarm:
         singles = {n: log_z[ModelKey((n,))] for n in rivals.effects}
-        aliases = near_aliases(rivals, singles, actions, [*equivalent, *near])
+        aliases = near_aliases(rivals, singles, actions, [*equivalent, *groups])
     inclusion = {
         name: sum(share for key, share in p.items() if name in key.effects)
         for name in rivals.effects
@@ -223,7 +223,7 @@ def trace(
         inclusion=inclusion,
         credible_set=credible_set(probabilities),
         equivalent=(*equivalent,),
-        near=near,
+        near=groups,
         aliases=aliases,
         estimates=estimates,
         evidences=evidences,

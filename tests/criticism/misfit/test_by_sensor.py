@@ -171,6 +171,7 @@ def test_linear_evidence_is_that_of_samples(biased):
     rivals = RivalSet(OSCILLATOR, RATES, biased.trials, biased.effects, seed=0)
     sampled = [log_evidence(rivals, ModelKey(k))[0] for k in ((), ("bias",))]
     linear = [tracing.evidences[k].log_evidence for k in ("none", "bias")]
+    # The bare model, hundreds of nats behind, is linear no more: hence the share.
     assert np.diff(linear) == pytest.approx(np.diff(sampled), abs=1.0, rel=0.01)
 
 
