@@ -180,9 +180,11 @@ def cross_checked(*, missed: float) -> Report:
     report = usual.report()
     assert report.detection is not None
     check = report.detection.null_log_evidence + missed
-    detection = replace(report.detection, null_cross_check=check)
     found = find_warnings(
-        report.trials, report.residuals, report.tracing, detection=detection
+        Trials(ACTIONS.values[SPREAD[:10]].double(), report.residuals.x),
+        report.residuals,
+        report.tracing,
+        detection=replace(report.detection, null_cross_check=check),
     )
     return replace(report, warnings=found)
 
