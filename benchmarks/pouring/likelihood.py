@@ -40,9 +40,9 @@ from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
 from sbi_active.inference.emulation.likelihood import correlation_root
-from sbi_active.inference.emulation.process import GaussianProcess
 from sbi_active.inference.emulation.statistics import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
+from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.regression.regions import whole_space
 
 __all__ = ["ImageLikelihood", "components", "doubted", "observed", "thumbnails"]
@@ -143,7 +143,12 @@ class ImageLikelihood:
             statistic, own = _that_tell(statistic, own, z[seen][:, :num_wanted])
         degree = 1 if z.shape[1] > MOST_SQUARED else None
         processes = tuple(
-            GaussianProcess.fit(z[seen], own[:, [j]], noisy=True, degree=degree)
+            GaussianProcess.fit(
+                z[seen],
+                own[:, [j]],
+                noise="learned",
+                settings=ProcessSettings(degree=degree),
+            )
             for j in range(own.shape[1])
         )
         left_out = np.concatenate([p.left_out for p in processes], 1)

@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 from sbi_active.design.cells import cells
 from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
+from sbi_active.inference.regression.process import GaussianProcess
 from sbi_active.information_gain import (
     CandidateSimulations,
     InformationGainEstimator,
@@ -19,7 +20,7 @@ from sbi_active.information_gain import (
 from sbi_active.information_gain.race import Race
 from sbi_active.search.base import Evaluations, Objective, Search
 from sbi_active.search.cube import Coordinates
-from sbi_active.search.surrogate import Surrogate
+from sbi_active.search.gradient import regression
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Outcome, Simulations
 from sbi_active.threads import single_thread
@@ -125,13 +126,13 @@ class GivenGains:
         for part in averages:
             knots = coordinates.points(part.action)
             c = coordinates.num_continuous
-            gain = Surrogate(knots, part.gain, part.error, num_continuous=c)
+            gain = regression(knots, part.gain, part.error, num_continuous=c)
             halves.append([*_as_contributions(gain, point)])
             valid = part.probability_valid
             if bool((valid < 1).any()):
                 error = (valid * (1 - valid) / part.num + 1e-4).sqrt()
-                share = Surrogate(knots, valid, error, num_continuous=c)
-                shares.append(share(point)[0].detach().clamp(0, 1))
+                share = regression(knots, valid, error, num_continuous=c)
+                shares.append(share(point)[0][:, 0].clamp(0, 1))
             else:
                 shares.append(torch.ones(len(point)).double())
         return self._estimates(action, halves, torch.stack(shares).mean(0))
@@ -238,7 +239,7 @@ class _Averages:
     num: Tensor
 
 
-def _as_contributions(regression: Surrogate, point: Tensor) -> Tensor:
+def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:
     r"""Return numbers whose mean is the regression's, shape (m, cells).
 
     Their standard error is the root of the sum of squares of what the residual of each
@@ -246,12 +247,14 @@ def _as_contributions(regression: Surrogate, point: Tensor) -> Tensor:
     deviation of the regression where that is larger, as beyond the outermost cells.
     """
     with torch.no_grad():
-        mean, sd = regression(point)
-        influence = regression.influence(point)
+        mean, variance = process(point)
+        influence = process.influence(point)
         influence = influence - influence.mean(1, keepdim=True)
-        ratio = sd / influence.square().sum(1).sqrt().clamp_min(1e-30)
+        ratio = variance[:, 0].sqrt() / influence.square().sum(1).sqrt().clamp_min(
+            1e-30
+        )
         influence = influence * ratio.clamp_min(1.0)[:, None]
-        return mean[:, None] + influence.shape[1] * influence
+        return mean + influence.shape[1] * influence
 
 
 def _nothing(action: Tensor) -> Evaluations:

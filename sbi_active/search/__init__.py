@@ -4,7 +4,6 @@ Here lives how candidates are proposed for any objective. What the objective is 
 ``information_gain``, who calls both in ``design``.
 """
 
-from sbi_active.renamed import former_names
 from sbi_active.search.base import Evaluations, Objective, Search
 from sbi_active.search.bayesopt import BayesianOptimization
 from sbi_active.search.exhaustive import ExhaustiveSearch
@@ -18,7 +17,3 @@ __all__ = [
     "Objective",
     "Search",
 ]
-
-__getattr__ = former_names(
-    __name__, {"Surrogate": "sbi_active.search.surrogate:Surrogate"}
-)

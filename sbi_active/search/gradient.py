@@ -7,13 +7,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from sbi_active.inference.regression.process import IN_CUBE, GaussianProcess
 from sbi_active.search.sequential import (
     Progress,
     SequentialSearch,
     permitted_points,
     spaced,
 )
-from sbi_active.search.surrogate import Surrogate
 
 NUM_STEPS = 50  # of the ascent
 STEP = 0.03  # in the unit cube
@@ -35,7 +35,7 @@ class GradientSearch(SequentialSearch):
         E[\log q(\theta_i | x_i, \xi_i) - \log p(\theta_i) \mid \xi_i] = U(\xi_i),
 
     so that a regression :math:`\mu(\xi) \pm s(\xi)` of them
-    (:class:`.Surrogate`) has the gradient that U is lacking; as has
+    (:class:`.GaussianProcess`) has the gradient that U is lacking; as has
     one of what other estimators give, on common random numbers. Where simulations are
     given and the estimator scores rows one by one, such as the paper's, they are all
     that is needed. Otherwise the utility is evaluated at actions that fill the space,
@@ -153,26 +153,47 @@ def ascend(
     return torch.cat([u.detach(), fixed], 1)
 
 
+def regression(
+    point: Tensor, value: Tensor, error: Tensor, *, num_continuous: int
+) -> GaussianProcess:
+    """Return a regression of values (n,) on points of a unit cube and categories.
+
+    Args:
+        point: Points, shape (n, dim).
+        value: Values, shape (n,).
+        error: Standard errors of the values, shape (n,).
+        num_continuous: Number of entries that are not categories, which come first.
+    """
+    return GaussianProcess.fit(
+        point,
+        value[:, None],
+        noise=error,
+        num_categories=point.shape[1] - num_continuous,
+        settings=IN_CUBE,
+    )
+
+
 def _score(
     progress: Progress, optimism: float
-) -> tuple[Callable[[Tensor], Tensor], Surrogate]:
+) -> tuple[Callable[[Tensor], Tensor], GaussianProcess]:
     """Return what to ascend, and the regression of the utility in it."""
     objective, coordinates, found = progress
     point = coordinates.points(found.action)
     c = coordinates.num_continuous
-    utility = Surrogate(point, found.utility, found.standard_error, num_continuous=c)
+    utility = regression(point, found.utility, found.standard_error, num_continuous=c)
     least, share = objective.min_probability_valid, found.probability_valid.double()
     presence = None
     if least > 0 and bool((share < 1).any()):
         error = (share * (1 - share) / 100 + 1e-4).sqrt()
-        presence = Surrogate(point, share, error, num_continuous=c)
+        presence = regression(point, share, error, num_continuous=c)
 
     def score(z: Tensor) -> Tensor:
-        mean, sd = utility(z)
+        mean, variance = utility(z)
+        height = (mean + optimism * variance.sqrt())[:, 0]
         if presence is None:
-            return mean + optimism * sd
-        lacking = (least - presence(z)[0]).clamp_min(0.0)
-        return mean + optimism * sd - PENALTY * utility.scale * lacking
+            return height
+        lacking = (least - presence(z)[0][:, 0]).clamp_min(0.0)
+        return height - PENALTY * utility.scale[0] * lacking
 
     return score, utility
 

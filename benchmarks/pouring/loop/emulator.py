@@ -33,7 +33,7 @@ from benchmarks.pouring.loop.worlds import World, poured_effects
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
 from sbi_active.inference.emulation.likelihood import correlation_root
-from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.tasks.pouring.raster import NUM_PIXELS, PIXEL
 
 __all__ = ["SHIFTS", "Emulator", "pictures_numbers"]
@@ -159,7 +159,10 @@ class Emulator:
         for own in world.actions:
             mine = (action == own).all(1).numpy()
             process = GaussianProcess.fit(
-                inputs[mine], x[mine].reshape(mine.sum(), -1), noisy=True, degree=1
+                inputs[mine],
+                x[mine].reshape(mine.sum(), -1),
+                noise="learned",
+                settings=ProcessSettings(degree=1),
             )
             shape = (-1, len(SHIFTS), NUM_NUMBERS)
             missed = process.left_out.reshape(shape)[:, SHIFTS.index(0)]

@@ -35,7 +35,7 @@ from benchmarks.pouring.likelihood import (
     observed,
 )
 from benchmarks.pouring.power import best_power, told_by
-from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, intersection_volume
@@ -236,7 +236,10 @@ class Overlap:
     def fit(theta: Array, volume: Array) -> Overlap:
         """Learn from pours: theta (n, 8) and volumes (n,)."""
         process = GaussianProcess.fit(
-            2 * theta - 1, volume[:, None], noisy=True, degree=1
+            2 * theta - 1,
+            volume[:, None],
+            noise="learned",
+            settings=ProcessSettings(degree=1),
         )
         missed = float((process.left_out**2).mean() / volume.var())
         return Overlap(process, float(volume.mean()), 1 - missed, len(theta))

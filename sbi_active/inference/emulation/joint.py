@@ -23,9 +23,9 @@ from sbi_active.inference.emulation.gain import mixture_gain
 from sbi_active.inference.emulation.likelihood import correlation_root
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.posterior import nearest
-from sbi_active.inference.emulation.process import GaussianProcess
 from sbi_active.inference.emulation.statistics import FEW, learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
@@ -124,7 +124,9 @@ def _gains(
     if len(inputs) < z.shape[1] + 4:
         return np.zeros((len(unit), NUM_OUTER))
     if noise is not None:
-        process = GaussianProcess.fit(inputs, numbers, noisy=False, kind="rough")
+        process = GaussianProcess.fit(
+            inputs, numbers, noise="none", settings=ProcessSettings(kind="rough")
+        )
         processes = [process]
         zeros = torch.zeros(max(400, 4 * numbers.shape[1]), *x_shape).double()
         seeds = torch.from_numpy(rng.integers(2**62, size=len(zeros)))
@@ -139,7 +141,7 @@ def _gains(
             features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
         _, own = learned_statistic(features, z, seed=derive_seed(seed, "folds"))
         processes = [
-            GaussianProcess.fit(inputs, own[:, [j]], noisy=True)
+            GaussianProcess.fit(inputs, own[:, [j]], noise="learned")
             for j in range(own.shape[1])
         ]
         left_out = np.concatenate([p.left_out for p in processes], 1)

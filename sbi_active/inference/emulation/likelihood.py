@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from sbi_active.inference.emulation.process import GaussianProcess
 from sbi_active.inference.regression.outcomes import TrialOutcome
+from sbi_active.inference.regression.process import GaussianProcess
 from sbi_active.inference.regression.regions import Region
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.simulation.noise.base import NoiseModel

@@ -21,7 +21,6 @@ from sbi_active.inference.emulation.likelihood import (
     correlation_root,
 )
 from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.process import GaussianProcess, num_features
 from sbi_active.inference.emulation.statistics import learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.engine.importance import fitted
@@ -29,6 +28,11 @@ from sbi_active.inference.engine.learned import CHEAP, LearnedFit, learned_fit
 from sbi_active.inference.engine.pool import PriorDraws
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.regression.outcomes import TrialOutcome
+from sbi_active.inference.regression.process import (
+    GaussianProcess,
+    ProcessSettings,
+    num_features,
+)
 from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -194,7 +198,12 @@ class PooledPosterior:
             if self.noise is not None:
                 kinds = ("smooth", "rough")
                 both = [
-                    GaussianProcess.fit(inputs, values, noisy=False, kind=kind)
+                    GaussianProcess.fit(
+                        inputs,
+                        values,
+                        noise="none",
+                        settings=ProcessSettings(kind=kind),
+                    )
                     for kind in kinds
                 ]
                 processes = (max(both, key=lambda p: p.log_evidence),)
@@ -204,7 +213,7 @@ class PooledPosterior:
                 )
                 seen = statistic(observed[used][None])[0]
                 processes = tuple(
-                    GaussianProcess.fit(inputs, own[:, [j]], noisy=True)
+                    GaussianProcess.fit(inputs, own[:, [j]], noise="learned")
                     for j in range(own.shape[1])
                 )
                 left_out = np.concatenate([p.left_out for p in processes], 1)

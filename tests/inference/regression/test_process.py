@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.inference.emulation.process import GaussianProcess
+from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 
 
 def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
@@ -14,7 +14,7 @@ def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
     def f(u):
         return (u @ slope + [7.0, 1.0] + np.sin(3 * u)).astype(np.float32)
 
-    process = GaussianProcess.fit(u, f(u).astype(float), noisy=False)
+    process = GaussianProcess.fit(u, f(u).astype(float), noise="none")
     mean, variance = process.predict(new)
     assert np.abs(mean - f(new)).max() < 0.5
     assert np.array_equal(process.mean(new), mean)
@@ -25,7 +25,7 @@ def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
 def test_what_is_no_trend_is_interpolated_with_its_error():
     rng = np.random.default_rng(1)
     u, new = rng.uniform(-1, 1, (30, 1)), rng.uniform(-1, 1, (200, 1))
-    process = GaussianProcess.fit(u, np.sin(9 * u), noisy=False)
+    process = GaussianProcess.fit(u, np.sin(9 * u), noise="none")
     mean, variance = process.predict(new)
     off = (mean - np.sin(9 * new)) / np.sqrt(variance)
     assert np.abs(mean - np.sin(9 * new)).max() < 0.05
@@ -38,7 +38,7 @@ def test_learned_noise_is_that_of_the_outputs():
     rng = np.random.default_rng(2)
     u = rng.uniform(-1, 1, (200, 2))
     y = 3 * u[:, :1] + 0.2 * rng.standard_normal((200, 1))
-    process = GaussianProcess.fit(u, y, noisy=True)
+    process = GaussianProcess.fit(u, y, noise="learned")
     assert float(process.noise_sd[0]) == pytest.approx(0.2, rel=0.2)
 
 
@@ -47,9 +47,12 @@ def test_a_trend_of_fewer_features_misses_left_out_rows_by_less():
     u = rng.uniform(-1, 1, (150, 10))
     y = 3 * u[:, :1] + 0.5 * rng.standard_normal((150, 1))
     given, linear = (
-        GaussianProcess.fit(u, y, noisy=True, degree=degree) for degree in (None, 1)
+        GaussianProcess.fit(
+            u, y, noise="learned", settings=ProcessSettings(degree=degree)
+        )
+        for degree in (None, 1)
     )
-    assert (given.degree, linear.degree) == (2, 1)
+    assert (given.settings.degree, linear.settings.degree) == (2, 1)
     missed = [np.sqrt((p.left_out**2).mean()) for p in (given, linear)]
     assert missed[1] == pytest.approx(0.5, rel=0.15)
     assert missed[0] > 1.2 * missed[1]

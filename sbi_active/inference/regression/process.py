@@ -1,0 +1,342 @@
+r"""Gaussian processes: of outcomes on few simulations, and of a utility on actions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Array = NDArray[Any]
+Kind = Literal["smooth", "rough"]
+
+TREND = 3.0  # deviation of the trend's coefficients, outputs of unit size
+ROUNDED = 1e-7  # of the largest output, which single precision does not tell
+SPARE = 3  # rows beyond the features before a trend is taken off
+ROWS_A_FEATURE = 2.0  # that a quadratic trend takes at least
+MOST_FITTED = 250  # rows that hyperparameters are fitted to
+INFLATION = 16.0  # of the variance at most, where left-out rows are missed by more
+RIDGES = (1e-9, 1e-7, 1e-5, 1e-3)  # of the kernel, where it has no factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessSettings:
+    """Settings of a Gaussian process.
+
+    Means and deviations are those of logarithms a priori, for inputs of about unit size
+    and outputs of unit variance.
+
+    Attributes:
+        kind: Kernel, a squared exponential ("smooth") or Matern 5/2 ("rough").
+        degree: Degree of the trend, 0 for none; None takes a quadratic one where rows
+            are twice its features, which of many inputs and much noise is too many.
+        length: Mean and deviation of the log length of each input.
+        amplitude: Mean and deviation of the log amplitude.
+        noise: Mean and deviation of the log standard deviation of learned noise.
+        jitter: Variance that is always added; a noise below its root is not resolved.
+        limit: Absolute value beyond which a line search may not step.
+        num_steps: Number of steps of the optimizer of the hyperparameters.
+    """
+
+    kind: Kind = "smooth"
+    degree: Literal[0, 1, 2] | None = None
+    length: tuple[float, float] = (math.log(2.5), 1.0)
+    amplitude: tuple[float, float] = (math.log(0.5), 1.5)
+    noise: tuple[float, float] = (math.log(0.3), 1.5)
+    jitter: float = 1e-7
+    limit: float = 6.0
+    num_steps: int = 25
+
+
+#: Of values in a unit cube that all vary, without a trend.
+IN_CUBE = ProcessSettings(
+    kind="rough",
+    degree=0,
+    length=(math.log(0.4), 1.0),
+    amplitude=(0.0, 1.0),
+    noise=(0.0, 1.0),
+    jitter=1e-5,
+    limit=4.0,
+    num_steps=40,
+)
+
+
+@dataclass(frozen=True)
+class GaussianProcess:
+    r"""Regression of outputs y (n, q) on inputs u (n, D), outputs sharing a kernel.
+
+    .. math::
+        k(u, u') = b^2 h(u)^\top h(u') + \sigma^2 \kappa(r)
+        \prod_j \rho_j^{[c_j \ne c'_j]} + \tau^2 [u = u'], \qquad
+        r^2 = \sum_i (u_i - u'_i)^2 / \ell_i^2,
+
+    with h a linear or quadratic basis, c the categories among the inputs, which are the
+    last, and the hyperparameters at their most probable values. Noise is none, learned,
+    or known but for a factor below one: values from common random numbers err together,
+    which a smooth function absorbs. Unless it is known the variance is scaled so that
+    left-out rows are missed by as much as it says. Of outputs without noise a
+    least-squares trend is taken off first: they may differ by 10,000 deviations of the
+    noise declared beside them, and are to be known to one.
+
+    Attributes:
+        u: Inputs, shape (n, D).
+        num_categories: Number of inputs that are categories.
+        settings: Settings, with the degree that was taken.
+        free: Logarithms of lengths, logits of :math:`\rho`, logarithms of
+            :math:`\sigma` and of the noise, shape (D + 2,).
+        noise: Variance of each row's noise, of outputs of unit size, shape (n,).
+        values: Outputs of unit size beside the trend taken off, shape (n, q).
+        precision: :math:`K^{-1}`, shape (n, n).
+        shift: Mean of the outputs, shape (q,).
+        taken_off: Coefficients of the trend taken off, shape (p, q).
+        scale: Size of the outputs, shape (q,).
+        inflation: Factor of the variance, shape (q,).
+        log_evidence: Log evidence of the data and the hyperparameters.
+
+    References:
+        Rasmussen & Williams, Gaussian Processes for Machine Learning, 2006, sections
+        2.7 and 5.4.2.
+    """
+
+    u: Tensor
+    num_categories: int
+    settings: ProcessSettings
+    free: Tensor
+    noise: Tensor
+    values: Tensor
+    precision: Tensor
+    shift: Tensor
+    taken_off: Tensor
+    scale: Tensor
+    inflation: Tensor
+    log_evidence: float
+
+    @staticmethod
+    def fit(
+        u: Array | Tensor,
+        y: Array | Tensor,
+        *,
+        noise: Literal["none", "learned"] | Tensor,
+        num_categories: int = 0,
+        settings: ProcessSettings | None = None,
+    ) -> GaussianProcess:
+        """Return the process of inputs (n, D) and outputs (n, q), n >= 2.
+
+        Args:
+            u: Inputs.
+            y: Outputs.
+            noise: What is known of the noise of y: standard errors (n,), or that there
+                is none, or that it is to be learned.
+            num_categories: Number of inputs, the last ones, that are categories.
+            settings: Kernel, trend and hyperpriors.
+        """
+        settings = settings or ProcessSettings()
+        u, y = torch.as_tensor(u).double(), torch.as_tensor(y).double()
+        if settings.degree is None:
+            enough = len(u) >= ROWS_A_FEATURE * num_features(u.shape[1])
+            settings = replace(settings, degree=2 if enough else 1)
+        shift, size = y.mean(0), y.abs().amax(0)
+        rest, scale = y - shift, y.std(0, correction=0)
+        basis = _features(u, settings)
+        taken_off = y.new_zeros(basis.shape[1], y.shape[1])
+        spare = len(u) - basis.shape[1]
+        if isinstance(noise, Tensor):
+            # Values that agree by common random numbers vary by less than they err.
+            scale = scale.clamp_min(1e-3 * float(noise.mean()) + 1e-12)
+            noise = noise.double() / scale
+        elif noise == "none" and spare >= SPARE:
+            taken_off = torch.linalg.lstsq(basis, rest, driver="gelsd").solution
+            rest = rest - basis @ taken_off
+            spread = (rest.square().sum(0) / spare).sqrt()
+            scale = torch.maximum(spread, (ROUNDED * size).clamp_min(1e-30))
+        else:
+            scale = torch.where(scale > 1e-6 * size, scale, size.clamp_min(1e-30))
+        values = rest / scale
+        some = slice(None, None, max(1, -(-len(u) // MOST_FITTED)))
+        few = noise[some] if isinstance(noise, Tensor) else noise
+        free, evidence = _hyperparameters(
+            u[some], values[some], few, num_categories, settings
+        )
+        variance = _variance(free, noise, len(u), settings)
+        kernel = _kernel(u, u, free, num_categories, settings) + variance.diag()
+        precision = torch.linalg.inv(kernel)
+        precision = 0.5 * (precision + precision.mT)
+        inflation = torch.ones_like(scale)
+        if not isinstance(noise, Tensor):
+            missed = (precision @ values).square() / precision.diagonal()[:, None]
+            inflation = missed.mean(0).clamp(1.0, INFLATION)
+        return GaussianProcess(
+            *(u, num_categories, settings, free, variance, values, precision),
+            *(shift, taken_off, scale, inflation, evidence),
+        )
+
+    @property
+    def noise_sd(self) -> Array:
+        r"""Standard deviation :math:`\tau` of learned noise in units of y, (q,)."""
+        return (self.scale * (self.noise[0] * self.inflation).sqrt()).numpy()
+
+    @property
+    def left_out(self) -> Array:
+        """Residuals of left-out rows in units of y, shape (n, q)."""
+        missed = self.precision @ self.values / self.precision.diagonal()[:, None]
+        return (missed * self.scale).numpy()
+
+    def predict(self, u: Array) -> tuple[Array, Array]:
+        """Return mean and variance without noise at inputs (m, D), both (m, q)."""
+        mean, variance = self(torch.from_numpy(u))
+        return mean.numpy(), variance.numpy()
+
+    def mean(self, u: Array) -> Array:
+        """Return the mean alone, which costs less, (m, D) -> (m, q)."""
+        at = torch.from_numpy(u)
+        return self._mean(at, self._cross(at)).numpy()
+
+    def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and variance at inputs (m, D), both (m, q), differentiably."""
+        cross, trend = self._cross(u), _features(u, self.settings)
+        own = trend.square().sum(1) + _amplitude(self.free, self.settings).square()
+        variance = own - ((cross @ self.precision) * cross).sum(1)
+        variance = variance.clamp_min(self.settings.jitter)[:, None] * self.inflation
+        return self._mean(u, cross), variance * self.scale**2
+
+    def covariance(self, u: Tensor) -> Tensor:
+        """Return the posterior covariance of the first output at (m, D), (m, m)."""
+        cross = self._cross(u)
+        own = _kernel(u, u, self.free, self.num_categories, self.settings)
+        return self.scale[0].square() * (own - cross @ self.precision @ cross.mT)
+
+    def influence(self, u: Tensor) -> Tensor:
+        r"""Return what each value adds to the mean of the first output, shape (m, n).
+
+        :math:`k(u, U) K^{-1}` times the residual of the value. Their root of the sum of
+        squares is a standard error that does not assume the values' errors.
+        """
+        # The fit misses a value by its noise times its weight.
+        residual = self.noise * (self.precision @ self.values)[:, 0]
+        return self.scale[0] * (self._cross(u) @ self.precision) * residual
+
+    def _cross(self, u: Tensor) -> Tensor:
+        return _kernel(u, self.u, self.free, self.num_categories, self.settings)
+
+    def _mean(self, u: Tensor, cross: Tensor) -> Tensor:
+        taken_off = _features(u, self.settings) @ self.taken_off
+        beside = cross @ (self.precision @ self.values)
+        return self.shift + taken_off + beside * self.scale
+
+
+def num_features(dim: int) -> int:
+    """Return the features of a quadratic trend of so many inputs."""
+    return 1 + dim + dim * (dim + 1) // 2
+
+
+def _features(u: Tensor, settings: ProcessSettings) -> Tensor:
+    """Return the trend's features times their deviations, shape (n, p)."""
+    if settings.degree == 0:
+        return u.new_zeros(len(u), 0)
+    parts = [torch.ones(len(u), 1).to(u), u]
+    if settings.degree == 2:
+        row, column = torch.triu_indices(u.shape[1], u.shape[1])
+        parts.append(0.5 * u[:, row] * u[:, column])
+    return TREND * torch.cat(parts, 1)
+
+
+def _amplitude(free: Tensor, settings: ProcessSettings) -> Tensor:
+    return free[-2].clamp(-settings.limit, settings.limit).exp()
+
+
+def _kernel(
+    u: Tensor,
+    other: Tensor,
+    free: Tensor,
+    num_categories: int,
+    settings: ProcessSettings,
+) -> Tensor:
+    """Return the covariance without noise of inputs (m, D) and (n, D), (m, n)."""
+    limit, c = settings.limit, u.shape[1] - num_categories
+    length = free[:c].clamp(-limit, limit).exp()
+    a, b = u[:, :c] / length, other[:, :c] / length
+    square = (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * a @ b.T).clamp_min(0)
+    if settings.kind == "smooth":
+        correlation = (-0.5 * square).exp()
+    else:
+        r = (5 * square + 1e-12).sqrt()
+        correlation = (1 + r + r.square() / 3) * (-r).exp()
+    if num_categories:
+        differs = (u[:, None, c:] != other[None, :, c:]).double()
+        rho = torch.nn.functional.logsigmoid(free[c:-2].clamp(-limit, limit))
+        correlation = correlation * (differs @ rho).exp()
+    trend = _features(u, settings) @ _features(other, settings).T
+    return trend + _amplitude(free, settings).square() * correlation
+
+
+def _variance(
+    free: Tensor, noise: str | Tensor, num: int, settings: ProcessSettings
+) -> Tensor:
+    """Return the variance of each row's noise, shape (n,)."""
+    last, limit = free[-1], settings.limit
+    own = free.new_zeros(num)
+    if isinstance(noise, Tensor):
+        own = last.clamp(-2 * limit, limit).sigmoid() * noise.square()
+    elif noise == "learned":
+        own = own + (2 * last.clamp(-limit, limit)).exp()
+    return own + settings.jitter
+
+
+def _hyperparameters(
+    u: Tensor,
+    y: Tensor,
+    noise: str | Tensor,
+    num_categories: int,
+    settings: ProcessSettings,
+) -> tuple[Tensor, float]:
+    """Return the most probable logarithms, see ``free``, and the log evidence."""
+    num_lengths = u.shape[1] - num_categories
+    priors = [settings.length] * num_lengths + [(0.0, 2.0)] * num_categories
+    priors += [settings.amplitude, settings.noise]
+    if isinstance(noise, Tensor):
+        priors[-1] = (0.0, 2.0)  # logit of the factor
+    center, deviation = torch.tensor(priors, dtype=torch.float64).T
+    free = center.clone().requires_grad_(True)
+    optimizer = torch.optim.LBFGS(
+        [free], max_iter=settings.num_steps, line_search_fn="strong_wolfe"
+    )
+
+    def negative_log_evidence() -> Tensor:
+        kernel = _kernel(u, u, free, num_categories, settings)
+        kernel = kernel + _variance(free, noise, len(u), settings).diag()
+        white, log_volume = _whitened(kernel, y)
+        loss = 0.5 * white.square().sum() + y.shape[1] * log_volume
+        return loss + 0.5 * ((free - center) / deviation).square().sum()
+
+    def closure() -> Tensor:
+        with torch.enable_grad():
+            optimizer.zero_grad()
+            loss = negative_log_evidence()
+            loss.backward()
+            return loss
+
+    step: Callable[..., Any] = optimizer.step
+    step(closure)
+    with torch.no_grad():
+        found = free.detach().clone()
+        if not bool(found.isfinite().all()):
+            found = center.clone()
+        free.data.copy_(found)
+        return found, -float(negative_log_evidence())
+
+
+def _whitened(kernel: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return whitened outputs, and half the log determinant."""
+    factor, failed = torch.linalg.cholesky_ex(kernel)
+    for share in RIDGES:
+        if not failed:
+            break
+        size = float(kernel.detach().diagonal().max())
+        ridge = share * size * torch.eye(len(kernel)).to(kernel)
+        factor, failed = torch.linalg.cholesky_ex(kernel + ridge)
+    white = torch.linalg.solve_triangular(factor, y, upper=False)
+    return white, factor.diagonal().log().sum()
