@@ -180,7 +180,7 @@ def many(num_parameters: int) -> list[Any]:
         trials,
         simulator=simulator,
         seed=7,
-        refinement=RefinementOptions(num_histories=600, num_particles=2_000),
+        refinement=RefinementOptions(num_histories=600, num_effective=50),
     )
     with forked_generators(0):
         draws = belief.sample(torch.Size([64]))

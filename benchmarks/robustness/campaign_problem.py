@@ -39,7 +39,7 @@ OPTIONS = CampaignOptions(
     num_samples=100,
     num_scored=200,
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=RefinementOptions(num_histories=300, num_particles=1_000),
+    refinement=RefinementOptions(num_histories=300, num_effective=25),
 )
 BIAS = Effect(
     "bias",

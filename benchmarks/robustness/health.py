@@ -65,7 +65,7 @@ CHEAP = CampaignOptions(
 CHEAPER = replace(
     CHEAP,
     num_scored=1_000,
-    refinement=RefinementOptions(num_histories=400, first_share=0.5),
+    refinement=RefinementOptions(num_histories=400),
 )
 
 

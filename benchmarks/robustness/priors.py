@@ -118,7 +118,7 @@ def begun(prior: Any, method: str = "asbi") -> Campaign:
         lambda theta, action: theta * action, noise=GaussianNoise(SD)
     )
     # The moments are asked for at .25 deviations: 300 histories are off by .2.
-    refinement = RefinementOptions(num_histories=2_000, num_particles=2_000)
+    refinement = RefinementOptions(num_histories=2_000, num_effective=50)
     return Campaign(
         model,
         prior,

@@ -22,7 +22,7 @@ from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
-SETTINGS = RefinementOptions(num_histories=300, num_particles=1_000)
+SETTINGS = RefinementOptions(num_histories=300, num_effective=25)
 SIZES = (1e15, 1e30, -3e38)
 
 

@@ -125,15 +125,19 @@ def describe_options(options: Any) -> Any:
 
 
 def options_from(described: Any) -> Any:
-    """Return the settings of :func:`describe_options`."""
+    """Return the settings of :func:`describe_options`.
+
+    Those of an earlier version that are no more are left out.
+    """
     if isinstance(described, list):
         return tuple(options_from(item) for item in described)
     if not isinstance(described, dict):
         return described
     if "number" in described:
         return float(described["number"])
-    values = {n: options_from(v) for n, v in described.items() if n != "settings"}
-    return _SETTINGS[described["settings"]](**values)
+    kind = _SETTINGS[described["settings"]]
+    known = {f.name for f in dataclasses.fields(kind)}
+    return kind(**{n: options_from(v) for n, v in described.items() if n in known})
 
 
 def _plain(value: Any) -> Any:

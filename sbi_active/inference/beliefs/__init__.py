@@ -5,13 +5,12 @@ in ``refinement``, those of learned factors in ``products``.
 """
 
 from sbi_active.inference.beliefs.belief import ChainedBelief, information_gained
-from sbi_active.inference.beliefs.comparison import compare, compare_orders
+from sbi_active.inference.beliefs.comparison import compare
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 
 __all__ = [
     "ChainedBelief",
     "KernelBelief",
     "compare",
-    "compare_orders",
     "information_gained",
 ]

@@ -1,4 +1,4 @@
-"""Beliefs against each other: network and refined, one order of trials and another."""
+"""The belief of the networks beside the refined one."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from sbi_active.seeding import forked_generators
 
 #: Nats by which the network may lie beside the refined belief before it is said.
 TOLERANCE = 0.5
-#: Nats between two refinements of the same trials beyond which it is said.
-ORDER_TOLERANCE = 0.2
 #: No density in float32 is further below another than this.
 FLOOR = -60.0
 NUM_DRAWS = 2_000  # of each belief, whose mean is then known to .02 nat a parameter
@@ -52,28 +50,3 @@ def compare(refined: Belief, chained: ChainedBelief) -> None:
     refined.diagnostics = refined.diagnostics.extended(
         network_warnings=(f"the amortized network is {kind}",)
     )
-
-
-def compare_orders(belief: Belief, other: Belief) -> None:
-    r"""Add the divergence from a second refinement to a belief's diagnostics.
-
-    .. math::
-        \mathrm{KL}(b \,\|\, b') = E_b[\log b(\theta) - \log b'(\theta)],
-
-    with b' from the trials in another order and other simulations. The likelihood is a
-    product over trials, so anything beyond Monte Carlo error is an error; beyond .2 nat
-    it is a warning.
-    """
-    with forked_generators(0, "orders"):
-        draws = belief.sample((NUM_DRAWS,))
-    difference = (belief.log_prob(draws) - other.log_prob(draws)).double()
-    divergence = float(difference.clamp_max(-FLOOR).mean())
-    spent = belief.diagnostics.num_simulations + other.diagnostics.num_simulations
-    belief.diagnostics = belief.diagnostics.extended(
-        order_swap_kl=divergence, num_simulations=spent
-    )
-    if divergence > ORDER_TOLERANCE:
-        belief.diagnostics = belief.diagnostics.warned(
-            f"a second refinement of the same trials, in reverse order, differs by "
-            f"{divergence:.2g} nats; raise num_histories"
-        )

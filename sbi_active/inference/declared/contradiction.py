@@ -41,6 +41,10 @@ Array = NDArray[Any]
 NUM_REPEATS = 2_000  # draws of the noise at the best fit
 MAX_INFLATIONS = 3  # a better fit may be found once the noise is wider
 NUM_NAMED = 3  # trials that a sentence lists
+#: Tail probability of the best fit's residuals under the declared noise, below which
+#: trials contradict. A right simulator crosses it once in a million updates; half and
+#: twice are the same in practice, since contradictions lie far below.
+LEVEL = 1e-6
 INFORMED = 1e-3  # derivative below which no trial informs a parameter
 
 
@@ -82,7 +86,7 @@ def find_contradiction(
     residual: Array,
     jacobian: Array,
     *,
-    level: float,
+    level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
     """Return what contradicts at the best fit; None where the noise explains it.
@@ -125,7 +129,7 @@ def contradiction_at(
     likelihood: SimulatedLikelihood,
     theta: Tensor,
     *,
-    level: float,
+    level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
     """Return what contradicts at parameters that are about the best, shape (1, d)."""
@@ -153,7 +157,7 @@ def compared(
     squares: Array,
     *,
     num_fitted: int,
-    level: float,
+    level: float = LEVEL,
 ) -> Contradiction | None:
     """Return what contradicts by the squares alone; None where nothing does.
 

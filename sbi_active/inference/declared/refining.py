@@ -101,12 +101,12 @@ def refine_declared(
     declared = SimulatedLikelihood(table, action, x)
     potential = SimulatedPotential(declared, coordinates)
     contradiction, fit = None, None
-    own = _engine_settings(settings, len(action))
+    own = _engine_settings(settings, len(action), coordinates.dim)
     if before is not None:
-        fit = _gone_on(before.pool, potential, settings, own, rng)
+        fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
         near = _near(hints, coordinates, seed)
-        potential, found, contradiction = _searched(potential, near, settings, own, rng)
+        potential, found, contradiction = _searched(potential, near, own, rng)
         fit = infer(potential, rng, found=found, near=near, settings=own)
     if not len(fit.u):
         raise UnexplainedOutcomeError(
@@ -136,10 +136,12 @@ def refine_declared(
     return belief
 
 
-def _engine_settings(settings: RefinementOptions, num_trials: int) -> Settings:
+def _engine_settings(
+    settings: RefinementOptions, num_trials: int, dim: int
+) -> Settings:
     num_draws = settings.num_draws or max(settings.num_histories // 6, 100)
     return Settings(
-        num_effective=settings.num_effective,
+        num_effective=settings.effective_of(dim),
         num_simulations=3 * settings.num_histories * num_trials,
         num_draws=num_draws,
     )
@@ -164,7 +166,6 @@ def _near(
 def _gone_on(
     past: Pool,
     potential: SimulatedPotential,
-    settings: RefinementOptions,
     own: Settings,
     rng: np.random.Generator,
 ) -> Fit | None:
@@ -182,15 +183,13 @@ def _gone_on(
     if fit.tail_shape > own.largest_shape:
         return None
     best = potential.coordinates.to_theta(fit.u[[fit.log_likelihood.argmax()]])
-    level = settings.contradiction_level
-    contradicted = contradiction_at(potential.likelihood, best, level=level, rng=rng)
+    contradicted = contradiction_at(potential.likelihood, best, rng=rng)
     return fit if contradicted is None else None
 
 
 def _searched(
     potential: SimulatedPotential,
     near: Array | None,
-    settings: RefinementOptions,
     own: Settings,
     rng: np.random.Generator,
 ) -> tuple[SimulatedPotential, Found | None, Contradiction | None]:
@@ -210,7 +209,6 @@ def _searched(
             c.to_theta(np.concatenate([best, around])),
             residual[0] * likelihood.inflation,
             jacobian[0] * likelihood.inflation,
-            level=settings.contradiction_level,
             rng=rng,
         )
         if now is None or now.inflation < STABLE * likelihood.inflation:

@@ -78,8 +78,8 @@ def by_replicates(
         belief: Learned belief.
         rng: Source of the draws.
     """
-    settings, coordinates = stages.settings, stages.coordinates
-    num = max(FEWEST, int(settings.checked_share * settings.num_histories))
+    own, coordinates = stages.own, stages.coordinates
+    num = max(FEWEST, int(own.checked_share * stages.settings.num_histories))
     with forked_generators(int(rng.integers(2**62))):
         theta = belief.sample(torch.Size([num])).float()
     histories = stages.histories
@@ -108,5 +108,5 @@ def by_replicates(
         shift = float(np.abs(moves.mean(0))[worst])
         error = float(moves[:, worst].std() / np.sqrt(len(moves)))
     used = histories.num_simulations - before
-    limit = max(settings.largest_shift, STANDARD_ERRORS * error)
+    limit = max(own.largest_shift, STANDARD_ERRORS * error)
     return Confirmation(shift, used, limit)

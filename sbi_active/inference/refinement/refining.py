@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import parameter_dim
-from sbi_active.inference.beliefs.comparison import compare_orders
 from sbi_active.inference.beliefs.enumerated import EnumeratedBelief, Enumeration
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared import SimulatedBelief, refine_declared
@@ -22,6 +21,7 @@ from sbi_active.inference.declared.simulated_belief import DeclaredRecord
 from sbi_active.inference.refinement.confirmation import by_replicates
 from sbi_active.inference.refinement.enumerating import enumerated
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.settings import StageSettings
 from sbi_active.inference.refinement.stages import Stages, Task
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
@@ -37,6 +37,7 @@ def refine(
     start: Distribution | Sequence[Distribution] | None = None,
     past: HistoryRecord | DeclaredRecord | None = None,
     settings: RefinementOptions | None = None,
+    stages: StageSettings | None = None,
     seed: int,
 ) -> LearnedBelief | SimulatedBelief | EnumeratedBelief:
     r"""Return the posterior of all trials given the original prior.
@@ -65,7 +66,8 @@ def refine(
             before the last trial. It adds simulations and no weight, so it cannot bias.
         past: ``belief.histories`` of an earlier call whose trials are the first of
             these: what still lies in a region is simulated at the new actions only.
-        settings: Budget and shares; None is ``RefinementOptions()``.
+        settings: Budget; None is ``RefinementOptions()``.
+        stages: Settings of a likelihood that is learned; None is ``StageSettings()``.
         seed: Of everything random here.
 
     Returns:
@@ -99,10 +101,12 @@ def refine(
         return enumerated(
             *(refine, simulator, prior, enumeration, action, outcome, seed),
             settings=settings,
+            stages=stages,
         )
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
-    task = Task(simulator, prior, action, outcome, [*hints], settings)
+    own = StageSettings() if stages is None else stages
+    task = Task(simulator, prior, action, outcome, [*hints], settings, own)
     with single_thread():
         belief = refine_declared(
             *(simulator, prior, action, outcome),
@@ -113,11 +117,6 @@ def refine(
         )
         if belief is None:
             belief = _within_memory(task, past, seed)
-        if settings.check_order and isinstance(belief, LearnedBelief):
-            other = replace(task, action=action.flip(0), outcome=outcome.flip(0))
-            compare_orders(
-                belief, Stages(other, None, derive_seed(seed, "reversed")).run()
-            )
     return belief
 
 

@@ -30,7 +30,6 @@ from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, S
 
 Array = NDArray[Any]
 
-SMALL = 0.05  # nats that need no mending
 LARGE = 0.2  # nats that the belief is off
 NUM_REPEATS = 20  # of the coefficients
 CHANCE = 0.99  # of agreement, where only chance makes a difference
@@ -92,8 +91,10 @@ def widened(
         if not difference <= allowed:
             break
         found = expected_error(other, draws, rng)
-        if found < least:
-            best, least, bias = other, found, max(difference - error, 0.0)
+        # Without bias they differ by what the wider one errs less (Hausman).
+        own = max(difference - (error - found), 0.0)
+        if found + own < least:
+            best, least, bias = other, found + own, own
     return best, bias
 
 

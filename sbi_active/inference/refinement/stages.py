@@ -20,7 +20,8 @@ from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedPotential, learned_fit
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
-from sbi_active.inference.refinement.regression_error import SMALL, widened
+from sbi_active.inference.refinement.regression_error import widened
+from sbi_active.inference.refinement.settings import StageSettings
 from sbi_active.inference.refinement.trust import (
     Course,
     Stage,
@@ -41,14 +42,14 @@ from sbi_active.simulation.outcomes import MissingRowsWarning
 
 Array = NDArray[Any]
 
-MANY = 6  # parameters beyond which each covariance needs more draws
-MOST_FORCED = 32  # regions that split misfit, as many as the options allow
-MIN_STAGE = 60  # histories below which another stage adds nothing; more by dimension
-
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be refined, as in :func:`.refine`."""
+    """What is to be refined, as in :func:`.refine`.
+
+    Attributes:
+        stages: Settings of the stages.
+    """
 
     simulator: Callable[..., Any]
     prior: Distribution
@@ -56,6 +57,7 @@ class Task:
     outcome: Tensor
     hints: list[Distribution]
     settings: RefinementOptions
+    stages: StageSettings = StageSettings()
 
 
 class Stages:
@@ -70,6 +72,7 @@ class Stages:
         further_noise: Array | None = None,
     ) -> None:
         self.task, self.settings, self.seed = task, task.settings, seed
+        self.own = task.stages
         self.rng = np.random.default_rng(derive_seed(seed, "refine"))
         self.coordinates = PriorCoordinates(task.prior, self.rng)
         observed = task.outcome.numpy().reshape(len(task.outcome), -1)
@@ -87,8 +90,8 @@ class Stages:
             near.append(z[self.coordinates.inside(z)])
             self.regions.append(around(near[-1]))
         self.near = np.concatenate(near) if near else None
-        self.course, self.num_forced = Course(), 1
-        self.least = max(MIN_STAGE, 2 * fewest_rows(self.coordinates.dim))
+        self.course, self.num_forced = Course(self.own.small), 1
+        self.least = max(self.own.fewest, 2 * fewest_rows(self.coordinates.dim))
 
     def run(self) -> LearnedBelief:
         """Return the belief of the last stage."""
@@ -98,7 +101,7 @@ class Stages:
             is_last = next_size < self.least
             fitted = self._fit(is_cautious=not is_last)
             stage = self._sample(fitted, self.near)
-            if stage.error > SMALL and self.course.stages:
+            if stage.error > self.own.small and self.course.stages:
                 stage = self._with_more(stage)
             self.course.append(stage)
             if is_last or self.course.is_settled:
@@ -129,13 +132,12 @@ class Stages:
             lambda gap: gap.flatten(1) / sds,
             best,
             num_fitted=self.coordinates.dim,
-            level=self.settings.contradiction_level,
         )
 
     def _size(self) -> int:
         """Return the histories of the next stage."""
         settings, used = self.settings, self.histories.num_drawn
-        share = settings.first_share if used == 0 else settings.stage_share
+        share = self.own.first_share if used == 0 else self.own.stage_share
         size = max(int(share * settings.num_histories), self.least)
         left = settings.num_histories - used
         # A remainder too small for a stage of its own goes to the one before.
@@ -145,13 +147,15 @@ class Stages:
         """Put the next stage's regions around what is still plausible."""
         many = 2 * max(self.num_forced, len(self.regions))
         fewer = max(1, self.num_forced // 2)
-        self.num_forced = min(many, MOST_FORCED) if self.course.is_stuck else fewer
+        self.num_forced = (
+            min(many, self.own.max_forced) if self.course.is_stuck else fewer
+        )
         limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
         self.regions = cover(
             stage.draws,
             self.rng,
             min_regions=min(self.num_forced, limit),
-            max_regions=min(max(self.settings.max_regions, self.num_forced), limit),
+            max_regions=min(max(self.own.max_regions, self.num_forced), limit),
             generous=stage.excess < 3,
         )
         self.near = stage.draws
@@ -160,7 +164,7 @@ class Stages:
         """Bring the stage's regions to their numbers, past histories first."""
         histories, regions = self.histories, self.regions
         is_first = histories.num_drawn == 0
-        num_places = size - max(int(self.settings.replicate_share * size), 12)
+        num_places = size - max(int(self.own.replicate_share * size), 12)
         shares = np.full(len(regions), 1 / len(regions))
         if is_first and len(regions) > 2:  # the overview keeps half of the stage
             shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
@@ -202,8 +206,7 @@ class Stages:
 
     def _sample(self, surrogate: Surrogate, near: Array | None) -> Stage:
         """Return the stage of a surrogate, its density sampled."""
-        many = max(1.0, self.coordinates.dim / MANY)
-        num = many * self.settings.effective_particles
+        num = self.own.oversampling * self.settings.effective_of(self.coordinates.dim)
         fit = learned_fit(surrogate, self.rng, near=near, num_effective=num)
         if fit is None:
             raise UnexplainedOutcomeError(

@@ -13,7 +13,6 @@ from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.declared.diagnosing import misplaced
 from sbi_active.inference.engine.learned import LearnedFit
 from sbi_active.inference.refinement.regression_error import (
-    SMALL,
     expected_error,
 )
 from sbi_active.inference.refinement.tails import tail_probability
@@ -98,8 +97,13 @@ class Stage:
 
 @dataclass
 class Course:
-    """The stages so far and whether to go on."""
+    """The stages so far and whether to go on.
 
+    Attributes:
+        small: Nats by which a settled belief may be off for want of simulations.
+    """
+
+    small: float
     stages: list[Stage] = field(default_factory=list)
     divergence: float = np.inf
     shrinkage: float = np.inf
@@ -122,7 +126,7 @@ class Course:
             stage.excess <= MISFIT
             and self.divergence < SETTLED * d
             and self.shrinkage < 0.1 * d
-            and stage.error <= SMALL
+            and stage.error <= self.small
         )
 
     @property
@@ -167,7 +171,7 @@ def diagnose(
             effective >= MIN_EFFECTIVE,
             effective,
             "at some stage only {:.1%} of the particles counted, as with many narrow "
-            "modes, and a mode may be lost; raise num_histories and first_share",
+            "modes, and a mode may be lost; raise num_histories",
         ),
         "smooth_response": (
             roughness <= ROUGH,

@@ -26,6 +26,7 @@ from sbi_active.inference.products.product import (
     TrainedRegion,
     widened,
 )
+from sbi_active.inference.refinement.settings import StageSettings
 from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
@@ -268,7 +269,7 @@ class ProductRounds(ActionRounds):
             product,
             hint,
             rng,
-            num_effective=settings.effective_particles,
+            num_effective=StageSettings().oversampling * settings.num_effective,
             defensive=settings.defensive,
         )
         sampled: Belief = belief

@@ -109,7 +109,6 @@ def test_deterministic_simulator_is_refused():
         {"num_effective": 5},
         {"num_draws": 1},
         {"defensive": 0.0},
-        {"replicate_share": 0.9},
     ],
 )
 def test_settings_validate_themselves(option: dict):

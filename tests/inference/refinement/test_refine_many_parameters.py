@@ -23,7 +23,7 @@ def refined(dim: int, num: int, seed: int, num_histories: int):
         return theta @ weight.T + 0.5 * torch.randn(len(theta), num)
 
     prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
-    settings = RefinementOptions(num_histories=num_histories, num_particles=3_000)
+    settings = RefinementOptions(num_histories=num_histories, num_effective=75)
     belief = refine(
         simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=seed
     )
@@ -62,7 +62,7 @@ def refine_two_of(dim: int):
     def simulator(theta: Tensor, action: Tensor) -> Tensor:
         return theta[:, :2] + 0.5 * torch.randn(len(theta), 2)
 
-    settings = RefinementOptions(num_histories=200, num_particles=1_000)
+    settings = RefinementOptions(num_histories=200, num_effective=25)
     x = torch.full((1, 2), 0.5)
     return refine(simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=0)
 

@@ -96,7 +96,7 @@ def test_many_correlated_numbers_of_the_right_simulator_are_not_unlike_it(lost):
         torch.manual_seed(seed)
         x = simulator(prior.sample((1,)), torch.ones(1, 1))
         x[:, torch.randperm(150)[:lost]] = torch.nan
-        settings = RefinementOptions(num_histories=300, num_particles=1_000)
+        settings = RefinementOptions(num_histories=300, num_effective=25)
         belief = refine(
             simulator, prior, torch.ones(1, 1), x, settings=settings, seed=seed
         )

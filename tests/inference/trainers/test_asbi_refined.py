@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation, refine
-from sbi_active.inference.beliefs import ChainedBelief, compare, compare_orders
+from sbi_active.inference.beliefs import ChainedBelief, compare
 from sbi_active.inference.trainers import asbi
 from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator
@@ -213,17 +213,3 @@ def test_the_faithful_network_is_flagged_as_blunt():
     assert belief.diagnostics.trustworthy
     assert belief.diagnostics.chained_bluntness > 3
     assert "under-confident" in belief.diagnostics.network_warnings[0]
-
-
-def test_a_second_refinement_in_reverse_order_agrees():
-    settings = RefinementOptions(num_histories=600, check_order=True)
-    belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=settings, seed=0)
-    assert -0.02 < belief.diagnostics.order_swap_kl < 0.1
-    single = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)
-    spent = belief.diagnostics.num_simulations
-    assert spent > 1.5 * single.diagnostics.num_simulations
-    # negative control: the beliefs of other trials differ, and that is said
-    other = ASBI(PRIOR).update_all(TRIALS[:1], simulator, refinement=SETTINGS, seed=0)
-    compare_orders(belief, other)
-    assert belief.diagnostics.order_swap_kl > 0.2
-    assert not belief.diagnostics.trustworthy
