@@ -18,6 +18,7 @@ from sbi_active.cli.options import (
     COUNT,
     FILE,
     FOLDER,
+    PORT,
     SECONDS,
     TEXT,
     WHOLE,
@@ -299,4 +300,17 @@ _add(
     "session.serve",
     [DIR, SIMULATOR_NOW, TRUST],
     'Answer requests of a program, a JSON object a line, as {"command": "ask"}.',
+)
+_add(
+    "watch",
+    "watch.watch",
+    [
+        DIR,
+        _option(
+            "--port", "of this machine alone; 0 is any free one", PORT, default=8642
+        ),
+        _option("--once", "write the page, and end", FILE, "FILE.html"),
+    ],
+    "Show a campaign in a browser while another process runs it. The page is drawn "
+    "again when the folder changes; the folder is only read.",
 )

@@ -81,6 +81,7 @@ def _text(word: str) -> str:
     return word.encode(errors="surrogateescape").decode()
 
 
+PORT = Value("a port, 0 to 65535", lambda w: range(65_536).index(int(w)), kind="n")
 WHOLE = Value("a whole number", int, kind="n")
 COUNT = Value("a whole number >= 1", _count, kind="n")
 SECONDS, TEXT = Value("a number", float, kind="s"), Value("text in UTF-8", _text)

@@ -78,7 +78,7 @@ class Session:
                 return getattr(trials, name)(Record(self.folder), **options)
         if not (is_same and has_all) or simulator_changed or name == "repair":
             self._opened, self._campaign = wants, None
-            self._campaign = import_module("sbi_active.cli.folder").open_campaign(
+            self._campaign = import_module("sbi_active.cli.campaign").open_campaign(
                 self.folder,
                 simulates=simulates,
                 simulator=simulator,

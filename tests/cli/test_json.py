@@ -43,7 +43,7 @@ def test_statuses_of_errors_are_in_the_json(raised, status, capsys, monkeypatch)
     def fail(*_, **__):
         raise raised
 
-    monkeypatch.setattr("sbi_active.cli.folder.open_campaign", fail)
+    monkeypatch.setattr("sbi_active.cli.campaign.open_campaign", fail)
     assert main(["update", "camp", "--json"]) == status
     answer = json.loads(capsys.readouterr().out, parse_constant=refuse)
     assert answer["error"]["status"] == status
