@@ -6,13 +6,12 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
 
 from sbi_active.cli import main, watch
-from tests.page.browser import CHROMIUM, FLAGS
+from tests.page.browser import CHROMIUM, FLAGS, assert_reads_well
 
 ROOT = Path(__file__).parents[2]
 #: A campaign that goes on one step with each line that it reads.
@@ -206,14 +205,18 @@ def test_a_folder_that_goes_is_said_on_the_page(place, tmp_path):
     assert "expected a campaign; got no" in news(watched.page())[0]
 
 
+def test_it_reads_well_in_a_browser(place, tmp_path):
+    assert_reads_well(watch.Watched(place[0]).drawn(), tmp_path)
+
+
 def test_a_browser_loads_the_page_again(place, server, tmp_path, monkeypatch):
     if CHROMIUM is None:
         pytest.skip("Chromium is not installed here: the page is not looked at")
     made, drawn = [], watch.Watched.drawn
 
     def counted(self):
-        made.append(time.monotonic())
-        monkeypatch.setattr(watch, "digest", lambda _: f"{min(len(made), 2)}")
+        made.append(self)
+        monkeypatch.setattr(watch, "digest", lambda _: "changed")
         return drawn(self)
 
     monkeypatch.setattr(watch.Watched, "drawn", counted)
