@@ -26,8 +26,8 @@ from sbi_active.cli.given import (
     simulator_of,
     with_generic,
 )
+from sbi_active.cli.output import Answer
 from sbi_active.cli.trials import status, sum_up_campaign
-from sbi_active.cli.words import Answer
 from sbi_active.criticism import Effect
 from sbi_active.simulation.bank.store import Store
 

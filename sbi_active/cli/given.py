@@ -24,7 +24,7 @@ from sbi_active.actions import (
 )
 from sbi_active.cli.declared import in_campaign, names_object
 from sbi_active.cli.options import number_of, numbers_of
-from sbi_active.cli.words import place_of
+from sbi_active.cli.output import place_of
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore

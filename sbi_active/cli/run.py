@@ -25,8 +25,8 @@ from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
+from sbi_active.cli.output import as_json
 from sbi_active.cli.trials import sum_up_campaign
-from sbi_active.cli.words import as_json
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.cli.options import number_of, numbers_in, numbers_of
+from sbi_active.cli.output import Answer
 from sbi_active.cli.record import shaped, sum_up
-from sbi_active.cli.words import Answer, spoken
 
 MANY = 5  # numbers, more than somebody types
 
@@ -97,7 +97,7 @@ def status(campaign: Any) -> Answer:
         lines.append(f"{trial['trial']:>4}  {trial['status']:<9} {shown}")
     for name, entry in belief["parameters"].items():
         lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
-    lines += [f"note: {spoken(w, campaign.directory)}" for w in belief["warnings"]]
+    lines += [f"note: {w}" for w in belief["warnings"]]
     if data["not_in_belief"]:
         waiting = data["not_in_belief"]
         lines.append(f"not in the belief yet: {waiting}; run sbi-active update")
