@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,14 @@ from sbi_active.cli.declared import (
     write_declared,
 )
 from sbi_active.cli.given import (
-    actions_of,
     effects_of,
     load_object,
     make_task,
-    prior_of,
+    problem_of,
     simulator_of,
     with_generic,
 )
-from sbi_active.cli.output import Answer
+from sbi_active.cli.output import Answer, say
 from sbi_active.cli.trials import status, sum_up_campaign
 from sbi_active.criticism import Effect
 from sbi_active.simulation.bank.store import Store
@@ -38,24 +36,23 @@ def init(
     folder: Path,
     *,
     config: Path | None,
-    simulator: str | None,
-    noise: str | None,
-    actions: Sequence[str],
     effects: str | None,
     method: str,
     seed: int,
+    names: str | None,
+    units: str | None,
     **options: Any,
 ) -> None:
     """Make a campaign in a new folder."""
-    declared = declare(simulator, noise, options["prior"], actions, effects)
-    sizes = {name: options[name] for name in SIZES if options[name] is not None}
-    bounds = options["theta_low"], options["theta_high"]
-    space = actions_of(actions)
-    for what in ("names", "units"):
-        _label(space, what, options[what])
+    sizes = {name: options.pop(name) for name in SIZES}
+    sizes = {name: size for name, size in sizes.items() if size is not None}
+    declared = declare(effects=effects, **options)
+    simulator, prior, space, _ = problem_of(**options)
+    _label(space, "names", names)
+    _label(space, "units", units)
     with Campaign(
-        simulator_of(declared["simulator"], noise),
-        prior_of(options["prior"], *bounds),
+        simulator,
+        prior,
         space,
         method=method,
         effects=effects_of(declared["effects"]),
@@ -86,8 +83,7 @@ def criticize(
     campaign: Campaign, *, effects: str | None, out: Path | None = None
 ) -> None:
     """Compare the campaign's simulator with its trials, and print the report."""
-    own = [] if effects is None else [effects]
-    report = campaign.criticize(library_of(campaign, effects_of(own)))
+    report = campaign.criticize(library_of(campaign, effects_of([effects])))
     print(report)
     if out is not None:
         print(f"\nsaved: {report.save(out)}")
@@ -98,12 +94,13 @@ def criticize(
 
 def adopt(campaign: Campaign, *, effects: str | None) -> Answer:
     """Go on with the simulator that the verdict names."""
-    own = [] if effects is None else [effects]
-    report = campaign.criticize(library_of(campaign, effects_of(own)), evaluate=False)
+    report = campaign.criticize(
+        library_of(campaign, effects_of([effects])), evaluate=False
+    )
     campaign.adopt(report)
     if effects is not None:
         _declare_effects(Path(str(campaign.directory)), effects)
-    print(f"adopted: {report.verdict}", file=sys.stderr)
+    say(f"adopted: {report.verdict}")
     return status(campaign)
 
 
@@ -113,7 +110,7 @@ def _declare_effects(folder: Path, name: str) -> None:
     module, colon, attribute = name.partition(":")
     if module.endswith(".py"):
         name = f"{Path(module).resolve()}{colon}{attribute}"
-    effects = [*(declared.get("effects") or ()), name]
+    effects = [*declared["effects"], name]
     write_declared(folder, {**declared, "effects": [*dict.fromkeys(effects)]})
 
 
@@ -130,10 +127,9 @@ def export(campaign: Campaign, *, netcdf: Path, seed: int) -> Answer:
     from sbi_active.export import to_inference_data
 
     if campaign.simulator is None:
-        print(
-            "sbi-active: note: without predictions and likelihoods, for which the "
-            "simulator runs: add --simulator, or --trust",
-            file=sys.stderr,
+        say(
+            "note: without predictions and likelihoods, for which the simulator runs: "
+            "add --simulator, or --trust"
         )
     data = to_inference_data(campaign, seed=seed)
     try:

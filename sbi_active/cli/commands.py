@@ -122,8 +122,7 @@ RUN = [
     _option("--iterations", "training steps a round", COUNT),
 ]
 BUILD = [
-    *(DIR, A_TASK, OF_TASK, SIMULATOR, PRIOR, SEED, WORKERS),
-    _option("--actions", "with --simulator", metavar="MODULE:NAME"),
+    *(DIR, A_TASK, OF_TASK, SIMULATOR, *SPACE, SEED, WORKERS),
     _option("--simulator-version", "in place of its source code", default=""),
     _option("--rows", "in the bank, in all", COUNT, required=True),
 ]

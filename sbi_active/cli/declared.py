@@ -38,11 +38,13 @@ def names_object(specs: Sequence[str]) -> bool:
 
 
 def declare(
+    *,
     simulator: str | None,
     noise: str | None,
     prior: str | None,
     actions: Sequence[str],
     effects: str | None,
+    **_: Any,
 ) -> dict[str, Any]:
     """Return where everything is that a program wrote, as other commands need it."""
     if simulator is None:
@@ -76,26 +78,18 @@ def read_declared(folder: Path) -> dict[str, Any]:
         ValueError: If the file does not hold what the command line writes.
     """
     path = folder / DECLARED
-    try:
-        found = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return {}
-    except (ValueError, RecursionError):
-        found = None
-    found = found if isinstance(found, dict) else None
-    if found is not None:
-        effects = found.get("effects")  # a single one in earlier files
-        found["effects"] = [effects] if isinstance(effects, str) else effects or []
-        found.setdefault("options", [])
-    if found is None or not (
-        all(isinstance(found.get(name), str | None) for name in TEXTS)
-        and all(_is_texts(found[name]) for name in LISTS)
-    ):
-        raise ValueError(
-            f"expected {path} as sbi-active writes it; got another content; remove the "
-            "file, and name the simulator by --simulator"
-        )
-    return found
+    found: Any = None
+    with suppress(ValueError, RecursionError):
+        found = json.loads(path.read_bytes()) if path.exists() else {}
+    if isinstance(found, dict):
+        found = {**dict.fromkeys(LISTS, []), **found}
+        is_text = [isinstance(found.get(name), str | None) for name in TEXTS]
+        if all(is_text) and all(_is_texts(found[name]) for name in LISTS):
+            return found
+    raise ValueError(
+        f"expected {path} as sbi-active writes it; got another content; remove the "
+        "file, and name the simulator by --simulator"
+    )
 
 
 def _is_texts(value: Any) -> bool:

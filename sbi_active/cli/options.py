@@ -55,6 +55,8 @@ class Command(click.Command):
                     said = f"Option {awaits!r} requires an argument."
                     raise click.BadOptionUsage(awaits, said, ctx)
                 several = name if isinstance(known[name], Several) else ""
+                if several:  # of two alike the last counts
+                    words = [w for w in words if not w.startswith(f"{name}=")]
                 if several and not equals:
                     continue
                 is_flag = getattr(known[name], "is_flag", False)
@@ -86,8 +88,18 @@ def take_config(
             'theta-low = "0,1"'
         ) from error
     options = [p for p in ctx.command.params if isinstance(p, click.Option)]
-    ctx.default_map = as_written(options, values, str(path))
+    found = as_written(options, values, str(path))
+    ctx.default_map = {k: _beside(path.parent, v) for k, v in found.items()}
     return path
+
+
+def _beside(folder: Path, value: Any) -> Any:
+    """Return what a file says, with the path of programs that lie beside it."""
+    if isinstance(value, list):
+        return [_beside(folder, part) for part in value]
+    file, colon, name = str(value).partition(":")
+    is_there = file.endswith(".py") and (folder / file).is_file()
+    return f"{folder / file}{colon}{name}" if is_there else value
 
 
 def take_problem(ctx: click.Context, param: click.Parameter, folder: Path) -> Path:

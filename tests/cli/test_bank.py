@@ -105,7 +105,10 @@ def test_inspect_names_a_damaged_file(capsys):
             ["--task", "oscillator", "--option", "variant=x"],
             "expected options of 'oscillator' among",
         ),
-        (["--simulator", "m:f"], "expected --prior and --actions with --simulator"),
+        (
+            ["--simulator", "math:sin"],
+            "expected --theta-low and --theta-high, or --prior",
+        ),
         (
             ["--simulator", "math", "--prior", "a:b", "--actions", "a:b"],
             "expected MODULE:NAME; got 'math'",
