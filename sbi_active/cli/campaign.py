@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,9 @@ from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.storage.damage import naming
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.declared import (
+    Declared,
     declare,
-    named,
     read_declared,
-    require_trust,
     write_declared,
 )
 from sbi_active.cli.given import (
@@ -170,60 +169,44 @@ def open_campaign(
         ValueError: If there is no campaign, or nobody knows where its simulator is, or
             only the folder says so.
     """
-    declared = read_declared(folder)
+    declared = Declared(folder, trusts=trust)
     given = {}
-    if simulates or trust and declared:
-        given = _given(folder, declared, trusts=trust)
+    if simulates or trust:
+        with naming():
+            manifest = read_manifest(Store(folder, "campaign"))
+        lacking = [what for what in ("prior", "actions") if manifest[what] is None]
+        given = {what: _object_of(declared, what) for what in lacking}
     reader = Campaign.load(folder, repair=repair, **given)
     if not simulates:
         return reader
-    model = _simulator_of(simulator, declared, folder, trusts=trust)
-    names = named(declared, "effects", folder, trusts=trust)
-    effects = effects_of(names, declared.get("folder"))
+    model = _simulator_of(declared, simulator)
+    effects = effects_of(declared.names("effects"), declared.place)
     if reader.state.version.effects:
         effects = _with_usual(effects, model, reader)
     changed = {"simulator_changed": simulator_changed}
     return Campaign.load(folder, simulator=model, effects=effects, **changed, **given)
 
 
-def _given(
-    folder: Path, declared: Mapping[str, Any], *, trusts: bool
-) -> dict[str, Any]:
-    """Return the prior and the actions that no file describes, from their programs."""
-    with naming():
-        manifest = read_manifest(Store(folder, "campaign"))
-    lacking = [what for what in ("prior", "actions") if manifest[what] is None]
-    if lacking and declared.get("task") is not None:
-        task = _task_of(declared, folder, trusts=trusts)
-        return {what: getattr(task, what) for what in lacking}
-    return {
-        what: load_object(name, declared.get("folder"))
-        for what in lacking
-        for name in named(declared, what, folder, trusts=trusts)
-    }
+def _object_of(declared: Declared, what: str) -> Any:
+    """Return an object of the task or the program that a folder declares."""
+    if declared.task is not None:
+        return getattr(make_task(declared.task, declared.options), what)
+    names = declared.names(what)
+    return load_object(names[0], declared.place) if names else None
 
 
-def _task_of(declared: Mapping[str, Any], folder: Path, *, trusts: bool) -> Any:
-    if declared["options"]:  # of which some name files
-        text = f"options {' '.join(declared['options'])} of a task"
-        require_trust(folder, text, None, trusts=trusts)
-    return make_task(declared["task"], declared["options"])
-
-
-def _simulator_of(
-    name: str | None, declared: Mapping[str, Any], folder: Path, *, trusts: bool
-) -> Any:
+def _simulator_of(declared: Declared, name: str | None) -> Any:
     if name is not None:
-        return simulator_of(name, declared.get("noise"))
-    if declared.get("task") is not None:
-        return _task_of(declared, folder, trusts=trusts).simulator
-    names = named(declared, "simulator", folder, trusts=trusts)
+        return simulator_of(name, declared.noise)
+    if declared.task is not None:
+        return _object_of(declared, "simulator")
+    names = declared.names("simulator")
     if not names:
         raise ValueError(
-            f"expected --simulator, since the campaign in {folder} was made by a "
-            "program; got none; name it, as in --simulator my_robot.py:fn"
+            "expected --simulator, since the campaign was made by a program; got none; "
+            "name it, as in --simulator my_robot.py:fn"
         )
-    return simulator_of(names[0], declared.get("noise"), declared.get("folder"))
+    return simulator_of(names[0], declared.noise, declared.place)
 
 
 def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:

@@ -111,7 +111,6 @@ def sum_up_campaign(campaign: Any) -> None:
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         known = {
             "status": found_in(campaign),
-            "is_sure": True,
             "x_shape": [*campaign.x_shape],
             "actions": describe_actions(campaign.actions),
             "names": [*campaign.actions.names],
