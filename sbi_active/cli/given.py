@@ -63,15 +63,9 @@ def load_object(name: str, folder: str | None = None) -> Any:
     try:
         loaded = importlib.import_module(module)
     except (Exception, SystemExit) as error:
-        lacks = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
-        if lacks and lacks.partition(".")[0] == module.partition(".")[0]:
-            raise ValueError(
-                f"expected a module {module!r}; got none in {here} or among the "
-                "installed ones; run where it lies, or install it"
-            ) from error
         raise ValueError(
-            f"expected {name} to be imported; got {type(error).__name__}: {error}"
-            f"{place_of(error)}; correct it"
+            f"expected {name} to be imported, from {here} or as installed; got "
+            f"{type(error).__name__}: {error}{place_of(error)}; correct it"
         ) from error
     origin = getattr(loaded, "__file__", None)
     if file is not None and (origin is None or Path(origin).resolve() != file):
@@ -104,14 +98,6 @@ def make_task(name: str, options: Sequence[str]) -> Task:
         'sinh'
     """
     values = dict(_parse(option) for option in options)
-    if name in TASKS:
-        known = [*inspect.signature(TASKS[name]).parameters]
-        unknown = [option for option in values if option not in known]
-        if unknown:
-            raise ValueError(
-                f"expected options of {name!r} among {', '.join(known) or 'none'}; got "
-                f"{unknown[0]!r}; drop it or choose one of these"
-            )
     try:
         return get_task(name, **values)
     except ImportError as error:  # its text has the line that installs it
@@ -119,9 +105,10 @@ def make_task(name: str, options: Sequence[str]) -> Task:
     except FileNotFoundError as error:
         raise ValueError(f"{error}, as --option data=FOLDER") from error
     except TypeError as error:
+        known = ", ".join(inspect.signature(TASKS[name]).parameters) or "none"
         raise ValueError(
-            f"expected values that {name!r} can use; got {values} ({error}); "
-            "correct the types"
+            f"expected options of {name!r} among {known}, of their types; got "
+            f"{values} ({error}); correct them"
         ) from error
 
 
@@ -245,7 +232,7 @@ def prior_of(
 ) -> Distribution:
     """Return the prior that --prior, or --theta-low and --theta-high, name."""
     if prior is not None:
-        return _instance(prior, Distribution, "a torch distribution; name a prior")
+        return _instance(prior, Distribution, "a torch distribution")
     if theta_low is None or theta_high is None:
         raise ValueError(
             "expected --theta-low and --theta-high, or --prior; got too few; give "
@@ -260,11 +247,12 @@ def prior_of(
     return BoxUniform(torch.tensor(low), torch.tensor(high))
 
 
-def _instance(name: str, kind: type, expected: str) -> Any:
-    found, (what, _, rest) = load_object(name), expected.partition(";")
+def _instance(name: str, kind: type, what: str) -> Any:
+    found = load_object(name)
     if not isinstance(found, kind):
-        got = f"got {type(found).__name__} under {name}"
-        raise ValueError(f"expected {what}; {got};{rest}")
+        raise ValueError(
+            f"expected {what}; got {type(found).__name__} under {name}; name another"
+        )
     return found
 
 
@@ -276,8 +264,7 @@ def actions_of(specs: Sequence[str]) -> ActionSpace:
             "an entry of the action"
         )
     if names_object(specs):
-        what = "an action space; name one of sbi_active.actions"
-        return _instance(specs[0], ActionSpace, what)
+        return _instance(specs[0], ActionSpace, "a space of sbi_active.actions")
     entries = [_entry(spec) for spec in specs]
     limits = [entry for entry in entries if isinstance(entry, tuple)]
     values = [entry for entry in entries if isinstance(entry, list)]

@@ -42,17 +42,7 @@ def tell(
         _require_trial(campaign, trial)
     x, status = _outcome(campaign, **outcome)
     executed = None if action is None else numbers_of(action)
-    folder = campaign.directory
-    try:
-        told = campaign.tell(x, trial=trial, action=executed, status=status)
-    except ValueError as error:
-        if not str(error).startswith("expected a pending trial"):
-            raise
-        raise ValueError(
-            "expected a pending trial; got none; ask for one by sbi-active ask "
-            f"{folder}, add --action of the trial that was run, or "
-            f"sbi-active correct {folder} TRIAL where one is wrong"
-        ) from None
+    told = campaign.tell(x, trial=trial, action=executed, status=status)
     return _confirmed(campaign, told)
 
 

@@ -115,7 +115,7 @@ def test_inspect_names_a_damaged_file(capsys):
         ),
         (
             ["--simulator", "no_such:f", "--prior", "a:b", "--actions", "a:b"],
-            "expected a module 'no_such'; got none",
+            "got ModuleNotFoundError: No module named 'no_such'",
         ),
         (
             ["--simulator", "math:tau2", "--prior", "a:b", "--actions", "a:b"],

@@ -100,7 +100,7 @@ def test_outcomes_of_a_file(made, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["tell", "camp", "0.7"], "ask for one by sbi-active ask camp"),
+        (["tell", "camp", "0.7"], "expected a pending trial; got none"),
         (["tell", "camp", "1", "2", "--action", "1"], "expected 1 numbers"),
         (["tell", "camp", "fast", "--action", "1"], "write them with a point"),
         (["tell", "camp", "1", "--missing"], "got several; write one"),

@@ -132,7 +132,7 @@ def test_a_robot_s_loop(server):
         ({"command": "tell", "x": ["fast"]}, "write them with a point"),
         ({"command": "tell", "x": [1, 2], "action": 1}, "expected 1 numbers"),
         ({"command": "tell", "x": [None], "action": 1}, "a number that was measured"),
-        ({"command": "tell", "x": 1}, "ask for one by sbi-active ask camp"),
+        ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
         ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
         ({"command": "withdraw", "trial": "first"}, "'first' is not a valid integer"),
         ({"command": "ask", "target": "weather"}, "expected"),
