@@ -24,7 +24,7 @@ from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
 from sbi_active.cli.output import as_json
-from sbi_active.cli.trials import status, sum_up_campaign
+from sbi_active.cli.trials import described, status, sum_up_campaign
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
@@ -161,18 +161,14 @@ def _record(
     """Return the figures of the last round; JSON has no NaN, but null."""
     trial = campaign.history[-1]
     assert trial.design is not None
-    assert trial.x is not None
     index, truth = trial.design.index, task.theta_true
     known = truth.isfinite().all()
     log_prob = float(campaign.belief.log_prob(truth)) if known else float("nan")
     record = {
         "round": len(campaign.history),
-        "action": trial.action.tolist(),
-        "status": trial.status,
-        "x": trial.x.flatten().tolist(),
+        **described(campaign, trial),
         "eig": float(trial.design.expected_information_gain[index]),
         "eig_se": float(trial.design.standard_error[index]),
-        "information_gained": trial.information_gained,
         "log_prob_true": log_prob,
         "num_simulations": trial.num_simulations,
         "seconds": trial.seconds,

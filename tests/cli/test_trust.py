@@ -41,6 +41,7 @@ READING = [
     ["correct", "camp", "0", "0.31"],
     ["withdraw", "camp", "0"],
     ["report", "camp"],
+    ["watch", "camp", "--once", "page.html"],
     ["repair", "camp"],
 ]
 SIMULATING = [

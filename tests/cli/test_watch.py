@@ -2,11 +2,13 @@
 
 import http.client
 import re
+import signal
 import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -161,6 +163,26 @@ def test_a_reader_that_leaves_is_no_error(server, capfd):
             leaving.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
     assert asked(server)[0] == 200
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_the_command_ends_by_an_interrupt(place):
+    code = "import sys; from sbi_active.cli import main; sys.exit(main())"
+    words = ["watch", str(place[0]), "--port", "0"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    port = re.fullmatch(r".* is shown at http://127.0.0.1:(\d+) until Ctrl-C\n", said)
+    assert port is not None, said
+    assert "2 trials told" in asked(SimpleNamespace(server_port=int(port[1])))[1]
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error == "sbi-active: interrupted; what was told before is kept\n"
 
 
 def test_nothing_of_the_folder_changes(place, capsys):
