@@ -77,24 +77,21 @@ CONFIG = _option(
     is_eager=True,
     callback=take_config,
 )
-SIMULATOR = _option("--simulator", "or file.py:NAME", metavar="MODULE:FUNCTION")
-SIMULATOR_NOW = _option(
+SIMULATOR = _option(
     "--simulator",
-    "where it is now; the campaign knows where it was",
-    metavar="MODULE:FN",
-)
-PRIOR = _option("--prior", "in place of bounds", metavar="MODULE:NAME")
-ACTIONS = _several(
-    "--actions",
-    "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
-    "A,B,...; or one MODULE:NAME of an action space",
-    metavar="SPEC ...",
+    "or file.py:NAME; where it is now, for a campaign that knows where it was",
+    metavar="MODULE:FUNCTION",
 )
 SPACE = [
-    PRIOR,
+    _option("--prior", "in place of bounds", metavar="MODULE:NAME"),
     _option("--theta-low", "one a parameter", metavar="A,B,..."),
     _option("--theta-high", "one a parameter", metavar="A,B,..."),
-    ACTIONS,
+    _several(
+        "--actions",
+        "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
+        "A,B,...; or one MODULE:NAME of an action space",
+        metavar="SPEC ...",
+    ),
     _option("--noise", "standard deviation of x or its entries", metavar="SD[,SD...]"),
 ]
 EFFECTS = _option(
@@ -278,7 +275,7 @@ _add(
 _add(
     "ask",
     "Design the next trial, or show the pending one.",
-    SIMULATOR_NOW,
+    SIMULATOR,
     _option("--target", "theta, model or a parameter's name", default="auto"),
 )
 _add(
@@ -294,10 +291,10 @@ _add("repair", "Give up what is damaged, and say what that is.")
 _add(
     "update",
     "Bring the belief up to date.",
-    SIMULATOR_NOW,
+    SIMULATOR,
     _flag("--simulator-changed", "take another than before, compute all again"),
 )
-_add("adopt", "Go on with the effects that a verdict names.", SIMULATOR_NOW, EFFECTS)
+_add("adopt", "Go on with the effects that a verdict names.", SIMULATOR, EFFECTS)
 _add(
     "report",
     "Write one page that shows the campaign.",
@@ -306,13 +303,13 @@ _add(
 _add(
     "export",
     "Write belief and trials for ArviZ.",
-    *(SIMULATOR_NOW, SEED),
+    *(SIMULATOR, SEED),
     _option("--netcdf", "where to", FILE, "FILE.nc", required=True),
 )
 _add(
     "serve",
     'Answer requests of a program, a JSON object a line, as {"command": "ask"}.',
-    *(DIR, SIMULATOR_NOW, TRUST),
+    *(DIR, SIMULATOR, TRUST),
     place="session.serve",
 )
 _add(
