@@ -8,7 +8,6 @@ here.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import sys
 import warnings
@@ -21,12 +20,11 @@ from click.shell_completion import shell_complete
 
 from sbi_active.cli.commands import main as program
 from sbi_active.cli.declared import in_campaign
-from sbi_active.cli.words import (
+from sbi_active.cli.output import (
     FAILED,
     Answer,
-    as_json,
+    as_line,
     failure,
-    failure_json,
     flush,
     output_to_errors,
     say,
@@ -51,17 +49,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     shell = os.environ.get(COMPLETE)
     if shell:
         return shell_complete(program, {}, NAME, COMPLETE, shell)
-    options: dict[str, Any] = {}
-    answer: Any = None
+    is_json, answer = "--json" in words, None
     with contextlib.suppress(AttributeError, ValueError):
         # A terminal that has no such letter shows its number.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore
     try:
         _leave_out_campaigns()
-        answer = _answer(words, options)
+        answer = _answer(words, is_json)
         if isinstance(answer, Answer):
-            text = json.dumps(as_json(answer.data), allow_nan=False)
-            print(text if options["json"] else answer.text)
+            print(as_line(answer.data) if is_json else answer.text)
         if sys.stdout is not None:
             sys.stdout.flush()
         return answer if isinstance(answer, int) else 0
@@ -70,31 +66,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # as in "| head": nobody reads on
         status = FAILED
     except (Exception, KeyboardInterrupt) as error:
-        status, text = failure(error)
-        say(text, _folder(options))
-        if "--json" in words and not isinstance(answer, Answer):
+        found = failure(error)
+        status = found["status"]
+        say(found["message"])
+        if is_json and answer is None:
             with contextlib.suppress(OSError, ValueError):
-                print(json.dumps(failure_json(error, _folder(options))))
+                print(as_line({"error": found}))
     flush()
     return status
 
 
-def _answer(words: list[str], options: dict[str, Any]) -> Any:
+def _answer(words: list[str], is_json: bool) -> Any:
     """Run a command; the answer for programs has standard output for itself."""
-    is_json = "--json" in words
     with (
         output_to_errors() if is_json else contextlib.nullcontext(),
         warnings.catch_warnings(),
     ):
-        warnings.showwarning = lambda message, *_: say(
-            f"note: {message}", _folder(options)
-        )
-        with program.make_context(NAME, words, obj=options) as context:
+        warnings.showwarning = lambda message, *_: say(f"note: {message}")
+        with program.make_context(NAME, words) as context:
             return program.invoke(context)
-
-
-def _folder(options: dict[str, Any]) -> object:
-    return options.get("folder", options.get("trials", "DIR"))
 
 
 def _leave_out_campaigns() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -14,7 +13,7 @@ from torch.distributions import Distribution
 from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
-from sbi_active.cli.given import load_object, make_task
+from sbi_active.cli.given import problem_of
 from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate
@@ -33,23 +32,14 @@ LINES = 30
 def build(
     folder: Path,
     *,
-    task: str | None,
-    option: Sequence[str],
-    simulator: str | None,
-    prior: str | None,
-    actions: str | None,
     simulator_version: str,
     rows: int,
     seed: int,
     workers: int,
+    **problem: Any,
 ) -> None:
     """Simulate prior draws into a bank, from where it ended."""
-    if (task is None) == (simulator is None):
-        raise ValueError(
-            "expected --task or --simulator; got both or neither; give one of them"
-        )
-    source = _of_task(task, option) if task else _named(simulator, prior, actions)
-    model, drawn, space = source
+    model, drawn, space, _ = problem_of(**problem)
     missing = 0
     with (
         Bank(
@@ -78,21 +68,6 @@ def build(
     print(f"{folder}: {len(bank)} rows, {bank.counts}")
     if missing:
         print(f"note: {missing} rows are missing; run again to try them once more")
-
-
-def _of_task(name: str, options: Sequence[str]) -> tuple[Any, Any, Any]:
-    task = make_task(name, options)
-    return task.simulator, task.prior, task.actions
-
-
-def _named(*names: str | None) -> tuple[Any, Any, Any]:
-    if None in names:
-        raise ValueError(
-            "expected --prior and --actions with --simulator; got one without the "
-            "other; name them, as in --prior my_robot:prior"
-        )
-    simulator, prior, actions = [load_object(str(name)) for name in names]
-    return simulator, prior, actions
 
 
 @dataclass(frozen=True)

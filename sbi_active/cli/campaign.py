@@ -1,18 +1,32 @@
-"""``sbi-active init``, and what a campaign's folder is compared and shown with."""
+"""Commands on a campaign that compute, and the campaign of a folder for them."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.declared import declare, read_declared, write_declared
-from sbi_active.cli.folder import library_of
-from sbi_active.cli.given import actions_of, effects_of, prior_of, simulator_of
+from sbi_active.campaign.storage.damage import naming
+from sbi_active.campaign.storage.manifest import read_manifest
+from sbi_active.cli.declared import (
+    Declared,
+    declare,
+    read_declared,
+    write_declared,
+)
+from sbi_active.cli.given import (
+    effects_of,
+    load_object,
+    make_task,
+    problem_of,
+    simulator_of,
+    with_generic,
+)
+from sbi_active.cli.output import Answer, say
 from sbi_active.cli.trials import status, sum_up_campaign
-from sbi_active.cli.words import Answer
+from sbi_active.criticism import Effect
+from sbi_active.simulation.bank.store import Store
 
 SIZES = ("num_simulations", "num_samples", "num_workers", "time_limit")
 
@@ -21,24 +35,23 @@ def init(
     folder: Path,
     *,
     config: Path | None,
-    simulator: str | None,
-    noise: str | None,
-    actions: Sequence[str],
     effects: str | None,
     method: str,
     seed: int,
+    names: str | None,
+    units: str | None,
     **options: Any,
 ) -> None:
     """Make a campaign in a new folder."""
-    declared = declare(simulator, noise, options["prior"], actions, effects)
-    sizes = {name: options[name] for name in SIZES if options[name] is not None}
-    bounds = options["theta_low"], options["theta_high"]
-    space = actions_of(actions)
-    for what in ("names", "units"):
-        _label(space, what, options[what])
+    sizes = {name: options.pop(name) for name in SIZES}
+    sizes = {name: size for name, size in sizes.items() if size is not None}
+    declared = declare(effects=effects, **options)
+    simulator, prior, space, _ = problem_of(**options)
+    _label(space, "names", names)
+    _label(space, "units", units)
     with Campaign(
-        simulator_of(declared["simulator"], noise),
-        prior_of(options["prior"], *bounds),
+        simulator,
+        prior,
         space,
         method=method,
         effects=effects_of(declared["effects"]),
@@ -69,8 +82,7 @@ def criticize(
     campaign: Campaign, *, effects: str | None, out: Path | None = None
 ) -> None:
     """Compare the campaign's simulator with its trials, and print the report."""
-    own = [] if effects is None else [effects]
-    report = campaign.criticize(library_of(campaign, effects_of(own)))
+    report = campaign.criticize(library_of(campaign, effects_of([effects])))
     print(report)
     if out is not None:
         print(f"\nsaved: {report.save(out)}")
@@ -81,12 +93,13 @@ def criticize(
 
 def adopt(campaign: Campaign, *, effects: str | None) -> Answer:
     """Go on with the simulator that the verdict names."""
-    own = [] if effects is None else [effects]
-    report = campaign.criticize(library_of(campaign, effects_of(own)), evaluate=False)
+    report = campaign.criticize(
+        library_of(campaign, effects_of([effects])), evaluate=False
+    )
     campaign.adopt(report)
     if effects is not None:
         _declare_effects(Path(str(campaign.directory)), effects)
-    print(f"adopted: {report.verdict}", file=sys.stderr)
+    say(f"adopted: {report.verdict}")
     return status(campaign)
 
 
@@ -96,7 +109,7 @@ def _declare_effects(folder: Path, name: str) -> None:
     module, colon, attribute = name.partition(":")
     if module.endswith(".py"):
         name = f"{Path(module).resolve()}{colon}{attribute}"
-    effects = [*(declared.get("effects") or ()), name]
+    effects = [*declared["effects"], name]
     write_declared(folder, {**declared, "effects": [*dict.fromkeys(effects)]})
 
 
@@ -113,10 +126,9 @@ def export(campaign: Campaign, *, netcdf: Path, seed: int) -> Answer:
     from sbi_active.export import to_inference_data
 
     if campaign.simulator is None:
-        print(
-            "sbi-active: note: without predictions and likelihoods, for which the "
-            "simulator runs: add --simulator, or --trust",
-            file=sys.stderr,
+        say(
+            "note: without predictions and likelihoods, for which the simulator runs: "
+            "add --simulator, or --trust"
         )
     data = to_inference_data(campaign, seed=seed)
     try:
@@ -131,3 +143,85 @@ def export(campaign: Campaign, *, netcdf: Path, seed: int) -> Answer:
 
 def _saved(path: object) -> Answer:
     return Answer({"saved": str(path)}, f"saved: {path}")
+
+
+def open_campaign(
+    folder: Path,
+    *,
+    simulates: bool,
+    simulator: str | None = None,
+    trust: bool = False,
+    simulator_changed: bool = False,
+    repair: bool = False,
+) -> Campaign:
+    """Return the campaign of a folder.
+
+    Args:
+        folder: Of the campaign.
+        simulates: Whether its simulator is needed; else nothing of the folder is
+            imported without --trust.
+        simulator: Where that is; None where the folder says.
+        trust: Whether to import what the folder names.
+        simulator_changed: Take another simulator than before.
+        repair: Give up what is damaged.
+
+    Raises:
+        ValueError: If there is no campaign, or nobody knows where its simulator is, or
+            only the folder says so.
+    """
+    declared = Declared(folder, trusts=trust)
+    given = {}
+    if simulates or trust:
+        with naming():
+            manifest = read_manifest(Store(folder, "campaign"))
+        lacking = [what for what in ("prior", "actions") if manifest[what] is None]
+        given = {what: _object_of(declared, what) for what in lacking}
+    reader = Campaign.load(folder, repair=repair, **given)
+    if not simulates:
+        return reader
+    model = _simulator_of(declared, simulator)
+    effects = effects_of(declared.names("effects"), declared.place)
+    if reader.state.version.effects:
+        effects = _with_usual(effects, model, reader)
+    changed = {"simulator_changed": simulator_changed}
+    return Campaign.load(folder, simulator=model, effects=effects, **changed, **given)
+
+
+def _object_of(declared: Declared, what: str) -> Any:
+    """Return an object of the task or the program that a folder declares."""
+    if declared.task is not None:
+        return getattr(make_task(declared.task, declared.options), what)
+    names = declared.names(what)
+    return load_object(names[0], declared.place) if names else None
+
+
+def _simulator_of(declared: Declared, name: str | None) -> Any:
+    if name is not None:
+        return simulator_of(name, declared.noise)
+    if declared.task is not None:
+        return _object_of(declared, "simulator")
+    names = declared.names("simulator")
+    if not names:
+        raise ValueError(
+            "expected --simulator, since the campaign was made by a program; got none; "
+            "name it, as in --simulator my_robot.py:fn"
+        )
+    return simulator_of(names[0], declared.noise, declared.place)
+
+
+def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:
+    """Return the effects to compare, once each.
+
+    Args:
+        campaign: Whose own follow, and then those that are usual.
+        own: They come first.
+    """
+    taken = {effect.name for effect in own}
+    known = [effect for effect in campaign.effects if effect.name not in taken]
+    # An adopted effect is declared for the simulator without it.
+    base = getattr(campaign.simulator, "base", campaign.simulator)
+    return _with_usual([*own, *known], base, campaign)
+
+
+def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:
+    return with_generic(own, simulator, reader.actions, reader.first_prior)

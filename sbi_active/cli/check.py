@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,41 +12,20 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.given import actions_of, prior_of, simulator_of, with_noise
+from sbi_active.cli.given import problem_of
+from sbi_active.cli.output import say
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.simulation.check import check_simulator
-from sbi_active.tasks import get_task  # pyright: ignore
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
 LONG = 20.0  # seconds of simulation a round, beside which learning counts little
 
 
-def check(
-    simulator: str | None,
-    *,
-    task: str | None,
-    noise: str | None,
-    rows: int,
-    rounds: int,
-    workers: int,
-    seed: int,
-    **space: Any,
-) -> int:
+def check(*, rows: int, rounds: int, workers: int, seed: int, **problem: Any) -> int:
     """Look a simulator over; status 1 where a campaign cannot run."""
-    if (task is None) == (simulator is None):
-        raise ValueError(
-            "expected MODULE:FUNCTION or --task; got both or neither; give one, as "
-            "in sbi-active check my_robot.py:simulator"
-        )
-    if simulator is not None:
-        model = simulator_of(simulator, noise)
-        prior, actions = _space(**space)
-    else:
-        found = get_task(str(task))
-        model = with_noise(found.simulator, noise)
-        prior, actions = found.prior, found.actions
-    print("sbi-active: running the simulator", file=sys.stderr)
+    model, prior, actions, _ = problem_of(**problem)
+    say("running the simulator")
     report = check_simulator(
         model,
         prior,
@@ -61,7 +38,7 @@ def check(
     # Where simulations take longer than this, they are what a campaign takes.
     is_short = 60 * (report.minutes or 0.0) <= LONG * rounds
     if report.is_ready and is_short:
-        print("sbi-active: timing a round", file=sys.stderr)
+        say("timing a round")
         try:
             seconds = _time_round(model, prior, actions, workers, seed)
             report = replace(report, seconds_round=seconds, num_rounds=rounds)
@@ -69,16 +46,6 @@ def check(
             report = replace(report, defects=(f"a round of a campaign fails: {error}",))
     print(report)
     return 0 if report.is_ready else 1
-
-
-def _space(
-    *,
-    prior: str | None,
-    theta_low: str | None,
-    theta_high: str | None,
-    actions: Sequence[str],
-) -> tuple[Distribution, ActionSpace]:
-    return prior_of(prior, theta_low, theta_high), actions_of(actions)
 
 
 def _time_round(

@@ -7,26 +7,22 @@ at once. A command's module is imported when the command is called.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
+from click import Argument, Choice, IntRange, Option
 
 from sbi_active.cli.options import (
     COUNT,
     FILE,
     FOLDER,
-    SECONDS,
-    TEXT,
-    WHOLE,
     Command,
-    Group,
     Several,
-    one_of,
     take_config,
     take_problem,
+    text,
 )
 
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
@@ -41,29 +37,23 @@ SETTINGS = ("default", "faithful")
 
 
 def _option(
-    name: str, help: str, type: Any = TEXT, metavar: str | None = None, **settings: Any
-) -> click.Option:
+    name: str, help: str, type: Any = text, metavar: str | None = None, **settings: Any
+) -> Option:
     shows = settings.get("default") not in (None, "")
     settings = {"type": type, "metavar": metavar, "show_default": shows, **settings}
-    return click.Option([name], help=help, **settings)
+    return settings.pop("kind", Option)([name], help=help, **settings)
 
 
-def _flag(name: str, help: str) -> click.Option:
-    return click.Option([name], is_flag=True, help=help)
+_flag = partial(_option, type=None, is_flag=True)
+_several = partial(_option, kind=Several, multiple=True)
 
 
-def _several(name: str, metavar: str, help: str) -> click.Option:
-    return Several([name], type=TEXT, metavar=f"{metavar} ...", help=help)
+def _argument(name: str, metavar: str, type: Any = FOLDER, **settings: Any) -> Argument:
+    return Argument([name], metavar=metavar, type=type, **settings)
 
 
-def _argument(name: str, metavar: str, type: Any = FOLDER, **settings: Any) -> Any:
-    return click.Argument([name], metavar=metavar, type=type, **settings)
-
-
-DIR, TRIAL = _argument("folder", "DIR"), _argument("trial", "TRIAL", WHOLE)
-TASK_NAME, METHOD_NAME = one_of(TASKS), one_of(METHODS)
-TASK_NAMES, METHOD_NAMES = (f"one of: {', '.join(n)}" for n in (TASKS, METHODS))
-A_TASK = _option("--task", TASK_NAMES, TASK_NAME, "TASK")
+DIR, TRIAL = _argument("folder", "DIR"), _argument("trial", "TRIAL", int)
+A_TASK = _option("--task", "with all that is declared of it", Choice(TASKS))
 OF_TASK = _option(
     "--option",
     "of the task, as often as wanted: variant=sinh, target=2, noise=0.01, "
@@ -71,8 +61,8 @@ OF_TASK = _option(
     metavar="NAME=VALUE",
     multiple=True,
 )
-METHOD = _option("--method", METHOD_NAMES, METHOD_NAME, "METHOD", default="asbi")
-SEED = _option("--seed", "of all that is random", WHOLE, default=0)
+METHOD = _option("--method", "by which it learns", Choice(METHODS), default="asbi")
+SEED = _option("--seed", "of all that is random", int, default=0)
 ROUNDS = _option("--rounds", "real trials", COUNT, default=4)
 WORKERS = _option("--workers", "processes", COUNT, default=1)
 JSON = _flag("--json", "for programs, errors too")
@@ -87,27 +77,22 @@ CONFIG = _option(
     is_eager=True,
     callback=take_config,
 )
-SIMULATOR = _option("--simulator", "or file.py:NAME", metavar="MODULE:FUNCTION")
-SIMULATOR_NOW = _option(
+SIMULATOR = _option(
     "--simulator",
-    "where it is now; the campaign knows where it was",
-    metavar="MODULE:FN",
-)
-PRIOR = _option("--prior", "in place of bounds", metavar="MODULE:NAME")
-ACTIONS = _several(
-    "--actions",
-    "SPEC",
-    "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
-    "A,B,...; or one MODULE:NAME of an action space",
+    "or file.py:NAME; where it is now, for a campaign that knows where it was",
+    metavar="MODULE:FUNCTION",
 )
 SPACE = [
-    PRIOR,
+    _option("--prior", "in place of bounds", metavar="MODULE:NAME"),
     _option("--theta-low", "one a parameter", metavar="A,B,..."),
     _option("--theta-high", "one a parameter", metavar="A,B,..."),
-    ACTIONS,
-    _option(
-        "--noise", "standard deviation of x or of its entries", metavar="SD[,SD...]"
+    _several(
+        "--actions",
+        "for each entry of the action LOW:HIGH (any number between), LOW:HIGH:COUNT or "
+        "A,B,...; or one MODULE:NAME of an action space",
+        metavar="SPEC ...",
     ),
+    _option("--noise", "standard deviation of x or its entries", metavar="SD[,SD...]"),
 ]
 EFFECTS = _option(
     "--effects",
@@ -116,31 +101,30 @@ EFFECTS = _option(
 )
 REASON = _option("--reason", "kept with the trial", default="")
 OUTCOME = [
-    _argument("x", "[X]...", nargs=-1, type=TEXT, required=False),
+    _argument("x", "[X]...", text, nargs=-1, required=False),
     _option("--file", "with the numbers", FILE, "X.csv"),
     _flag("--invalid", "it ran and gave no measurement"),
     _flag("--missing", "a fault that tells nothing hit it"),
     _option("--action", "executed, where not the one asked for", metavar="A,B,..."),
 ]
 RUN = [
-    _argument("task", "TASK", TASK_NAME),
+    _argument("task", "TASK", Choice(TASKS)),
     *(METHOD, ROUNDS, SEED, OF_TASK),
     _option("--out", "folder for the results", FOLDER, "DIR", required=True),
     _option(
-        "--setting", "the paper's is faithful", one_of(SETTINGS), default="default"
+        "--setting", "the paper's is faithful", Choice(SETTINGS), default="default"
     ),
     _option("--simulations", "to train on, a round", COUNT),
     _option("--samples", "for the gain, a candidate action", COUNT),
     _option("--iterations", "training steps a round", COUNT),
 ]
 BUILD = [
-    *(DIR, A_TASK, OF_TASK, SIMULATOR, PRIOR, SEED, WORKERS),
-    _option("--actions", "with --simulator", metavar="MODULE:NAME"),
+    *(DIR, A_TASK, OF_TASK, SIMULATOR, *SPACE, SEED, WORKERS),
     _option("--simulator-version", "in place of its source code", default=""),
     _option("--rows", "in the bank, in all", COUNT, required=True),
 ]
 CHECK = [
-    _argument("simulator", "[MODULE:FUNCTION]", TEXT, required=False),
+    _argument("simulator", "[MODULE:FUNCTION]", text, required=False),
     *(A_TASK, *SPACE, ROUNDS, WORKERS, SEED),
     _option("--rows", "a check", COUNT, default=256),
 ]
@@ -148,25 +132,27 @@ INIT = [
     *(DIR, CONFIG, SIMULATOR, *SPACE, EFFECTS, METHOD, SEED),
     _option("--names", "of the action's entries", metavar="A,B,..."),
     _option("--units", "of the action's entries", metavar="A,B,..."),
-    _option("--num-simulations", "a round", WHOLE, "N"),
-    _option("--num-samples", "a candidate action", WHOLE, "N"),
-    _option("--num-workers", "processes", WHOLE, "N"),
-    _option("--time-limit", "s a simulation", SECONDS, "S"),
+    _option("--num-simulations", "a round", int, "N"),
+    _option("--num-samples", "a candidate action", int, "N"),
+    _option("--num-workers", "processes", int, "N"),
+    _option("--time-limit", "s a simulation", float, "S"),
 ]
 CRITICIZE = [
     _argument("trials", "TRIALS.csv", FILE, is_eager=True, callback=take_problem),
     *(CONFIG, A_TASK, SIMULATOR, *SPACE, EFFECTS, SEED, TRUST),
     _several(
         "--columns",
-        "KEY=NAME[,NAME...]",
         "columns that are trial, time, action, x, input, start, role, index or "
         "repeat_of, where they are named otherwise, as in trial=ball,drop x=height_m",
+        metavar="KEY=NAME[,NAME...] ...",
     ),
-    _several("--units", "NAME=UNIT", "of columns without a unit in the header"),
+    _several(
+        "--units", "of columns without a unit in the header", metavar="NAME=UNIT ..."
+    ),
     _option(
         "--order",
         "unknown: rows (or the column index) are not the order of execution",
-        one_of(("known", "unknown")),
+        Choice(("known", "unknown")),
         default="known",
     ),
     _option(
@@ -178,14 +164,13 @@ CRITICIZE = [
     _option(
         "--input-hold",
         "between two times an input has the value before, or is linear",
-        one_of(("previous", "linear")),
+        Choice(("previous", "linear")),
         default="previous",
     ),
     _flag("--no-thin", "use all samples of trajectories, with measurement_sd declared"),
     _flag("--designed", "the actions were chosen for their information"),
     _option("--out", "folder for the report", FOLDER, "DIR"),
 ]
-CHANGED = _flag("--simulator-changed", "take another than before, compute all again")
 TRIALS_CSV = """
 Find what a simulator lacks, from measured trials. Find the residual, trace it to an
 effect that the simulator lacks, add it, and report the error before and after.
@@ -199,39 +184,47 @@ knows its simulator and its prior, or of recordings, with trials.csv or one file
 trial.
 """
 
-main = Group(
+main = click.Group(
     "sbi-active",
     help="Tune a black-box simulator from a handful of real trials.",
     epilog="Exit status: 0; 1 where something failed, as in the simulator; 2 where the "
     "call or a file has to be changed; 130 after an interrupt.",
     context_settings={"help_option_names": ["-h", "--help"]},
+    no_args_is_help=False,
 )
 VERSION = {"message": "%(version)s", "help": "Show the version and exit."}
 click.version_option(package_name="sbi-active", **VERSION)(main)
-bank = Group("bank", help="Simulate into a bank, and inspect one.")
+bank = click.Group(
+    "bank", help="Simulate into a bank, and inspect one.", no_args_is_help=False
+)
 main.add_command(bank)
 
 
 def _add(
     name: str,
-    place: str,
-    params: Sequence[click.Parameter],
     help: str,
-    to: Group = main,
+    *params: click.Parameter,
+    place: str = "",
+    to: click.Group = main,
 ) -> None:
-    """Add a command, whose function has a place as ``module.name``."""
-    call = partial(_call, *place.split("."))
-    to.add_command(Command(name, callback=call, params=[*params], help=help))
+    """Add a command; one without a place is on a campaign, and answers programs too.
+
+    Args:
+        name: What is written.
+        help: What it does.
+        *params: Its arguments and options.
+        place: Of its function, as ``module.name``.
+        to: The commands that it belongs to.
+    """
+    call = partial(_call, place) if place else partial(_call_on_campaign, name)
+    params = params if place else (DIR, *params, JSON, TRUST)
+    # Words like -1e-3 are numbers; those that are no option are found by the command.
+    settings = {"ignore_unknown_options": True, **main.context_settings}
+    to.add_command(Command(name, settings, callback=call, params=[*params], help=help))
 
 
-def _steer(name: str, help: str, *params: click.Parameter) -> None:
-    """Add a command on a campaign, which answers programs too."""
-    given = [DIR, *params, JSON, TRUST]
-    call = partial(_call_on_campaign, name)
-    main.add_command(Command(name, callback=call, params=given, help=help))
-
-
-def _call(module: str, function: str, **options: Any) -> Any:
+def _call(place: str, **options: Any) -> Any:
+    module, function = place.split(".")
     found = importlib.import_module(f"sbi_active.cli.{module}")
     return getattr(found, function)(**options)
 
@@ -239,64 +232,97 @@ def _call(module: str, function: str, **options: Any) -> Any:
 def _call_on_campaign(name: str, folder: Path, *, json: bool, **options: Any) -> Any:
     from sbi_active.cli.session import Session
 
-    held = click.get_current_context().obj.get("session")
-    with held or Session(folder) as session:
+    with click.get_current_context().obj or Session(folder) as session:
         return session.call(name, **options)
 
 
 _add(
     "migrate",
-    "bank.migrate",
-    [DIR],
     "Bring a campaign or bank of release 0.1 up to date.",
+    DIR,
+    place="bank.migrate",
 )
-_add("run", "run.run", RUN, "Run a campaign on a task.")
-_add("build", "bank.build", BUILD, "Simulate into a bank, from where it ended.", bank)
-_add("inspect", "bank.inspect", [DIR], "Show outcomes, and compare checksums.", bank)
+_add("run", "Run a campaign on a task.", *RUN, place="run.run")
+_add(
+    "build",
+    "Simulate into a bank, from where it ended.",
+    *BUILD,
+    place="bank.build",
+    to=bank,
+)
+_add(
+    "inspect",
+    "Show outcomes, and compare checksums.",
+    DIR,
+    place="bank.inspect",
+    to=bank,
+)
 _add(
     "check",
-    "check.check",
-    CHECK,
     "Look a simulator over before a campaign. Shapes, seeds, noise, lost rows, "
     "parameters that change nothing, and the cost of a campaign; exit status 1 where "
     "something keeps a campaign from working.",
+    *CHECK,
+    place="check.check",
 )
-_add("criticize", "criticize.criticize", CRITICIZE, TRIALS_CSV)
+_add("criticize", TRIALS_CSV, *CRITICIZE, place="criticize.criticize")
 _add(
-    "init", "campaign.init", INIT, "Make a campaign in a new folder, also by --config."
+    "init",
+    "Make a campaign in a new folder, also by --config.",
+    *INIT,
+    place="campaign.init",
 )
-_steer(
+_add(
     "ask",
     "Design the next trial, or show the pending one.",
-    SIMULATOR_NOW,
+    SIMULATOR,
     _option("--target", "theta, model or a parameter's name", default="auto"),
 )
-_steer(
+_add(
     "tell",
     "Record what a trial gave. X are the numbers, nan for one not measured.",
     *OUTCOME,
-    _option("--trial", "None is the pending one, or a new one", WHOLE, "K"),
+    _option("--trial", "None is the pending one, or a new one", int, "K"),
 )
-_steer("correct", "Replace what was told of a trial.", TRIAL, *OUTCOME, REASON)
-_steer("withdraw", "Take a trial out of the belief.", TRIAL, REASON)
-_steer("status", "Show the trials, the belief and the health.")
-_steer("repair", "Give up what is damaged, and say what that is.")
-_steer("update", "Bring the belief up to date.", SIMULATOR_NOW, CHANGED)
-_steer("adopt", "Go on with the effects that a verdict names.", SIMULATOR_NOW, EFFECTS)
-_steer(
+_add("correct", "Replace what was told of a trial.", TRIAL, *OUTCOME, REASON)
+_add("withdraw", "Take a trial out of the belief.", TRIAL, REASON)
+_add("status", "Show the trials, the belief and the health.")
+_add("repair", "Give up what is damaged, and say what that is.")
+_add(
+    "update",
+    "Bring the belief up to date.",
+    SIMULATOR,
+    _flag("--simulator-changed", "take another than before, compute all again"),
+)
+_add("adopt", "Go on with the effects that a verdict names.", SIMULATOR, EFFECTS)
+_add(
     "report",
     "Write one page that shows the campaign.",
     _option("--out", "where to", FILE, "PAGE.html"),
 )
-_steer(
+_add(
     "export",
     "Write belief and trials for ArviZ.",
-    *(SIMULATOR_NOW, SEED),
+    *(SIMULATOR, SEED),
     _option("--netcdf", "where to", FILE, "FILE.nc", required=True),
 )
 _add(
     "serve",
-    "session.serve",
-    [DIR, SIMULATOR_NOW, TRUST],
     'Answer requests of a program, a JSON object a line, as {"command": "ask"}.',
+    *(DIR, SIMULATOR, TRUST),
+    place="session.serve",
+)
+_add(
+    "watch",
+    "Show a campaign in a browser while another process runs it. The page is drawn "
+    "again when the folder changes; the folder is only read.",
+    DIR,
+    _option(
+        "--port",
+        "of this machine alone; 0 is any free one",
+        IntRange(0, 65_535),
+        default=8642,
+    ),
+    _option("--once", "write the page, and end", FILE, "FILE.html"),
+    place="watch.watch",
 )

@@ -38,11 +38,13 @@ def names_object(specs: Sequence[str]) -> bool:
 
 
 def declare(
+    *,
     simulator: str | None,
     noise: str | None,
     prior: str | None,
     actions: Sequence[str],
     effects: str | None,
+    **_: Any,
 ) -> dict[str, Any]:
     """Return where everything is that a program wrote, as other commands need it."""
     if simulator is None:
@@ -76,26 +78,18 @@ def read_declared(folder: Path) -> dict[str, Any]:
         ValueError: If the file does not hold what the command line writes.
     """
     path = folder / DECLARED
-    try:
-        found = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return {}
-    except (ValueError, RecursionError):
-        found = None
-    found = found if isinstance(found, dict) else None
-    if found is not None:
-        effects = found.get("effects")  # a single one in earlier files
-        found["effects"] = [effects] if isinstance(effects, str) else effects or []
-        found.setdefault("options", [])
-    if found is None or not (
-        all(isinstance(found.get(name), str | None) for name in TEXTS)
-        and all(_is_texts(found[name]) for name in LISTS)
-    ):
-        raise ValueError(
-            f"expected {path} as sbi-active writes it; got another content; remove the "
-            "file, and name the simulator by --simulator"
-        )
-    return found
+    found: Any = None
+    with suppress(ValueError, RecursionError):
+        found = json.loads(path.read_bytes()) if path.exists() else {}
+    if isinstance(found, dict):
+        found = {**dict.fromkeys(LISTS, []), **found}
+        is_text = [isinstance(found.get(name), str | None) for name in TEXTS]
+        if all(is_text) and all(_is_texts(found[name]) for name in LISTS):
+            return found
+    raise ValueError(
+        f"expected {path} as sbi-active writes it; got another content; remove the "
+        "file, and name the simulator by --simulator"
+    )
 
 
 def _is_texts(value: Any) -> bool:
@@ -110,53 +104,71 @@ def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
     _remember(folder)
 
 
-def named(
-    declared: Mapping[str, Any], what: str, folder: Path, *, trusts: bool
-) -> list[str]:
-    """Return what a folder names under a key, each MODULE:NAME.
-
-    Args:
-        declared: Of the folder.
-        what: The key.
-        folder: Of the campaign.
-        trusts: Whether the command line says to follow it.
-
-    Raises:
-        ValueError: If it names something that may be anybody's program.
-    """
-    value = declared.get(what)
-    names = value if isinstance(value, list) else [value] if value else []
-    origin = Path(declared.get("folder") or "")
-    for name in names:
-        module = name.partition(":")[0]
-        place = origin / module if module.endswith(".py") else origin
-        require_trust(folder, f"{name} in {origin}", place, trusts=trusts)
-    return names
-
-
-def require_trust(folder: Path, what: str, place: Path | None, *, trusts: bool) -> None:
-    """Raise where nobody here said that what a folder names may be executed.
+class Declared:
+    """What the folder of a campaign names, where that may be imported.
 
     Args:
         folder: Of the campaign.
-        what: It names, for the error.
-        place: Where that would be imported from; None for this library.
-        trusts: Whether the command line says so.
+        trusts: Whether the command line says to import it, whoever wrote it.
 
-    Raises:
-        ValueError: If it has to be looked at first.
+    Attributes:
+        task: Its name, for a campaign on a task.
+        noise: As --noise had it.
+        place: Where names of files begin.
     """
-    # A relative place, or one within the folder, holds whatever somebody put there.
-    is_fixed = place is None or (place.is_absolute() and not _is_within(place, folder))
-    if trusts:
-        if is_fixed:
-            _remember(folder)
-    elif not (is_fixed and _record(folder).exists()):
-        raise ValueError(
-            f"expected programs that were named here; got {what}, which {DECLARED} in "
-            f"{folder} names and this account did not write or trust; look at it, then "
-            "add --trust to have it executed, or name your own by --simulator"
+
+    def __init__(self, folder: Path, *, trusts: bool) -> None:
+        self._folder, self._trusts = folder, trusts
+        self._content = read_declared(folder)
+        texts = (self._content.get(name) for name in ("task", "noise", "folder"))
+        self.task, self.noise, self.place = texts
+
+    def names(self, what: str) -> list[str]:
+        """Return what the folder names under a key, each MODULE:NAME.
+
+        Raises:
+            ValueError: If it names something that may be anybody's program.
+        """
+        value, origin = self._content.get(what) or [], Path(self.place or "")
+        names = value if isinstance(value, list) else [value]
+        for name in names:
+            module = name.partition(":")[0]
+            place = origin / module if module.endswith(".py") else origin
+            self._require_trust(f"{name} in {origin}", place)
+        return names
+
+    @property
+    def options(self) -> list[str]:
+        """Those of the task, of which some name files.
+
+        Raises:
+            ValueError: As :meth:`names` raises.
+        """
+        options = self._content["options"]
+        if options:
+            self._require_trust(f"options {' '.join(options)} of a task", None)
+        return options
+
+    def _require_trust(self, what: str, place: Path | None) -> None:
+        """Raise where nobody here said that what comes from a place may be executed.
+
+        None is this library. A relative place, or one within the folder, holds whatever
+        somebody put there.
+        """
+        folder = self._folder
+        is_fixed = place is None or (
+            place.is_absolute() and not _is_within(place, folder)
         )
+        if self._trusts:
+            if is_fixed:
+                _remember(folder)
+        elif not (is_fixed and _record(folder).exists()):
+            raise ValueError(
+                f"expected programs that were named here; got {what}, which {DECLARED} "
+                f"in {folder} names and this account did not write or trust; look at "
+                "it, then add --trust to have it executed, or name your own by "
+                "--simulator"
+            )
 
 
 def _is_within(place: Path, folder: Path) -> bool:

@@ -10,7 +10,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from sbi.utils import BoxUniform
@@ -24,7 +24,7 @@ from sbi_active.actions import (
 )
 from sbi_active.cli.declared import in_campaign, names_object
 from sbi_active.cli.options import number_of, numbers_of
-from sbi_active.cli.words import place_of
+from sbi_active.cli.output import place_of
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
@@ -63,15 +63,9 @@ def load_object(name: str, folder: str | None = None) -> Any:
     try:
         loaded = importlib.import_module(module)
     except (Exception, SystemExit) as error:
-        lacks = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
-        if lacks and lacks.partition(".")[0] == module.partition(".")[0]:
-            raise ValueError(
-                f"expected a module {module!r}; got none in {here} or among the "
-                "installed ones; run where it lies, or install it"
-            ) from error
         raise ValueError(
-            f"expected {name} to be imported; got {type(error).__name__}: {error}"
-            f"{place_of(error)}; correct it"
+            f"expected {name} to be imported, from {here} or as installed; got "
+            f"{type(error).__name__}: {error}{place_of(error)}; correct it"
         ) from error
     origin = getattr(loaded, "__file__", None)
     if file is not None and (origin is None or Path(origin).resolve() != file):
@@ -104,14 +98,6 @@ def make_task(name: str, options: Sequence[str]) -> Task:
         'sinh'
     """
     values = dict(_parse(option) for option in options)
-    if name in TASKS:
-        known = [*inspect.signature(TASKS[name]).parameters]
-        unknown = [option for option in values if option not in known]
-        if unknown:
-            raise ValueError(
-                f"expected options of {name!r} among {', '.join(known) or 'none'}; got "
-                f"{unknown[0]!r}; drop it or choose one of these"
-            )
     try:
         return get_task(name, **values)
     except ImportError as error:  # its text has the line that installs it
@@ -119,9 +105,10 @@ def make_task(name: str, options: Sequence[str]) -> Task:
     except FileNotFoundError as error:
         raise ValueError(f"{error}, as --option data=FOLDER") from error
     except TypeError as error:
+        known = ", ".join(inspect.signature(TASKS[name]).parameters) or "none"
         raise ValueError(
-            f"expected values that {name!r} can use; got {values} ({error}); "
-            "correct the types"
+            f"expected options of {name!r} among {known}, of their types; got "
+            f"{values} ({error}); correct them"
         ) from error
 
 
@@ -135,6 +122,71 @@ def _parse(option: str) -> tuple[str, Any]:
         return name, json.loads(text)
     except json.JSONDecodeError:
         return name, text
+
+
+class Problem(NamedTuple):
+    """What options declare.
+
+    Attributes:
+        simulator: With its noise.
+        prior: Over its parameters.
+        actions: Permitted ones; None where none were needed.
+        effects: What a task's simulator may lack.
+    """
+
+    simulator: Any
+    prior: Distribution
+    actions: Any
+    effects: Sequence[Effect] = ()
+
+
+def problem_of(
+    simulator: str | None,
+    *,
+    task: str | None = None,
+    option: Sequence[str] = (),
+    prior: str | None = None,
+    theta_low: str | None = None,
+    theta_high: str | None = None,
+    actions: Sequence[str] = (),
+    noise: str | None = None,
+    needs_actions: bool = True,
+) -> Problem:
+    """Return the simulator, prior and actions that options of these names give.
+
+    Args:
+        simulator: MODULE:NAME; None for a task's.
+        task: Name of a task, which has all but other actions and noise.
+        option: Of the task, each NAME=VALUE.
+        prior: MODULE:NAME.
+        theta_low: Bounds in its place.
+        theta_high: Bounds in its place.
+        actions: As :func:`actions_of` takes them.
+        noise: As :func:`with_noise` takes it.
+        needs_actions: Whether nothing can be done without them.
+
+    Raises:
+        ValueError: If too much or too little is given, or it is not what it has to be.
+    """
+    if (task is None) == (simulator is None):
+        raise ValueError(
+            "expected --simulator MODULE:FUNCTION or --task; got both or neither; give "
+            "one, as in my_robot.py:simulator"
+        )
+    if simulator is not None:
+        model = simulator_of(simulator, noise)
+        bounded = prior_of(prior, theta_low, theta_high)
+        space = actions_of(actions) if actions or needs_actions else None
+        return Problem(model, bounded, space)
+    if prior or theta_low or theta_high:
+        raise ValueError(
+            f"expected no prior with --task, which has one; got "
+            f"{prior or theta_low or theta_high}; drop one of them"
+        )
+    found = make_task(str(task), option)
+    space = actions_of(actions) if actions else found.actions
+    model, effects = with_noise(found.simulator, noise), getattr(found, "effects", list)
+    return Problem(model, found.prior, space, effects())
 
 
 def simulator_of(name: str, noise: str | None, folder: str | None = None) -> Any:
@@ -180,7 +232,7 @@ def prior_of(
 ) -> Distribution:
     """Return the prior that --prior, or --theta-low and --theta-high, name."""
     if prior is not None:
-        return _instance(prior, Distribution, "a torch distribution; name a prior")
+        return _instance(prior, Distribution, "a torch distribution")
     if theta_low is None or theta_high is None:
         raise ValueError(
             "expected --theta-low and --theta-high, or --prior; got too few; give "
@@ -195,11 +247,12 @@ def prior_of(
     return BoxUniform(torch.tensor(low), torch.tensor(high))
 
 
-def _instance(name: str, kind: type, expected: str) -> Any:
-    found, (what, _, rest) = load_object(name), expected.partition(";")
+def _instance(name: str, kind: type, what: str) -> Any:
+    found = load_object(name)
     if not isinstance(found, kind):
-        got = f"got {type(found).__name__} under {name}"
-        raise ValueError(f"expected {what}; {got};{rest}")
+        raise ValueError(
+            f"expected {what}; got {type(found).__name__} under {name}; name another"
+        )
     return found
 
 
@@ -211,46 +264,39 @@ def actions_of(specs: Sequence[str]) -> ActionSpace:
             "an entry of the action"
         )
     if names_object(specs):
-        what = "an action space; name one of sbi_active.actions"
-        return _instance(specs[0], ActionSpace, what)
-    ranges = [_range(spec) for spec in specs]
-    if None not in ranges:
-        low, high = zip(*[limits for limits in ranges if limits], strict=True)
+        return _instance(specs[0], ActionSpace, "a space of sbi_active.actions")
+    entries = [_entry(spec) for spec in specs]
+    limits = [entry for entry in entries if isinstance(entry, tuple)]
+    values = [entry for entry in entries if isinstance(entry, list)]
+    if not values:
+        low, high = zip(*limits, strict=True)
         return BoxActions([*low], [*high])
-    if any(ranges):
-        parts = [(f"action_{k}", spec) for k, spec in enumerate(specs)]
+    if limits:
         return MixedActions(
             *[
-                BoxActions(*[[limit] for limit in limits], names=[name])
-                if limits
-                else DiscreteActions(_axis(spec), names=[name])
-                for (name, spec), limits in zip(parts, ranges, strict=True)
+                DiscreteActions(entry, names=[f"action_{k}"])
+                if isinstance(entry, list)
+                else BoxActions([entry[0]], [entry[1]], names=[f"action_{k}"])
+                for k, entry in enumerate(entries)
             ]
         )
-    axes = [torch.tensor(_axis(spec)) for spec in specs]
-    _require_few(math.prod(map(len, axes)))
-    return DiscreteActions(torch.cartesian_prod(*axes))
+    _require_few(math.prod(map(len, values)))
+    return DiscreteActions(torch.cartesian_prod(*map(torch.tensor, values)))
 
 
-def _range(spec: str) -> tuple[float, float] | None:
-    """Return the limits that LOW:HIGH writes; None for anything else."""
-    if spec.count(":") != 1:
-        return None
-    low, high = map(number_of, spec.split(":"))
-    return low, high
-
-
-def _axis(spec: str) -> list[float]:
+def _entry(spec: str) -> tuple[float, float] | list[float]:
+    """Return the limits that LOW:HIGH writes, or the values that anything else does."""
     parts = spec.split(":")
     if len(parts) == 1:
         return numbers_of(spec)
-    if len(parts) != 3 or not parts[2].isdecimal() or int(parts[2]) < 1:
+    count = int(parts[2]) if len(parts) == 3 and parts[2].isdecimal() else 0
+    if len(parts) > 2 and count < 1:
         raise ValueError(
             f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; write, say, 0:5:11"
         )
     low, high = map(number_of, parts[:2])
-    _require_few(int(parts[2]))
-    return torch.linspace(low, high, int(parts[2])).tolist()
+    _require_few(count)
+    return torch.linspace(low, high, count).tolist() if count else (low, high)
 
 
 def _require_few(count: int) -> None:
@@ -261,18 +307,18 @@ def _require_few(count: int) -> None:
         )
 
 
-def effects_of(names: Sequence[str], folder: str | None = None) -> list[Effect]:
+def effects_of(names: Iterable[str | None], folder: str | None = None) -> list[Effect]:
     """Return effects, each name that of a list or of a function that returns one.
 
     Args:
-        names: As :func:`load_object` takes them.
+        names: As :func:`load_object` takes them; None is left out.
         folder: As there.
 
     Raises:
         ValueError: If there are none under a name.
     """
     effects: list[Effect] = []
-    for name in names:
+    for name in filter(None, names):
         listed: Any = load_object(name, folder)
         if callable(listed):
             listed = listed()

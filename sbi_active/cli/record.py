@@ -1,7 +1,7 @@
 """A campaign's trials as its folder sums them up: told and read without torch.
 
-A command that has computed leaves a summary in the folder. While nothing else was
-written since, :class:`Record` is all that ``tell``, ``correct``, ``withdraw`` and
+A command that has computed leaves a summary in the folder. What was told since is read
+from the log, and :class:`Record` is all that ``tell``, ``correct``, ``withdraw`` and
 ``status`` need. What it cannot judge alone is :class:`Unsure`, and the campaign is
 loaded.
 """
@@ -28,7 +28,7 @@ from sbi_active.simulation.bank.store import Store
 
 SUMMARY = "status.json"
 LOG, STATE = "log", "state"  # records of a campaign, see its storage
-UNSCORED = {"information_gained": None, "surprise": None}
+TOLD = ("told", "corrected", "withdrawn")  # events that compute nothing
 
 
 class Unsure(Exception):  # noqa: N818
@@ -42,7 +42,8 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
         folder: Of the campaign.
         known: What :class:`Record` needs.
     """
-    content = {**known, "of": digest(folder)}
+    with _stored(folder) as store:
+        content = {**known, "of": _mark(store, store.length(EVENTS, LOG))}
     temporary = folder / f".{os.getpid()}-{SUMMARY}"
     with contextlib.suppress(OSError):  # as in a folder that is read only
         with open(temporary, "x", encoding="utf-8") as file:  # follows no link
@@ -57,22 +58,23 @@ def digest(folder: Path) -> str:
         folder: Of the campaign.
     """
     with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
-        num = store.length(EVENTS, LOG)
-        last = store.get(EVENTS, LOG, num) if num else None
-        parts = (str(num).encode(), last or b"", store.get(OBJECTS, STATE) or b"")
-        return hashlib.sha256(b"".join(parts)).hexdigest()
+        return str(_mark(store, store.length(EVENTS, LOG)))
     return ""
+
+
+def _mark(store: Store, num: int) -> list[Any]:
+    """Return how long the log is, and a checksum of its end and of the state."""
+    last = store.get(EVENTS, LOG, num) if num else None
+    content = (last or b"") + (store.get(OBJECTS, STATE) or b"")
+    return [num, hashlib.sha256(content).hexdigest()]
 
 
 @contextlib.contextmanager
 def _stored(folder: Path) -> Iterator[Store]:
     if not (folder / NAME).exists():
         raise Unsure
-    store = Store(folder, "campaign")
-    try:
+    with naming(), contextlib.closing(Store(folder, "campaign")) as store:
         yield store
-    finally:
-        store.close()
 
 
 class Record:
@@ -87,7 +89,7 @@ class Record:
         state: Has the trials.
 
     Raises:
-        Unsure: If there is no summary, or it is of before.
+        Unsure: If there is no summary, or more was done since than told.
         ValueError: If the folder's programs are not declared as they are written.
     """
 
@@ -95,12 +97,23 @@ class Record:
 
     def __init__(self, folder: Path) -> None:
         read_declared(folder)
-        self.directory = folder
+        self.directory, self._facts = folder, {}
         try:
             self._summary = json.loads((folder / SUMMARY).read_bytes())
-            self._require_same()
             self.x_shape: list[int] = self._summary["x_shape"]
-            self.state = SimpleNamespace(trials=self._summary["status"]["trials"])
+            self._status = self._summary["status"]
+            self.state = SimpleNamespace(trials=self._status["trials"])
+            num = self._summary["of"][0]
+            with _stored(folder) as store:
+                self._num = store.length(EVENTS, LOG)
+                if self._summary["of"] != _mark(store, num):
+                    raise Unsure
+                numbers = range(1, self._num + 1)
+                lines = [store.get(EVENTS, LOG, k) or b"{}" for k in numbers]
+            for number, entry in enumerate(map(json.loads, lines), start=1):
+                self._take(entry, is_new=number > num)
+            if len(self._facts) != len(self.state.trials):
+                raise Unsure
         except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
             raise Unsure from error
 
@@ -111,20 +124,19 @@ class Record:
         Raises:
             Unsure: If a trial that the belief has used is another one now.
         """
-        if not self._summary["is_sure"]:
+        if {*self._status["not_in_belief"]} & {*self._summary["processed"]}:
             raise Unsure
-        return self._summary["status"]
+        return self._status
 
     def tell(self, x: Any, *, trial: int | None, action: Any, status: str) -> Any:
         """Record the outcome of the pending trial, or of a new one with an action."""
         trials = self.state.trials
         pending = [t["trial"] for t in trials if t["status"] == "pending"]
         index = [*pending, len(trials)][0] if trial is None else trial
+        before = {"index": index, "action": None, "target": None, "reason": ""}
         if index in pending:
-            before = self._facts()[index]
-        elif index == len(trials) and action is not None:
-            before = {"index": index, "action": None, "target": None, "reason": ""}
-        else:  # a trial told again, or none
+            before = self._facts[index]
+        elif index != len(trials) or action is None:  # a trial told again, or none
             raise Unsure
         return self._write("told", self._told(before, x, action, status))
 
@@ -132,34 +144,17 @@ class Record:
         self, trial: int, x: Any, *, action: Any, status: str, reason: str
     ) -> Any:
         """Replace what was told of a trial."""
-        before = self._facts()[trial]
-        if before["status"] == "pending":
-            raise Unsure
+        before = self._facts[trial]
         told = self._told(before, x, action, status)
-        if told == before:  # which stays as it was scored
+        # One told as before stays as it was scored.
+        if before["status"] == "pending" or told == before:
             raise Unsure
         return self._write("corrected", {**told, "reason": reason})
 
     def withdraw(self, trial: int, *, reason: str) -> Any:
         """Take a trial out."""
-        before = self._facts()[trial]
-        return self._write(
-            "withdrawn", {**before, "status": "withdrawn", "reason": reason}
-        )
-
-    def _require_same(self) -> None:
-        if not self._summary["of"] or self._summary["of"] != digest(self.directory):
-            raise Unsure
-
-    def _facts(self) -> list[dict[str, Any]]:
-        """Return each trial as the log has it last."""
-        with naming(), _stored(self.directory) as store:
-            numbers = range(1, store.length(EVENTS, LOG) + 1)
-            entries = [json.loads(store.get(EVENTS, LOG, k) or b"{}") for k in numbers]
-        facts = {e["trial"]["index"]: e["trial"] for e in entries if "trial" in e}
-        if [*sorted(facts)] != [*range(len(self.state.trials))]:
-            raise Unsure
-        return [facts[index] for index in sorted(facts)]
+        facts = {**self._facts[trial], "status": "withdrawn", "reason": reason}
+        return self._write("withdrawn", facts)
 
     def _told(
         self, before: Mapping[str, Any], x: Any, action: Any, status: str
@@ -189,34 +184,36 @@ class Record:
 
     def _write(self, event: str, facts: dict[str, Any]) -> dict[str, Any]:
         time = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        with naming(), _stored(self.directory) as store:
-            with store.writing((EVENTS, LOG)) as number:
-                self._require_same()
-                line = {"line": number, "time": time, "event": event, "trial": facts}
-                store.put(EVENTS, LOG, number, line)
-            return self._noted(facts)
+        with _stored(self.directory) as store, store.writing((EVENTS, LOG)) as number:
+            if number != self._num + 1:  # another process was faster
+                raise Unsure
+            line = {"line": number, "time": time, "event": event, "trial": facts}
+            store.put(EVENTS, LOG, number, line)
+        self._take(line, is_new=True)
+        return self.state.trials[facts["index"]]
 
-    def _noted(self, facts: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a trial as it is now, and sum up anew."""
-        index, trials = facts["index"], self.state.trials
-        labels = {name: self._summary[name] for name in ("names", "units")}
-        told = {
-            "trial": index,
-            "status": facts["status"],
-            "action": facts["action"],
-            **labels,
-            "x": None if facts["x"] is None else _numbers(facts["x"]),
-            **UNSCORED,
-            "reason": facts["reason"],
-        }
-        trials[index : index + 1] = [told]
-        found = self._summary["status"]
-        waiting = sorted({*found["not_in_belief"], index})
-        status = {**found, "not_in_belief": waiting}
-        is_sure = self._summary["is_sure"] and index not in self._summary["processed"]
-        known = {**self._summary, "status": status, "is_sure": is_sure}
-        sum_up(self.directory, known)
-        return told
+    def _take(self, entry: Mapping[str, Any], *, is_new: bool) -> None:
+        """Take a line of the log, which a new one changes the trials by."""
+        if is_new and entry["event"] not in TOLD:
+            raise Unsure
+        facts = entry.get("trial")
+        if facts is None:
+            return
+        index = facts["index"]
+        self._facts[index] = facts
+        if is_new:
+            numbers = None if facts["x"] is None else flat(facts["x"])
+            told = {
+                "trial": index,
+                **{name: facts[name] for name in ("status", "action")},
+                **{name: self._summary[name] for name in ("names", "units")},
+                "x": numbers and [math.nan if v is None else v for v in numbers],
+                **{"information_gained": None, "surprise": None},
+                "reason": facts["reason"],
+            }
+            self.state.trials[index : index + 1] = [told]
+            waiting = {*self._status["not_in_belief"], index}
+            self._status["not_in_belief"] = sorted(waiting)
 
 
 def shaped(numbers: list[Any], shape: Sequence[int]) -> Any:
@@ -233,7 +230,3 @@ def _single(x: Any) -> Any:
     if isinstance(x, list):
         return [_single(part) for part in x]
     return None if x is None or x != x else struct.unpack("f", struct.pack("f", x))[0]
-
-
-def _numbers(x: Any) -> list[float]:
-    return [math.nan if v is None else v for v in flat(x)]

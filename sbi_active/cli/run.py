@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,9 +23,8 @@ from sbi_active.campaign import Campaign, CampaignOptions, Trial
 from sbi_active.campaign.learning.methods import faithful_options, find_method
 from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
-from sbi_active.cli.trials import sum_up_campaign
-from sbi_active.cli.words import as_json
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.cli.output import as_json
+from sbi_active.cli.trials import described, status, sum_up_campaign
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.plots import as_table, plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
@@ -49,38 +46,6 @@ COLUMNS = {
 }
 
 
-class Progress:
-    """A bar of rounds that names the present step and goes on counting seconds.
-
-    Args:
-        total: Rounds.
-        name: In front of the bar.
-    """
-
-    #: Seconds between two signs of life: on a terminal, and in a file.
-    SIGN, SIGN_IN_FILE = 1.0, 30.0
-
-    def __init__(self, total: int, name: str) -> None:
-        self._bar = tqdm(total=total, desc=name, unit="round", mininterval=0)
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._tick, daemon=True)
-        self.step, self.count = self._bar.set_postfix_str, self._bar.update
-
-    def __enter__(self) -> Progress:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-        self._bar.close()
-
-    def _tick(self) -> None:
-        interval = self.SIGN if sys.stderr.isatty() else self.SIGN_IN_FILE
-        while not self._over.wait(interval):
-            self._bar.refresh()
-
-
 def run(
     task: str,
     *,
@@ -94,57 +59,45 @@ def run(
 ) -> None:
     """Run a campaign on a task, and save its table, figure and results."""
     start = time.perf_counter()
-    records, gains = [], []
-    with Progress(rounds, method) as progress:
-        progress.step("preparing the task")
-        problem = make_task(task, option)
-        campaign = Campaign(
-            problem.simulator,
-            problem.prior,
-            problem.actions,
-            method=method,
-            seed=seed,
-            options=_campaign_options(setting, method, **sizes),
-            directory=(folder := _new_folder(out)),
+    problem = make_task(task, option)
+    campaign = Campaign(
+        problem.simulator,
+        problem.prior,
+        problem.actions,
+        method=method,
+        seed=seed,
+        options=_campaign_options(setting, method, **sizes),
+        directory=(folder := _new_folder(out)),
+        show_progress=sys.stderr.isatty(),
+    )
+    write_declared(folder, declared_of_task(task, option))
+    records, gains, beliefs = [], [], [campaign.belief]
+    for index in tqdm(range(rounds), desc=method, unit="round"):
+        gains.append(_exact_gain(problem, campaign))
+        action = campaign.ask().action
+        real = derive_seed(seed, "real", index)
+        campaign.tell(problem.real_system(action, seed=real))
+        beliefs.append(campaign.update())
+        records.append(_record(problem, campaign, gains[-1]))
+    wall = time.perf_counter() - start
+    with forked_generators(seed, "figure"):
+        figure = plot_rounds(
+            beliefs,
+            [t.design for t in campaign.history if t.design is not None],
+            parameter_names=problem.parameter_names,
+            theta_true=problem.theta_true,
+            exact_gains=gains,
         )
-        write_declared(folder, declared_of_task(task, option))
-        beliefs = [campaign.belief]
-        for index in range(rounds):
-            progress.step("looking up what is exact")
-            gains.append(_exact_gain(problem, campaign))
-            progress.step("simulating, training and designing")
-            trial = campaign.ask()
-            progress.step("measuring")
-            real = derive_seed(seed, "real", index)
-            campaign.tell(problem.real_system(trial.action, seed=real))
-            progress.step("updating the belief")
-            beliefs.append(campaign.update())
-            records.append(_round_record(problem, campaign, gains[-1]))
-            progress.count()
-        wall = time.perf_counter() - start
-        progress.step("drawing and saving")
-        with forked_generators(seed, "figure"):
-            figure = plot_rounds(
-                beliefs,
-                [t.design for t in campaign.history if t.design is not None],
-                parameter_names=problem.parameter_names,
-                theta_true=problem.theta_true,
-                exact_gains=gains,
-            )
-        save(figure, str(out / "loop.png"))
-        said = {"task": task, "options": [*option], "method": method}
-        said |= {"setting": setting, "seed": seed, "version": __version__}
-        _save(out, campaign, {**said, "seconds": wall, "rounds": records}, seed)
-        sum_up_campaign(campaign)
-        campaign.close()
+    save(figure, str(out / "loop.png"))
+    said = {"task": task, "options": [*option], "method": method}
+    said |= {"setting": setting, "seed": seed, "version": __version__}
+    _save(out, campaign, {**said, "seconds": wall, "rounds": records}, seed)
+    sum_up_campaign(campaign)
+    campaign.close()
+    names = zip(problem.parameter_names, problem.theta_true, strict=True)
     print(_table(records))
-    belief = campaign.belief
-    moments = zip(belief.mean, belief.variance.sqrt(), problem.theta_true, strict=True)
-    for name, (m, s, truth) in zip(problem.parameter_names, moments, strict=True):
-        print(f"{name}: {m:.4g} +- {s:.2g} (truth {truth:g})")
-    diagnostics = getattr(belief, "diagnostics", Diagnostics())
-    for warning in (*diagnostics.warnings, *diagnostics.network_warnings):
-        print(f"note: {warning}")
+    print(f"\n{status(campaign).text}")
+    print(f"the truth: {', '.join(f'{name} = {value:g}' for name, value in names)}")
     print(f"{wall:.1f} s; figure: {out / 'loop.png'}; results: {out}")
     print(f"to go on with it: sbi-active ask {folder}")
 
@@ -168,16 +121,16 @@ def _campaign_options(
     options = SETTINGS[setting](method)
     sizes = {"num_simulations": simulations, "num_samples": samples}
     options = replace(options, **{k: v for k, v in sizes.items() if v is not None})
-    if iterations is not None:
-        estimator = options.density_estimator or find_method(method).estimator
-        if not isinstance(estimator, MixtureDensity):
-            raise ValueError(
-                f"expected --iterations with a method that trains a mixture density; "
-                f"got --method {method}; leave it out"
-            )
-        estimator = replace(estimator, num_iterations=iterations)
-        options = replace(options, density_estimator=estimator)
-    return options
+    if iterations is None:
+        return options
+    estimator = options.density_estimator or find_method(method).estimator
+    if not isinstance(estimator, MixtureDensity):
+        raise ValueError(
+            f"expected --iterations with a method that trains a mixture density; got "
+            f"--method {method}; leave it out"
+        )
+    estimator = replace(estimator, num_iterations=iterations)
+    return replace(options, density_estimator=estimator)
 
 
 def _exact_gain(task: Task, campaign: Campaign) -> torch.Tensor | None:
@@ -195,48 +148,37 @@ def _reference(task: Task, trials: Sequence[Trial]) -> Any:
     if used:
         x = torch.stack([t.x for t in used if t.x is not None])
         return task.reference(torch.stack([t.action for t in used]), x)
-    if not _is_known(task):
+    if not task.theta_true.isfinite().all():  # nobody knows the truth
         return None
     action = task.actions.values[:1]
     row = simulate(task.simulator, task.theta_true[None], action, seed=0)
     return task.reference(action[:0], row.x[:0])
 
 
-def _is_known(task: Task) -> bool:
-    """Return whether anybody knows the truth."""
-    return bool(task.theta_true.isfinite().all())
-
-
-def _round_record(
+def _record(
     task: Task, campaign: Campaign, exact_gain: torch.Tensor | None
 ) -> dict[str, Any]:
     """Return the figures of the last round; JSON has no NaN, but null."""
     trial = campaign.history[-1]
     assert trial.design is not None
-    assert trial.x is not None
-    index = trial.design.index
-    log_prob = math.nan
-    if _is_known(task):
-        log_prob = float(campaign.belief.log_prob(task.theta_true))
+    index, truth = trial.design.index, task.theta_true
+    known = truth.isfinite().all()
+    log_prob = float(campaign.belief.log_prob(truth)) if known else float("nan")
     record = {
         "round": len(campaign.history),
-        "action": trial.action.tolist(),
-        "status": trial.status,
-        "x": trial.x.flatten().tolist(),
+        **described(campaign, trial),
         "eig": float(trial.design.expected_information_gain[index]),
         "eig_se": float(trial.design.standard_error[index]),
-        "information_gained": trial.information_gained,
         "log_prob_true": log_prob,
         "num_simulations": trial.num_simulations,
         "seconds": trial.seconds,
         "cpu_seconds": trial.cpu_seconds,
     }
     if exact_gain is not None:
-        exact = _reference(task, campaign.history)
+        exact = float(_reference(task, campaign.history).log_prob(truth[None])[0])
         record["exact_eig"] = float(exact_gain[index])
         record["regret"] = float(exact_gain.max() - exact_gain[index])
-        record["exact_log_prob_true"] = float(exact.log_prob(task.theta_true[None])[0])
-        record["gap"] = record["exact_log_prob_true"] - log_prob
+        record |= {"exact_log_prob_true": exact, "gap": exact - log_prob}
     return as_json(record)
 
 
@@ -246,9 +188,7 @@ def _table(records: Sequence[dict[str, Any]]) -> str:
         shown["action"] = ", ".join(f"{a:g}" for a in record["action"])
         return "-" if shown.get(name) is None else form.format(shown[name])
 
-    rows = [
-        [cell(record, *column) for column in COLUMNS.values()] for record in records
-    ]
+    rows = [[cell(record, *c) for c in COLUMNS.values()] for record in records]
     return as_table(rows, [*COLUMNS])
 
 
@@ -257,5 +197,4 @@ def _save(out: Path, campaign: Campaign, summary: dict[str, Any], seed: int) -> 
 
     text = json.dumps(summary, indent=2) + "\n"
     (out / "result.json").write_text(text, encoding="utf-8")
-    data = to_inference_data(campaign, seed=seed)
-    data.to_netcdf(str(out / "inference_data.nc"))
+    to_inference_data(campaign, seed=seed).to_netcdf(str(out / "inference_data.nc"))

@@ -12,14 +12,14 @@ import os
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import click
 
 from sbi_active.cli import trials
 from sbi_active.cli.options import as_written
+from sbi_active.cli.output import Answer, as_line, failure, output_to_errors
 from sbi_active.cli.record import Record, Unsure, digest
-from sbi_active.cli.words import Answer, as_json, failure_json, output_to_errors
 
 #: Commands for which the simulator runs.
 SIMULATE = ("ask", "update", "criticize", "adopt")
@@ -78,7 +78,7 @@ class Session:
                 return getattr(trials, name)(Record(self.folder), **options)
         if not (is_same and has_all) or simulator_changed or name == "repair":
             self._opened, self._campaign = wants, None
-            self._campaign = import_module("sbi_active.cli.folder").open_campaign(
+            self._campaign = import_module("sbi_active.cli.campaign").open_campaign(
                 self.folder,
                 simulates=simulates,
                 simulator=simulator,
@@ -106,14 +106,8 @@ def serve(folder: Path, *, simulator: str | None, trust: bool) -> None:
     session = Session(folder)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     with answers, output_to_errors():
-        for line in sys.stdin.buffer:
-            if line.strip():
-                _write(answers, _answer(line, session, given))
-
-
-def _write(answers: TextIO, answer: dict[str, Any]) -> None:
-    answers.write(json.dumps(as_json(answer), allow_nan=False) + "\n")
-    answers.flush()
+        for line in filter(bytes.strip, sys.stdin.buffer):
+            print(as_line(_answer(line, session, given)), file=answers, flush=True)
 
 
 def _answer(line: bytes, session: Session, given: dict[str, Any]) -> dict[str, Any]:
@@ -122,23 +116,20 @@ def _answer(line: bytes, session: Session, given: dict[str, Any]) -> dict[str, A
     try:
         request = _request(line)
         named = {"id": request.pop("id")} if "id" in request else {}
-        found = _called(request, session, given)
-        return {**named, "answer": found}
+        return {**named, "answer": _called(request, session, given)}
     except Exception as error:
-        return {**named, **failure_json(error, session.folder)}
+        return {**named, "error": failure(error)}
 
 
 def _request(line: bytes) -> dict[str, Any]:
-    try:
+    with contextlib.suppress(ValueError, RecursionError):
         request = json.loads(line)
-    except (ValueError, RecursionError):
-        request = None
-    if not isinstance(request, dict):
-        raise ValueError(
-            f'expected a request as {{"command": "ask"}}; got {line.strip()!a:.80}; '
-            "write one JSON object a line"
-        )
-    return request
+        if isinstance(request, dict):
+            return request
+    raise ValueError(
+        f'expected a request as {{"command": "ask"}}; got {line.strip()!a:.80}; write '
+        "one JSON object a line"
+    )
 
 
 def _called(
@@ -146,33 +137,22 @@ def _called(
 ) -> dict[str, Any]:
     root = click.get_current_context().find_root()
     assert isinstance(root.command, click.Group)
-    takes_json = {
-        name: command
+    known = {
+        name: {str(param.name): param for param in command.params}
         for name, command in root.command.commands.items()
         if {"folder", "json"} <= {param.name for param in command.params}
     }
     name = request.pop("command", None)
-    command = takes_json.get(name) if isinstance(name, str) else None
-    if command is None:
+    if not isinstance(name, str) or name not in known:
         raise ValueError(
-            f"expected a command among {', '.join(takes_json)}; got {name!r:.80}; "
+            f"expected a command among {', '.join(known)}; got {name!r:.80}; "
             'write one of these, as in {"command": "ask"}'
         )
-    options = [param for param in command.params if param.name != "folder"]
-    known = {param.name for param in command.params}
-    written = {
-        "folder": session.folder,
-        **{key: value for key, value in given.items() if key in known},
-        **as_written(options, request, "the request"),
-    }
-    held = {"session": session}
-    with command.make_context(
-        name,
-        [],
-        parent=root,
-        default_map=written,
-        obj=held,
-    ) as context:
-        answer = command.invoke(context)
-    assert isinstance(answer, Answer)
-    return answer.data
+    options = known[name]
+    written = {key: value for key, value in given.items() if key in options}
+    written["folder"] = session.folder
+    del options["folder"]
+    written |= as_written([*options.values()], request, "the request")
+    command, held = root.command.commands[name], {"default_map": written}
+    with command.make_context(name, [], parent=root, obj=session, **held) as context:
+        return command.invoke(context).data

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.cli.options import number_of, numbers_in, numbers_of
+from sbi_active.cli.output import Answer
 from sbi_active.cli.record import shaped, sum_up
-from sbi_active.cli.words import Answer, spoken
 
 MANY = 5  # numbers, more than somebody types
 
@@ -42,17 +42,7 @@ def tell(
         _require_trial(campaign, trial)
     x, status = _outcome(campaign, **outcome)
     executed = None if action is None else numbers_of(action)
-    folder = campaign.directory
-    try:
-        told = campaign.tell(x, trial=trial, action=executed, status=status)
-    except ValueError as error:
-        if not str(error).startswith("expected a pending trial"):
-            raise
-        raise ValueError(
-            "expected a pending trial; got none; ask for one by sbi-active ask "
-            f"{folder}, add --action of the trial that was run, or "
-            f"sbi-active correct {folder} TRIAL where one is wrong"
-        ) from None
+    told = campaign.tell(x, trial=trial, action=executed, status=status)
     return _confirmed(campaign, told)
 
 
@@ -97,7 +87,7 @@ def status(campaign: Any) -> Answer:
         lines.append(f"{trial['trial']:>4}  {trial['status']:<9} {shown}")
     for name, entry in belief["parameters"].items():
         lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
-    lines += [f"note: {spoken(w, campaign.directory)}" for w in belief["warnings"]]
+    lines += [f"note: {w}" for w in belief["warnings"]]
     if data["not_in_belief"]:
         waiting = data["not_in_belief"]
         lines.append(f"not in the belief yet: {waiting}; run sbi-active update")
@@ -111,7 +101,6 @@ def sum_up_campaign(campaign: Any) -> None:
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         known = {
             "status": found_in(campaign),
-            "is_sure": True,
             "x_shape": [*campaign.x_shape],
             "actions": describe_actions(campaign.actions),
             "names": [*campaign.actions.names],

@@ -105,14 +105,17 @@ def test_inspect_names_a_damaged_file(capsys):
             ["--task", "oscillator", "--option", "variant=x"],
             "expected options of 'oscillator' among",
         ),
-        (["--simulator", "m:f"], "expected --prior and --actions with --simulator"),
+        (
+            ["--simulator", "math:sin"],
+            "expected --theta-low and --theta-high, or --prior",
+        ),
         (
             ["--simulator", "math", "--prior", "a:b", "--actions", "a:b"],
             "expected MODULE:NAME; got 'math'",
         ),
         (
             ["--simulator", "no_such:f", "--prior", "a:b", "--actions", "a:b"],
-            "expected a module 'no_such'; got none",
+            "got ModuleNotFoundError: No module named 'no_such'",
         ),
         (
             ["--simulator", "math:tau2", "--prior", "a:b", "--actions", "a:b"],

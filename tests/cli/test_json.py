@@ -17,13 +17,13 @@ def refuse(constant):
 @pytest.mark.parametrize(
     ("words", "kind", "text"),
     [
-        (["status", "nowhere"], "ValueError", "sbi-active init nowhere"),
-        (["status"], "MissingParameter", "expected 'DIR'; got none"),
-        (["tell", "camp", "--faster"], "NoSuchOption", "got --faster"),
-        (["withdraw", "camp", "one"], "BadParameter", "expected a whole number"),
-        (["fly", "camp"], "UsageError", "expected a command among"),
-        (["export", "camp"], "MissingParameter", "expected '--netcdf'"),
-        (["status", "\ud800"], "ValueError", "expected"),
+        (["status", "nowhere"], "ValueError", "expected a campaign; got no nowhere"),
+        (["status"], "MissingParameter", "Missing argument 'DIR'"),
+        (["tell", "camp", "--faster"], "NoSuchOption", "No such option '--faster'"),
+        (["withdraw", "camp", "one"], "BadParameter", "'one' is not a valid integer"),
+        (["fly", "camp"], "NoSuchCommand", "No such command"),
+        (["export", "camp"], "MissingParameter", "Missing option '--netcdf'"),
+        (["status", "\ud800"], "UnicodeEncodeError", "surrogates not allowed"),
     ],
 )
 def test_an_error_is_json_as_well(words, kind, text, capfd):
@@ -43,7 +43,7 @@ def test_statuses_of_errors_are_in_the_json(raised, status, capsys, monkeypatch)
     def fail(*_, **__):
         raise raised
 
-    monkeypatch.setattr("sbi_active.cli.folder.open_campaign", fail)
+    monkeypatch.setattr("sbi_active.cli.campaign.open_campaign", fail)
     assert main(["update", "camp", "--json"]) == status
     answer = json.loads(capsys.readouterr().out, parse_constant=refuse)
     assert answer["error"]["status"] == status

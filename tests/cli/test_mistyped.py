@@ -111,7 +111,7 @@ def test_an_interrupt_is_one_line(camp, monkeypatch, capsys):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sbi_active.cli.folder.open_campaign", interrupted)
+    monkeypatch.setattr("sbi_active.cli.campaign.open_campaign", interrupted)
     assert main(["ask", "camp"]) == 130
     assert "interrupted" in capsys.readouterr().err
 

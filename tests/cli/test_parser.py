@@ -29,18 +29,33 @@ finally:
     [
         (["--help"], 0, "Find what a simulator lacks"),
         (["-h"], 0, "130 after an interrupt"),
-        (["run", "--help"], 0, "one of: asbi, nsbi, alhi, nlhi, seqbed"),
+        (["run", "--help"], 0, "[asbi|nsbi|alhi|nlhi|seqbed]"),
         (["--version"], 0, __version__),
-        ([], 2, "got none; choose one of these, or see sbi-active --help"),
-        (["rnu"], 2, "expected a command among adopt, ask, bank"),
-        (["rnu"], 2, "got rnu; write run, or see sbi-active --help"),
-        (["bank", "biuld"], 2, "got biuld; write build, or see sbi-active bank"),
-        (["run", "numerica", "--out", "d"], 2, "expected one of numerical, oscillator"),
-        (["run", "numerical", "--method", "abc"], 2, "got 'abc'; choose one of these"),
-        (["run", "numerical", "--roundz", "3", "--out", "d"], 2, "got --roundz; write"),
-        (["run", "numerical"], 2, "expected '--out'; got none; give it"),
-        (["tell", "c", "--qqqq"], 2, "got --qqqq; leave it out, or see"),
-        (["correct", "c", "0", "--reason", "--json"], 2, "a value of --reason; got"),
+        ([], 2, "Missing command."),
+        (["rnu"], 2, "No such command 'rnu'"),
+        (["bank", "biuld"], 2, "No such command 'biuld'"),
+        (
+            ["run", "numerica", "--out", "d"],
+            2,
+            "is not one of 'numerical', 'oscillator'",
+        ),
+        (
+            ["run", "numerical", "--method", "abc"],
+            2,
+            "'abc' is not one of 'asbi', 'nsbi'",
+        ),
+        (
+            ["run", "numerical", "--roundz", "3", "--out", "d"],
+            2,
+            "No such option '--roundz'",
+        ),
+        (["run", "numerical"], 2, "Missing option '--out'"),
+        (["tell", "c", "--qqqq"], 2, "No such option '--qqqq'"),
+        (
+            ["correct", "c", "0", "--reason", "--json"],
+            2,
+            "'--reason' requires an argument",
+        ),
     ],
 )
 def test_nothing_heavy_is_imported(arguments, status, text):
@@ -63,8 +78,9 @@ def test_nothing_heavy_is_imported(arguments, status, text):
 )
 def test_counts_are_at_least_one(arguments, capsys):
     assert main(arguments) == 2
-    text = f"expected a whole number >= 1; got {arguments[-1]!r}"
-    assert text in capsys.readouterr().err
+    text = capsys.readouterr().err
+    assert f"Invalid value for '{arguments[-2]}': " in text
+    assert arguments[-1] in text
 
 
 def test_names_are_those_of_the_library():
@@ -82,7 +98,7 @@ def every_command(group=commands.main):
 
 @pytest.mark.parametrize("command", every_command(), ids=lambda c: c.name)
 def test_every_command_has_its_function(command):
-    *module, function = command.callback.args
+    *module, function = command.callback.args[0].split(".")
     function = function.replace("repair", "status")
     homes = [
         importlib.import_module(f"sbi_active.cli.{name}")

@@ -143,6 +143,7 @@ def test_a_summary_is_never_written_through_a_link(camp, tmp_path):
     (tmp_path / "kept").write_text(content)
     summary.symlink_to(tmp_path / "kept")
     assert main(["tell", "camp", "0.4", "0.8"]) == 0
+    record.sum_up(camp, json.loads(content))
     assert (tmp_path / "kept").read_text() == content
     assert not summary.is_symlink()
 

@@ -1,6 +1,5 @@
 import json
 import sys
-import time
 
 import arviz as az
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.colors import to_rgb
 
 from sbi_active.campaign import Trial
 from sbi_active.cli import main
-from sbi_active.cli.run import Progress, _reference
+from sbi_active.cli.run import _reference
 from sbi_active.tasks import get_task  # pyright: ignore
 
 SMALL = ["--simulations", "200", "--samples", "20", "--iterations", "30"]
@@ -28,6 +27,7 @@ def test_run_writes_table_figure_and_results(method, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "exact EIG" in printed
     assert "gap to exact" in printed
+    assert "the truth: " in printed
     assert str(out / "loop.png") in printed
     # Two rounds of three panels; in the middle of each the exact gain as well.
     pixels = image.imread(out / "loop.png")[..., :3]
@@ -117,17 +117,6 @@ def test_a_task_s_own_options(tmp_path, capsys):
     assert result["options"] == ["target=2", "noise=0.01"]
     trial = result["rounds"][0]
     assert (trial["x"] == [None] * 3) == (trial["status"] == "invalid")
-
-
-def test_progress_names_steps_and_shows_that_it_lives(capsys, monkeypatch):
-    monkeypatch.setattr(Progress, "SIGN_IN_FILE", 0.05)
-    with Progress(2, "asbi") as progress:
-        progress.step("designing")
-        time.sleep(0.5)
-        progress.count()
-    shown = capsys.readouterr().err
-    assert shown.count("designing") > 3
-    assert "1/2" in shown
 
 
 def test_data_elsewhere_are_named_by_an_option(tmp_path, capsys):

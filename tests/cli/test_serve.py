@@ -132,9 +132,9 @@ def test_a_robot_s_loop(server):
         ({"command": "tell", "x": ["fast"]}, "write them with a point"),
         ({"command": "tell", "x": [1, 2], "action": 1}, "expected 1 numbers"),
         ({"command": "tell", "x": [None], "action": 1}, "a number that was measured"),
-        ({"command": "tell", "x": 1}, "ask for one by sbi-active ask camp"),
-        ({"command": "withdraw"}, "expected 'TRIAL'; got none"),
-        ({"command": "withdraw", "trial": "first"}, "expected a whole number"),
+        ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
+        ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
+        ({"command": "withdraw", "trial": "first"}, "'first' is not a valid integer"),
         ({"command": "ask", "target": "weather"}, "expected"),
     ],
 )
@@ -176,7 +176,7 @@ def test_an_interrupt_ends_the_session(server):
 
 def test_what_serve_needs_is_said_before_it_begins(capsys):
     assert main(["serve"]) == 2
-    assert "expected 'DIR'; got none" in capsys.readouterr().err
+    assert "Missing argument 'DIR'" in capsys.readouterr().err
 
 
 def test_nobody_reads_the_answers(camp):

@@ -41,6 +41,7 @@ READING = [
     ["correct", "camp", "0", "0.31"],
     ["withdraw", "camp", "0"],
     ["report", "camp"],
+    ["watch", "camp", "--once", "page.html"],
     ["repair", "camp"],
 ]
 SIMULATING = [
@@ -162,7 +163,7 @@ def test_a_simulator_of_the_command_line_needs_no_word(tmp_path, monkeypatch, ca
     del sys.modules["sled"]
     # Its noise was in the file, so that it is another one, and told to be.
     assert main(["update", "camp", *words]) == 2
-    assert "sbi-active update camp --simulator-changed" in capsys.readouterr().err
+    assert "simulator_changed=True" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -210,7 +210,7 @@ def test_tasks_are_ready(capsys):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], "expected MODULE:FUNCTION or --task; got both or neither"),
+        ([], "expected --simulator MODULE:FUNCTION or --task; got both"),
         (["math:pi", *SPACE], "expected a function or SimulatorModel; got float"),
         (["none.py:f", *SPACE], "expected a file; got none at"),
         (["math:sin"], "expected --theta-low and --theta-high, or --prior"),

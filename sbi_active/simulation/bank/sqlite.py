@@ -136,6 +136,24 @@ def _check(
         )
 
 
+def is_locked(folder: Path) -> bool:
+    """Return whether somebody has the right to write, without taking it.
+
+    Args:
+        folder: Of a store.
+    """
+    if not (folder / LOCK).exists():
+        return False
+    lock = connected(folder / LOCK, "ro", timeout=0.0)
+    try:
+        lock.execute("SELECT name FROM sqlite_master")
+    except sqlite3.OperationalError as error:
+        return "locked" in str(error)
+    finally:
+        lock.close()
+    return False
+
+
 def made(folder: Path, what: str) -> None:
     """Make a store in a folder of its own.
 

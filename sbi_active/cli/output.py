@@ -1,0 +1,107 @@
+"""What a command prints, and where: answers, notes, errors."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import math
+import os
+import re
+import sys
+import traceback
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import click
+
+FAILED, MISUSED, INTERRUPTED = 1, 2, 130
+#: What a worker says of an error: of its frames the last counts.
+TRACEBACK = re.compile(
+    r"Traceback \(most recent call last\):\n"
+    r'(?: .*\n)*  File "(.*)", line (\d+).*\n(?: .*\n)*(.*)'
+)
+
+
+class Answer(NamedTuple):
+    """What a command found.
+
+    Attributes:
+        data: For programs; numbers that are not finite become null.
+        text: For people.
+    """
+
+    data: dict[str, Any]
+    text: str
+
+
+def say(said: object) -> None:
+    """Print a note or an error to standard error."""
+    if sys.stderr is not None:
+        print(f"sbi-active: {said}", file=sys.stderr)
+
+
+def failure(error: BaseException) -> dict[str, Any]:
+    """Return an error for programs: its class, its text, and the exit status."""
+    status, text = FAILED, f"{type(error).__name__}: {error}{place_of(error)}"
+    if isinstance(error, KeyboardInterrupt):
+        status, text = INTERRUPTED, f"{str(error) or 'interrupted'}"
+        text += "; what was told before is kept"
+    elif isinstance(error, click.ClickException):
+        status, text = MISUSED, error.format_message()
+    elif isinstance(error, ValueError | OSError):
+        status, text = MISUSED, str(error)
+    message = TRACEBACK.sub(r"\3 (\1, line \2)", text)
+    return {"type": type(error).__name__, "message": message, "status": status}
+
+
+def place_of(error: BaseException) -> str:
+    """Return where an error was raised, to be added to its text."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, SyntaxError) or not frames:  # whose text has it
+        return ""
+    return f" ({frames[-1].filename}, line {frames[-1].lineno})"
+
+
+def as_json(value: Any) -> Any:
+    """Return an answer as JSON has it: null for a number that is not finite."""
+    if isinstance(value, dict):
+        return {key: as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in value]
+    is_number = not isinstance(value, float) or math.isfinite(value)
+    return value if is_number else None
+
+
+def as_line(value: Any) -> str:
+    """Return an answer as one line of JSON."""
+    return json.dumps(as_json(value), allow_nan=False)
+
+
+@contextlib.contextmanager
+def output_to_errors() -> Iterator[None]:
+    """Send to standard error what simulators print, in C and in workers too."""
+    with contextlib.redirect_stdout(sys.stderr), contextlib.ExitStack() as undo:
+        with contextlib.suppress(OSError):  # one of them is closed
+            kept = os.dup(1)
+            undo.callback(os.close, kept)
+            os.dup2(2, 1)
+            undo.callback(os.dup2, kept, 1)
+            undo.callback(_flush_c)
+        yield
+
+
+def _flush_c() -> None:
+    with contextlib.suppress(Exception):  # a platform without it
+        ctypes.CDLL(None).fflush(None)
+
+
+def flush() -> None:
+    """Write what is left, so that the end of the process has nothing to complain of."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except AttributeError:
+        pass  # closed from the start

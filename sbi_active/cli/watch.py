@@ -1,0 +1,169 @@
+"""``sbi-active watch DIR``: a campaign in a browser, while another process runs it.
+
+The page is made of the folder alone, which is only read; nothing that it names is
+imported. Who asks from elsewhere than this machine, or for anything else, gets nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import threading
+from html import escape
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from sbi_active.campaign import Campaign
+from sbi_active.campaign.display.page import page
+from sbi_active.cli.record import digest
+from sbi_active.page import render
+from sbi_active.progress import in_words
+from sbi_active.simulation.bank.sqlite import is_locked
+from sbi_active.simulation.bank.store import Store
+
+HOST = "127.0.0.1"
+#: What a browser lets the page do: show itself, and ask for its version.
+POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "img-src data:; connect-src 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+#: Asks every two seconds whether there is another page, and says when nobody answers.
+SCRIPT = """<script>
+setInterval(async () => {
+  try {
+    const answer = await fetch("/version", { cache: "no-store" });
+    if (answer.ok && await answer.text() !== "VERSION") location.reload();
+  } catch { document.querySelector("[role=status]").textContent =
+    "Nobody watches any more: this is the campaign as it was last."; }
+}, 2000);
+</script>
+"""
+
+
+class Watched:
+    """The page of a campaign, drawn again where the folder's store has changed.
+
+    Args:
+        folder: Of the campaign.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._drawing = folder, threading.Lock()
+        self._page = self._version = ""
+
+    @property
+    def version(self) -> str:
+        """What changes when the store does, or somebody begins or ends to write."""
+        with contextlib.suppress(ValueError, OSError):  # of a lock that is none
+            return f"{digest(self._folder)}-{is_locked(self._folder):d}"
+        return "unknown"
+
+    def page(self) -> str:
+        """Return the page, which asks for newer ones."""
+        with self._drawing:
+            version = self.version  # of before, so that nothing later is missed
+            if version != self._version:
+                try:
+                    text = self.drawn()
+                except (ValueError, OSError) as error:
+                    text = _with_news(render("Campaign", []), str(error))
+                script = SCRIPT.replace("VERSION", version)
+                self._page = text.replace("</body>", f"{script}</body>")
+                self._version = version
+            return self._page
+
+    def drawn(self) -> str:
+        """Return the page as it is now."""
+        with Campaign.load(self._folder) as campaign:
+            return _with_news(page(campaign), _news(campaign, self._folder))
+
+
+def watch(folder: Path, *, port: int, once: Path | None) -> None:
+    """Show a campaign until an interrupt, or write its page once."""
+    import matplotlib
+
+    matplotlib.use("Agg")  # figures are drawn by threads, which may open no window
+    watched = Watched(folder)
+    if once is not None:
+        once.write_text(watched.drawn(), encoding="utf-8")
+        print(f"saved: {once}")
+        return
+    Campaign.load(folder).close()  # what is wrong with it is said here
+    with served(watched, port) as server:
+        place = f"http://{HOST}:{server.server_port}"
+        print(f"{folder} is shown at {place} until Ctrl-C", flush=True)
+        server.serve_forever()
+
+
+def served(watched: Watched, port: int) -> ThreadingHTTPServer:
+    """Return a server of a page, for this machine alone.
+
+    Args:
+        watched: Has the page.
+        port: Where it listens; 0 is any that is free.
+
+    Raises:
+        ValueError: If another program listens there, or only others may.
+    """
+
+    class Handler(BaseHTTPRequestHandler):
+        def handle(self) -> None:
+            with contextlib.suppress(ConnectionError):  # a reader may leave
+                super().handle()
+
+        def do_GET(self) -> None:  # noqa: N802
+            # A page from elsewhere that has its name point here asks by that name.
+            host = self.headers.get("Host", "").partition(":")[0]
+            if host not in (HOST, "localhost") or self.path not in ("/", "/version"):
+                self.send_error(404)
+                return
+            is_page = self.path == "/"
+            content = (watched.page() if is_page else watched.version).encode()
+            self.send_response(200)
+            kind = "html" if is_page else "plain"
+            self.send_header("Content-Type", f"text/{kind}; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.send_header("Content-Security-Policy", POLICY)
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, format: str, *_: object) -> None:
+            """Say nothing of each request."""
+
+    try:
+        return ThreadingHTTPServer((HOST, port), Handler)
+    except OSError as error:
+        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+            raise
+        raise ValueError(
+            f"expected a port that is free; got {port} ({error.strerror}); choose "
+            "another by --port, or 0 for any"
+        ) from error
+
+
+def _news(campaign: Campaign, folder: Path) -> str:
+    """Return what is being computed, as far as the folder says."""
+    late = [t.index for t in campaign.history if not campaign.contains(t)]
+    if campaign.pending is not None:
+        doing, stage = f"trial {campaign.pending.index} waits for its outcome", ""
+    elif late:
+        doing, stage = f"trials not in the belief yet: {late}", "update"
+    else:
+        doing, stage = f"trial {len(campaign.history)} is to be designed", "design"
+    before = [
+        (t.index, t.seconds[stage]) for t in campaign.history if stage in t.seconds
+    ]
+    if before:
+        index, seconds = before[-1]
+        doing += f" ({stage} of trial {index}: {in_words(seconds)})"
+    if not is_locked(folder):
+        return f"No process writes to {folder}; {doing}."
+    writer = Store(folder, "campaign").text("writer") or {}
+    return f"Process {writer.get('pid')} on {writer.get('host')} writes; {doing}."
+
+
+def _with_news(text: str, news: str) -> str:
+    """Return a page with a line in front."""
+    line = f'<main>\n<p role="status">{escape(news)}</p>'
+    return text.replace("<main>", line, 1)

@@ -1,0 +1,258 @@
+"""``watch``: a page of a campaign that another process runs, for this machine alone."""
+
+import http.client
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from sbi_active.cli import main, watch
+from tests.page.browser import CHROMIUM, FLAGS, assert_reads_well
+
+ROOT = Path(__file__).parents[2]
+#: A campaign that goes on one step with each line that it reads.
+RUN = """
+from pathlib import Path
+from tests.campaign.storage.campaigns import MODEL, go_on, new
+
+campaign = new(Path("camp"), simulator=MODEL)
+for step in (campaign.ask, lambda: go_on(campaign, 1), lambda: go_on(campaign, 2)):
+    print("ready", flush=True)
+    input()
+    step()
+print("ready", flush=True)
+input()
+"""
+
+
+class Campaigner:
+    """A campaign in a process of its own."""
+
+    def __init__(self, folder):
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{RUN}",
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+        )
+        self.reads()
+
+    def reads(self):
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "ready\n"
+
+    def goes_on(self):
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        self.reads()
+
+    def ends(self):
+        self.process.communicate("\n", timeout=60)
+        assert self.process.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder, as a campaign of two trials leaves it; with the pages on the way."""
+    folder = tmp_path_factory.mktemp("watched")
+    campaigner = Campaigner(folder)
+    watched = watch.Watched(folder / "camp")
+    pages, versions = [], []
+    for _ in range(3):
+        versions += [watched.version]
+        pages += [watched.page()]
+        campaigner.goes_on()
+    campaigner.ends()
+    return folder / "camp", [*pages, watched.page()], [*versions, watched.version]
+
+
+@pytest.fixture
+def server(place):
+    """A server in a thread, and the port where it listens."""
+    with watch.served(watch.Watched(place[0]), 0) as made:
+        thread = threading.Thread(target=made.serve_forever, daemon=True)
+        thread.start()
+        yield made
+        made.shutdown()
+        thread.join()
+
+
+def asked(server, path="/", method="GET", **headers):
+    connection = http.client.HTTPConnection(watch.HOST, server.server_port, timeout=60)
+    connection.request(method, path, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode(), answer.headers
+
+
+def news(page):
+    return re.findall('<p role="status">(.*)</p>', page)
+
+
+def test_the_page_follows_a_campaign_of_another_process(place):
+    folder, pages, versions = place
+    assert len({*versions}) == 4
+    assert all(version in page for page, version in zip(pages, versions, strict=True))
+    first, asked_, told, last = pages
+    assert "; trial 0 is to be designed." in news(first)[0]
+    assert re.match(r"Process \d+ on .* writes; trial 0 waits for its", news(asked_)[0])
+    assert re.search(r"trial 1 is to be designed \(design of trial 0: .* s\)", told)
+    assert "1 trials told" in told
+    assert "2 trials told" in last
+    assert re.match(f"No process writes to {folder}; ", news(last)[0])
+    for page in pages:
+        assert "Belief by round" in page or "belief of each parameter by round" in page
+        assert "http:" not in page
+        assert "https:" not in page
+
+
+def test_it_is_drawn_again_where_something_changed(place, monkeypatch):
+    watched = watch.Watched(place[0])
+    drawn = watched.page()
+    monkeypatch.setattr(watched, "drawn", None)
+    assert watched.page() is drawn
+
+
+def test_a_browser_is_answered(server):
+    status, page, headers = asked(server)
+    assert status == 200
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+    assert headers["Cache-Control"] == "no-store"
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    status, version, _ = asked(server, "/version")
+    assert status == 200
+    assert f'!== "{version}"' in page
+
+
+def test_it_listens_on_this_machine_alone(server):
+    assert server.server_address[0] == "127.0.0.1"
+    assert asked(server, Host="example.org")[0] == 404
+    assert asked(server, Host=f"localhost:{server.server_port}")[0] == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "HEAD", "OPTIONS"])
+def test_it_is_only_read(server, method):
+    assert asked(server, method=method)[0] == 501
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/store.db", "/../store.db", "/%2e%2e/store.db", "//x", "/version/..", "/?a", "*"],
+)
+def test_no_file_is_given(server, path):
+    status, text, _ = asked(server, path)
+    assert status == 404
+    assert "SQLite" not in text
+
+
+def test_a_reader_that_leaves_is_no_error(server, capfd):
+    for _ in range(3):
+        with socket.create_connection((watch.HOST, server.server_port)) as leaving:
+            leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+            leaving.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert asked(server)[0] == 200
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_the_command_ends_by_an_interrupt(place):
+    code = "import sys; from sbi_active.cli import main; sys.exit(main())"
+    words = ["watch", str(place[0]), "--port", "0"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    port = re.fullmatch(r".* is shown at http://127.0.0.1:(\d+) until Ctrl-C\n", said)
+    assert port is not None, said
+    assert "2 trials told" in asked(SimpleNamespace(server_port=int(port[1])))[1]
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error == "sbi-active: interrupted; what was told before is kept\n"
+
+
+def test_nothing_of_the_folder_changes(place, capsys):
+    def content():
+        return {p.name: p.read_bytes() for p in place[0].iterdir()}
+
+    before = content()
+    assert main(["watch", str(place[0]), "--once", "page.html"]) == 0
+    assert capsys.readouterr().out == "saved: page.html\n"
+    assert content() == before
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert "2 trials told" in page
+    assert "setInterval" not in page
+
+
+@pytest.mark.parametrize("words", [[], ["--once", "page.html"]])
+def test_a_folder_that_is_no_campaign(words, capsys):
+    Path("empty").mkdir()
+    for folder in ("empty", "nowhere"):
+        assert main(["watch", folder, *words]) == 2
+        assert f"expected a campaign; got no {folder}" in capsys.readouterr().err
+    assert not Path("page.html").exists()
+
+
+def test_a_port_in_use(place, server, capsys):
+    port = str(server.server_port)
+    assert main(["watch", str(place[0]), "--port", port]) == 2
+    text = f"expected a port that is free; got {port} (Address already in use)"
+    assert text in capsys.readouterr().err
+    assert main(["watch", str(place[0]), "--port", "65536"]) == 2
+    assert "65536 is not in the range 0<=x<=65535" in capsys.readouterr().err
+
+
+def test_a_folder_that_goes_is_said_on_the_page(place, tmp_path):
+    folder = tmp_path / "camp"
+    folder.mkdir()
+    for file in place[0].iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    watched = watch.Watched(folder)
+    assert "2 trials told" in watched.page()
+    (folder / "store.db").unlink()
+    assert "expected a campaign; got no" in news(watched.page())[0]
+
+
+def test_it_reads_well_in_a_browser(place, tmp_path):
+    assert_reads_well(watch.Watched(place[0]).drawn(), tmp_path)
+
+
+def test_a_browser_loads_the_page_again(place, server, tmp_path, monkeypatch):
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed here: the page is not looked at")
+    made, drawn = [], watch.Watched.drawn
+
+    def counted(self):
+        made.append(self)
+        monkeypatch.setattr(watch, "digest", lambda _: "changed")
+        return drawn(self)
+
+    monkeypatch.setattr(watch.Watched, "drawn", counted)
+    done = subprocess.run(
+        [
+            CHROMIUM,
+            *FLAGS,
+            f"--user-data-dir={tmp_path / 'profile'}",
+            f"http://{watch.HOST}:{server.server_port}/",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "2 trials told" in done.stdout
+    assert len(made) == 2  # drawn, found changed, and loaded again
+    assert not [line for line in done.stderr.splitlines() if "CONSOLE" in line]
