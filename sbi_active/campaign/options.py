@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -11,7 +10,6 @@ from typing import Any, Literal
 import cloudpickle
 
 from sbi_active.campaign.stopping import StopRules
-from sbi_active.inference.beliefs.kernel_belief import Bandwidth
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
@@ -30,12 +28,9 @@ class CampaignOptions:
             :class:`.SeqBED`, or :class:`.LFIRE`.
         posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
             :class:`.ALHI`.
-        bandwidth: Of kernels, where a belief has them.
         estimator: Of the expected information gain, as in
             :class:`.InformationGainDesigner`; "posterior" is the paper's.
         eliminate: Whether candidates far behind the leader get no further samples.
-        exponent: Of the choice, as in :class:`.InformationGainDesigner`; inf
-            takes the best.
         design_on: "fresh" simulations, or those of the "training", which costs none
             further; the estimates are then too high, the more so the fewer rows.
         min_probability_valid: Actions that give a measurement less often are chosen
@@ -78,10 +73,8 @@ class CampaignOptions:
     num_samples: int = 1_500
     density_estimator: Any = None
     posterior: str = "importance"
-    bandwidth: Bandwidth = "scott"
     estimator: Any = "auto"
     eliminate: bool = True
-    exponent: float = math.inf
     design_on: Literal["fresh", "training"] = "fresh"
     min_probability_valid: float = 0.0
     repeat: bool = True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -15,38 +14,22 @@ from sbi_active.design.eligibility import DesignLimits
 from sbi_active.design.elimination import Estimates
 from sbi_active.information_gain.base import Bound
 from sbi_active.information_gain.race import Race, paired_errors, standard_error
-from sbi_active.seeding import derive_seed
 
 
 def choose(
     estimates: Estimates,
     limits: DesignLimits,
     *,
-    exponent: float,
     estimator: str,
     bound: Bound,
     num_simulations: int,
     num_missing: int,
     seed: int,
 ) -> Design:
-    r"""Return the design.
-
-    A finite exponent k draws the action, :math:`P(\xi) \propto \max(U(\xi), 0)^k`,
-    instead of taking the leader. The seed is that of the draw and of those behind
-    probabilities.
-    """
+    """Return the design of the leader; the seed is that behind probabilities."""
     price = limits.cost(estimates.action)
     chosen = estimates.leader
     eligible = estimates.eligible
-    if math.isfinite(exponent):
-        mean = torch.stack([row.nanmean() for row in estimates.choosing])
-        utility = (mean / price).clamp_min(0.0)
-        log_weight = exponent * utility.log().nan_to_num(neginf=-1e300)
-        if not bool((utility[eligible] > 0).any()):  # nothing is learned anywhere
-            log_weight = torch.zeros_like(log_weight)
-        weight = torch.where(eligible, log_weight, -torch.inf).softmax(0)
-        generator = torch.Generator().manual_seed(derive_seed(seed, "choice"))
-        chosen = int(torch.multinomial(weight, 1, generator=generator))
     report = estimates.reporting
     both = zip(estimates.choosing, report, eligible, price, strict=True)
     probability_best = torch.zeros(len(price), dtype=torch.float64)

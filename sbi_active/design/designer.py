@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -64,15 +63,13 @@ class InformationGainDesigner:
             a test of normality, else what the model can say.
         search: A search; "exhaustive", "gradient" or "bayesopt" (see
             :mod:`sbi_active.search`); or "auto", exhaustive for lists, else gradient.
-        exponent: k, of a choice with a probability proportional to the utility to the
-            power of k among the candidates; inf takes the best.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
         workers: Of the simulations.
 
     Raises:
-        ValueError: If ``num_samples`` is below 8, the exponent is negative, or the name
-            of an estimator or a search is unknown.
+        ValueError: If ``num_samples`` is below 8, or the name of an estimator or a
+            search is unknown.
         TypeError: If the search does not apply to the action space.
 
     Example:
@@ -97,7 +94,6 @@ class InformationGainDesigner:
         num_samples: int = 1_500,
         estimator: str | InformationGainEstimator = "auto",
         search: str | Search = "auto",
-        exponent: float = math.inf,
         eliminate: bool = True,
         workers: Workers = IN_PROCESS,
     ) -> None:
@@ -106,13 +102,8 @@ class InformationGainDesigner:
                 f"expected num_samples >= 8, half to choose and half to report; got "
                 f"{num_samples}; use about 1000"
             )
-        if not exponent >= 0:
-            raise ValueError(
-                f"expected exponent >= 0; got {exponent}; use inf for the best "
-                "action, or about 8 for one at random among good ones"
-            )
         self.actions = actions = action_space(actions)
-        self.num_samples, self.exponent = num_samples, exponent
+        self.num_samples = num_samples
         self.estimator, self.eliminate = estimator, eliminate
         self.search = _find_search(search, actions)
         self.search.size(actions)  # a search that does not apply is an error here
@@ -208,7 +199,6 @@ class InformationGainDesigner:
             search=self.search,
             num_samples=self.num_samples,
             early=self.eliminate,
-            exponent=self.exponent,
             workers=self.workers,
             seed=seed,
         )

@@ -37,7 +37,6 @@ class Selection:
         search: For the candidates.
         num_samples: Simulations a candidate on average.
         early: Whether candidates begin with half of them.
-        exponent: Of the choice.
         workers: Of the simulations.
         seed: Of everything random.
     """
@@ -47,7 +46,6 @@ class Selection:
     search: Search
     num_samples: int
     early: bool
-    exponent: float
     workers: Workers
     seed: int
 
@@ -95,7 +93,6 @@ class Selection:
         return choose(
             replace(estimates, notes=(*estimates.notes, *notes)),
             self.limits,
-            exponent=self.exponent,
             estimator=type(evaluator.estimator).__name__,
             bound=evaluator.bound,
             num_simulations=sampler.num_drawn,
@@ -134,7 +131,6 @@ class Selection:
         return choose(
             replace(estimates, notes=(*estimates.notes, *notes)),
             self.limits,
-            exponent=self.exponent,
             estimator=type(estimator).__name__,
             bound="none",  # the model may have seen the rows
             num_simulations=0,

@@ -2,16 +2,13 @@
 
 import pickle
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 
 from sbi_active import ASBI, Campaign, to_inference_data
-from sbi_active.campaign.learning.draws import NUM_KEPT, keep_draws
-from sbi_active.campaign.state import CampaignState
-from sbi_active.inference.beliefs.belief import UnchangedBelief, names_of
-from sbi_active.inference.products.markov_chains import MarkovChainBelief
+from sbi_active.campaign.learning.draws import NUM_KEPT
+from sbi_active.inference.beliefs.belief import names_of
 
 from .storage.campaigns import ACTIONS, MODEL, OPTIONS, PRIOR, go_on, new, outcome
 
@@ -67,17 +64,6 @@ def test_what_is_computed_again_is_drawn_again():
     campaign.withdraw(1)
     campaign.update()
     assert [*campaign.state.draws] == [0]
-
-
-def test_markov_chains_are_not_run_for_a_picture():
-    class NoChains(MarkovChainBelief):
-        def _sample(self, num_samples):
-            raise AssertionError("expected no chain")
-
-    state = CampaignState("alhi", 0, OPTIONS, processed=[3])
-    product: Any = UnchangedBelief(PRIOR, PRIOR)
-    keep_draws(state, NoChains(product, product, "slice_np"))
-    assert state.draws[3].shape == (NUM_KEPT, 2)
 
 
 def test_beliefs_know_their_parameters(tmp_path):

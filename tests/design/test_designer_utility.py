@@ -1,7 +1,5 @@
 """Costs, constraints, exclusion, chance and given simulations."""
 
-import math
-
 import pytest
 import torch
 
@@ -14,9 +12,6 @@ from sbi_active import (
     RandomDesigner,
     SimulatorModel,
 )
-from sbi_active.design.choice import choose
-from sbi_active.design.eligibility import DesignLimits
-from sbi_active.design.elimination import Estimates
 from sbi_active.simulation import Simulations
 from tests.design.test_designer import ACTIONS, VALUES
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
@@ -25,10 +20,8 @@ MODEL = SimulatorModel(lambda theta, action: action * theta, noise=GaussianNoise
 BOX = BoxActions(0.0, 2.0, names=["push"], units=["m/s"])
 
 
-def select(actions=ACTIONS, num_samples=1_000, exponent=math.inf, **options):
-    designer = InformationGainDesigner(
-        actions, num_samples=num_samples, exponent=exponent
-    )
+def select(actions=ACTIONS, num_samples=1_000, **options):
+    designer = InformationGainDesigner(actions, num_samples=num_samples)
     options = {"seed": 0} | options
     return designer.select(None, MODEL, belief=PRIOR, **options)
 
@@ -107,53 +100,6 @@ def test_a_measurement_that_is_too_improbable_in_a_box():
     # .6 is at an action of 1; the share of 200 has an error of .035
     assert float(design.action) < 1 + 4 * 0.035 / 0.4
     assert float(design.probability_valid[design.index]) >= 0.6
-
-
-def test_chance_in_proportion_to_a_power_of_the_utility():
-    gain = information(VALUES[:, None]).double()
-    noise = torch.randn(40, generator=torch.Generator().manual_seed(0)).double()
-    rows = [g + 0.1 * (noise - noise.mean()) for g in gain]
-    estimates = Estimates(
-        action=VALUES[:, None],
-        choosing=rows,
-        reporting=rows,
-        num_samples=torch.full((4,), 80),
-        probability_valid=torch.ones(4).double(),
-        eligible=torch.tensor([True, True, False, True]),
-        leader=3,
-        stopped="budget spent",
-        notes=(),
-    )
-
-    limits = DesignLimits(ACTIONS, None, torch.empty(0, 1))
-
-    def share(exponent, num=1_000):
-        chosen = torch.zeros(4).double()
-        for seed in range(num):
-            design = choose(
-                estimates,
-                limits,
-                exponent=exponent,
-                estimator="EntropyGain",
-                bound="none",
-                num_simulations=320,
-                num_missing=0,
-                seed=seed,
-            )
-            assert torch.equal(design.action, VALUES[design.index, None])
-            chosen[design.index] += 1 / num
-        return chosen
-
-    for exponent in (0.0, 2.0):
-        weight = gain**exponent * estimates.eligible
-        weight = weight / weight.sum()
-        error = (weight * (1 - weight) / 1_000).sqrt()
-        assert ((share(exponent) - weight).abs() <= 4 * error).all()
-    assert share(math.inf, 5).tolist() == pytest.approx([0, 0, 0, 1])
-    drawn = {select(num_samples=64, exponent=0.5, seed=s).index for s in range(12)}
-    assert len(drawn) > 1
-    with pytest.raises(ValueError, match="expected exponent >= 0; got -1"):
-        select(exponent=-1.0)
 
 
 def rows(num, actions, seed=0):

@@ -61,21 +61,17 @@ def _alhi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
         options.density_estimator,
         show_progress_bars=False,
         posterior=options.posterior,
-        bandwidth=options.bandwidth,
     )
 
 
 def _seqbed(prior: Distribution, options: CampaignOptions) -> ActiveInference:
     if isinstance(options.density_estimator, LFIRE):
-        return SeqBED_LFIRE(
-            prior, options.density_estimator, bandwidth=options.bandwidth
-        )
+        return SeqBED_LFIRE(prior, options.density_estimator)
     return SeqBED(
         prior,
         options.density_estimator,
         show_progress_bars=False,
         posterior=options.posterior,
-        bandwidth=options.bandwidth,
     )
 
 

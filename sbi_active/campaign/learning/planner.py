@@ -58,7 +58,6 @@ class Planner:
                 num_samples=options.num_samples,
                 estimator=options.estimator,
                 eliminate=options.eliminate,
-                exponent=options.exponent,
                 workers=options.workers,
             )
             if self._designs
@@ -151,7 +150,6 @@ class Planner:
             pooled = learner.design(
                 index,
                 self._limits.design(exclude, options.min_probability_valid),
-                options.exponent,
             )
             if about_model is not None and _utility(about_model) > _utility(pooled):
                 return about_model, "model"

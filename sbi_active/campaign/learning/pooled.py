@@ -169,12 +169,12 @@ class PooledLearner(Learner):
             return int(share * left / to_go)
         return int(min(left, left * (1 - share) / (to_go - share)))
 
-    def design(self, index: int, limits: DesignLimits, exponent: float) -> Design:
+    def design(self, index: int, limits: DesignLimits) -> Design:
         """Return the design of a trial, by simulations of the pool."""
         with self._state.stage(index, "design"):
-            return self._design(index, limits, exponent)
+            return self._design(index, limits)
 
-    def _design(self, index: int, limits: DesignLimits, exponent: float) -> Design:
+    def _design(self, index: int, limits: DesignLimits) -> Design:
         seed = derive_seed(self._state.seed, "design", index)
         listed, notes = limits.listed()
         if listed is None:
@@ -222,7 +222,6 @@ class PooledLearner(Learner):
         return choose(
             estimates,
             limits,
-            exponent=exponent,
             estimator="PooledGain",
             bound="none",
             num_simulations=self._state.meter.spent - start,

@@ -75,9 +75,7 @@ class Belief(Distribution, ABC):
             return draws.reshape(*shape, *self.event_shape)
 
     def quick_sample(self, num_samples: int, *, seed: int) -> Tensor:
-        """Return draws for a picture, at no cost worth a word.
-
-        They are those of :meth:`sample` but for beliefs whose draws take long.
+        """Return draws of a seed of their own, (n, theta_dim), for pictures and tables.
 
         Args:
             num_samples: Number of draws n.
@@ -87,10 +85,7 @@ class Belief(Distribution, ABC):
             Shape (n, theta_dim), float32.
         """
         with forked_generators(seed), torch.no_grad():
-            return self._quick_sample(num_samples).float()
-
-    def _quick_sample(self, num_samples: int) -> Tensor:
-        return self._sample(num_samples)
+            return self._sample(num_samples).float()
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, (..., theta_dim) -> (...); -inf off the support."""

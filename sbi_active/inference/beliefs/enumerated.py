@@ -124,19 +124,12 @@ class EnumeratedBelief(Belief):
         self.values, self.probability = enumeration.values, probability.double()
 
     def _sample(self, num_samples: int) -> Tensor:
-        return self._mixed(num_samples, lambda part, n: part._sample(n))
-
-    @override
-    def _quick_sample(self, num_samples: int) -> Tensor:
-        return self._mixed(num_samples, lambda part, n: part._quick_sample(n))
-
-    def _mixed(self, num_samples: int, draw: Callable[[Belief, int], Tensor]) -> Tensor:
         which = torch.multinomial(self.probability, num_samples, replacement=True)
         drawn = torch.empty(num_samples, *self.event_shape)
         for k, part in enumerate(self.parts):
             rows = (which == k).nonzero()[:, 0]
             if len(rows):
-                own = draw(part, len(rows)).float()
+                own = part._sample(len(rows)).float()
                 drawn[rows] = self._enumeration.filled(k, own)
         return drawn
 

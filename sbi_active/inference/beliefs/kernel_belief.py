@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,11 +10,9 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.sampling.bandwidth import scott, silverman
+from sbi_active.inference.sampling.bandwidth import scott
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
-
-Bandwidth = float | Literal["scott", "silverman"]
 
 BLOCK = 4_000_000  # pairs of a kernel and a row held in memory at once
 NUM_TRIED = 4_000  # draws behind the normalizer
@@ -29,18 +26,16 @@ class KernelBelief(Belief):
         b(\theta) = \frac{1[\theta \in \mathrm{supp}\, p]}{Z} \sum_i w_i\,
         \mathcal N(\theta; \theta_i, h^2 \hat\Sigma)
 
-    with the draws' covariance and h by Scott's rule :math:`n^{-1 / (d + 4)}`,
-    Silverman's :math:`(n (d + 2) / 4)^{-1 / (d + 4)}`, or as given; n is the effective
-    number of draws. The kernels widen the posterior by :math:`h^2` of its variance.
-    Where few weights count, :math:`\hat\Sigma` says nothing; kernels of weighted draws
-    are therefore wider by the distance between draws, :math:`n^{-2 / d}` of their
-    unweighted covariance with n all of them.
+    with the draws' covariance and h by Scott's rule :math:`n^{-1 / (d + 4)}`, where n
+    is the effective number of draws. The kernels widen the posterior by :math:`h^2` of
+    its variance. Where few weights count, :math:`\hat\Sigma` says nothing; kernels of
+    weighted draws are therefore wider by the distance between draws,
+    :math:`n^{-2 / d}` of their unweighted covariance with n all of them.
 
     Args:
         prior: The original prior, which gives the support.
         draws: Shape (n, theta_dim).
         weight: Normalized, shape (n,); None weighs all alike.
-        bandwidth: h, or the rule for it.
 
     References:
         Scott, *Multivariate Density Estimation*, 1992; Kim & Matsubara, Applied
@@ -54,8 +49,6 @@ class KernelBelief(Belief):
         prior: Distribution,
         draws: Tensor,
         weight: Tensor | None = None,
-        *,
-        bandwidth: Bandwidth = "scott",
     ) -> None:
         super().__init__(prior)
         draws = draws.double()
@@ -64,7 +57,7 @@ class KernelBelief(Belief):
         weight = torch.full((n,), 1 / n) if weight is None else weight
         self._draws, self._weight = draws, weight.double() / weight.double().sum()
         effective = float(1 / self._weight.square().sum())
-        width = _width(bandwidth, effective, d)
+        width = scott(effective, d)
         center = self._weight @ draws
         step = draws - center
         covariance = (self._weight[:, None] * step).mT @ step
@@ -82,7 +75,6 @@ class KernelBelief(Belief):
         self.diagnostics = Diagnostics().extended(
             effective_sample_size=effective,
             bandwidth=width,
-            rule=bandwidth,
             mass_inside_prior=self._kept,
         )
 
@@ -109,16 +101,3 @@ class KernelBelief(Belief):
             parts.append((log_weight - 0.5 * gap).logsumexp(1))
         constant = 0.5 * theta.shape[1] * math.log(2 * math.pi) + math.log(self._kept)
         return torch.cat(parts) + self._inverse.diagonal().log().sum() - constant
-
-
-def _width(bandwidth: Bandwidth, num: float, dim: int) -> float:
-    if bandwidth == "scott":
-        return scott(num, dim)
-    if bandwidth == "silverman":
-        return silverman(num, dim)
-    if isinstance(bandwidth, str) or not bandwidth > 0:
-        raise ValueError(
-            f"expected bandwidth 'scott', 'silverman' or a number > 0; got "
-            f"{bandwidth!r}; use 'scott'"
-        )
-    return float(bandwidth)

@@ -95,18 +95,28 @@ class Stages:
 
     def run(self) -> LearnedBelief:
         """Return the belief of the last stage."""
+        fitted: Surrogate | None = None
+        stage: Stage | None = None
         while True:
             self._simulate(self._size())
             next_size = self._size()
             is_last = next_size < self.least
-            fitted = self._fit(is_cautious=not is_last)
-            stage = self._sample(fitted, self.near)
+            surrogate = self._fit(is_cautious=not is_last)
+            try:
+                stage = self._sample(surrogate, self.near)
+            except UnexplainedOutcomeError:
+                if not self.course.stages:
+                    raise
+                break  # beyond what any parameters explain, closer is no better
+            fitted = surrogate
             if stage.error > self.own.small and self.course.stages:
                 stage = self._with_more(stage)
             self.course.append(stage)
             if is_last or self.course.is_settled:
                 break
             self._propose(stage, next_size)
+        assert stage is not None
+        assert fitted is not None
         return self._learned(stage, fitted)
 
     def contradiction(self) -> Contradiction | None:

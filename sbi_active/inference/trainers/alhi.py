@@ -10,7 +10,6 @@ from sbi.inference.trainers._contracts import TrainConfig
 from sbi.neural_nets import likelihood_nn
 from torch import Tensor
 
-from sbi_active.inference.beliefs.kernel_belief import Bandwidth
 from sbi_active.inference.models.factors import ActionLikelihood
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
 from sbi_active.inference.networks.mixture_density import MixtureDensity
@@ -51,7 +50,6 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
         kwargs: Alike, by name.
         posterior: How beliefs are sampled, see :class:`.ProductRounds`; "kde" is the
             paper's.
-        bandwidth: Of "kde".
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331; Papamakarios,
@@ -80,10 +78,9 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
         self,
         *args: Any,
         posterior: str = "importance",
-        bandwidth: Bandwidth = "scott",
         **kwargs: Any,
     ) -> None:
-        super().__init__(*args, posterior=posterior, bandwidth=bandwidth, **kwargs)
+        super().__init__(*args, posterior=posterior, **kwargs)
 
     def _stored(self, rows: RoundRows) -> tuple[Tensor, Tensor]:
         return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1)

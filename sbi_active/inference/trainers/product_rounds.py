@@ -15,12 +15,11 @@ from torch.distributions import Distribution
 from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
+from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.factors import ActionFactor
 from sbi_active.inference.products.belief import sample_product
-from sbi_active.inference.products.markov_chains import MARKOV_CHAINS, MarkovChainBelief
 from sbi_active.inference.products.product import (
     Product,
     TrainedRegion,
@@ -34,7 +33,7 @@ from sbi_active.inference.trainers.base import Told
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 
-SAMPLERS = ("importance", "kde", *MARKOV_CHAINS)
+SAMPLERS = ("importance", "kde")
 #: Shares of the budget by stage, by what they begin at: this round's network, the
 #: belief before, or the prior.
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
@@ -63,10 +62,8 @@ class ProductRounds(ActionRounds):
     Args:
         args: Of :class:`.ActionRounds`.
         posterior: How the belief is sampled: "importance", tempered importance
-            sampling; one of sbi's Markov chains, for example "slice_np_vectorized" or
-            "nuts_pyro"; or "kde", the paper's: draws of the belief before times the
-            last trial's factor, as a kernel density estimate.
-        bandwidth: Of "kde", see :class:`.KernelBelief`.
+            sampling; or "kde", the paper's: draws of the belief before times the last
+            trial's factor, as a kernel density estimate.
         kwargs: Of :class:`.ActionRounds`.
 
     References:
@@ -78,9 +75,7 @@ class ProductRounds(ActionRounds):
     network_serves = ("start",)
     _factor: ClassVar[type[ActionFactor]]
 
-    def __init__(
-        self, *args: Any, posterior: str, bandwidth: Bandwidth, **kwargs: Any
-    ) -> None:
+    def __init__(self, *args: Any, posterior: str, **kwargs: Any) -> None:
         if posterior not in SAMPLERS:
             raise ValueError(
                 f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
@@ -88,7 +83,6 @@ class ProductRounds(ActionRounds):
             )
         super().__init__(*args, **kwargs)
         self._sampler = posterior
-        self._bandwidth: Bandwidth = bandwidth
 
     def append_simulations(
         self,
@@ -276,9 +270,7 @@ class ProductRounds(ActionRounds):
         if chained:
             with forked_generators(seed, "kernels"):
                 draws = belief.sample(torch.Size([NUM_KERNELS]))
-            sampled = KernelBelief(prior, draws, bandwidth=self._bandwidth)
-        elif self._sampler in MARKOV_CHAINS:
-            sampled = MarkovChainBelief(belief, product, self._sampler)
+            sampled = KernelBelief(prior, draws)
         num_lost = len(used) - len(counted)
         if num_lost:
             sampled.diagnostics = sampled.diagnostics.warned(

@@ -12,7 +12,6 @@ from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.kernel_belief import Bandwidth
 from sbi_active.inference.models.factors import ActionRatio
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
@@ -49,7 +48,6 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
         args: Further ones of sbi's; without a tracker nothing is tracked.
         kwargs: Alike, by name.
         posterior: How beliefs are sampled, see :class:`.ProductRounds`.
-        bandwidth: Of "kde".
     """
 
     _factor = ActionRatio
@@ -63,10 +61,9 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
         self,
         *args: Any,
         posterior: str = "importance",
-        bandwidth: Bandwidth = "scott",
         **kwargs: Any,
     ) -> None:
-        super().__init__(*args, posterior=posterior, bandwidth=bandwidth, **kwargs)
+        super().__init__(*args, posterior=posterior, **kwargs)
 
     def _network(self, theta: Tensor, x: Tensor) -> RatioNetwork:
         assert self._action_dim is not None

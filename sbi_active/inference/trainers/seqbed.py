@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.beliefs.kernel_belief import Bandwidth, KernelBelief
+from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
@@ -59,7 +59,6 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         prior: The prior over parameters, with a support.
         settings: Of the logistic regressions; None is ``LFIRE()``.
         num_particles: In a round; None makes as many as each has simulations.
-        bandwidth: Of the kernels, see :class:`.KernelBelief`.
         tracker: Not used: no network is trained.
         show_progress_bars: Not used.
 
@@ -88,7 +87,6 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         settings: LFIRE | None = None,
         *,
         num_particles: int | None = None,
-        bandwidth: Bandwidth = "scott",
         tracker: Tracker | None = None,
         show_progress_bars: bool = False,
     ) -> None:
@@ -99,7 +97,6 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
                 f"expected num_particles >= 2; got {num_particles}; use about 50"
             )
         self._num_particles = num_particles
-        self._bandwidth: Bandwidth = bandwidth
         self._rows: list[RoundRows] = []
         self._model: LFIREModel | None = None
         self.trials = []
@@ -276,7 +273,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         if says_nothing:  # beyond 1e19 float32 has no squares
             log_ratio = torch.zeros_like(log_ratio)
         weight = log_ratio.nan_to_num(-torch.inf).softmax(0)
-        belief = KernelBelief(self._prior, particles, weight, bandwidth=self._bandwidth)
+        belief = KernelBelief(self._prior, particles, weight)
         belief.label = "weighted particles"
         effective = belief.diagnostics.effective_sample_size or 0.0
         belief.diagnostics = belief.diagnostics.extended(num_particles=n, **spent)

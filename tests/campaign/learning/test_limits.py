@@ -122,11 +122,6 @@ def test_actions_that_hardly_give_a_measurement_are_left_out():
         assert float(c.pending.design.probability_valid[-1]) == 0.0
 
 
-def test_a_finite_exponent_draws_the_action():
-    designs = [campaign(limits={"seed": s}, exponent=0.0).ask() for s in range(6)]
-    assert len({float(trial.action) for trial in designs}) > 1
-
-
 def test_a_design_by_the_simulations_of_the_training_costs_none():
     trained = campaign(design_on="training", num_simulations=2_000).ask()
     assert trained.num_simulations == 2_000

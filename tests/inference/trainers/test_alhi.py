@@ -138,50 +138,15 @@ def test_kernels_have_the_stated_bandwidth():
     draws = PRIOR.sample((1_000,))
     belief = KernelBelief(PRIOR, draws)
     assert belief.diagnostics.bandwidth == pytest.approx(1_000 ** (-1 / 6))
-    widened = KernelBelief(PRIOR, draws, bandwidth=2.0).sample((4_000,))
-    # 1 + h^2 times the variance of the draws, to a few per cent.
-    ratio = float(widened.var() / draws.var())
-    assert ratio == pytest.approx(5, rel=0.15)
-    with pytest.raises(ValueError, match="expected bandwidth 'scott', 'silverman'"):
-        KernelBelief(PRIOR, draws, bandwidth=-1.0)
-
-
-def test_beliefs_by_kernels_are_wider_by_the_bandwidth():
-    """h = 1 doubles the variance; that of 2,000 draws is known to 3 %."""
-    sharp = observe(trained(), TRIALS[:1])
-    wide = observe(trained(posterior="kde", bandwidth=1.0), TRIALS[:1])
-    ratio = wide.variance / sharp.variance
-    assert ratio.tolist() == pytest.approx([2, 2], abs=4 * 2 * 0.03)
-    assert wide.label == "kernel density estimate"
+    few = PRIOR.sample((30,))
+    widened = KernelBelief(PRIOR, few).sample((4_000,))
+    # 1 + h^2 times the variance of the draws, but for what is cut off.
+    assert 1 < float(widened.var() / few.var()) < 1.32 * 1.05
 
 
 @pytest.mark.slow
 def test_beliefs_by_kernels_are_chained():
     assert divergence(observe(trained(posterior="kde"))) < 0.3
-
-
-@pytest.mark.slow
-def test_markov_chains_of_sbi():
-    belief = observe(trained(posterior="slice_np_vectorized"), TRIALS[:1])
-    torch.manual_seed(0)
-    draws = belief.sample((200,))
-    mean, sd = exact(TRIALS[:1])
-    # 20 chains of 10 correlated draws: some 50 effective ones.
-    assert draws.mean(0).tolist() == pytest.approx(
-        mean.tolist(), abs=4 * float(sd) / 50**0.5
-    )
-    assert belief.label == "product over trials, by slice_np_vectorized"
-
-
-@pytest.mark.slow
-def test_nuts():
-    pytest.importorskip("pyro")
-    belief = observe(trained(posterior="nuts_pyro"), TRIALS[:1])
-    torch.manual_seed(0)
-    draws = belief.sample((200,))
-    mean, sd = exact(TRIALS[:1])
-    assert draws.mean(0).tolist() == pytest.approx(mean.tolist(), abs=0.3 * float(sd))
-    assert draws.std(0).tolist() == pytest.approx([float(sd)] * 2, rel=0.3)
 
 
 def falls(theta, action):
