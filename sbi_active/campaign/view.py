@@ -19,8 +19,8 @@ from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
+from sbi_active.display.figures import legible
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
-from sbi_active.page.page import legible
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:

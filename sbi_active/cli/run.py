@@ -27,9 +27,10 @@ from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
 from sbi_active.cli.trials import sum_up_campaign
 from sbi_active.cli.words import as_json
+from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.plots import as_table, plot_rounds, save
+from sbi_active.plots import plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import Task  # pyright: ignore
@@ -249,7 +250,7 @@ def _table(records: Sequence[dict[str, Any]]) -> str:
     rows = [
         [cell(record, *column) for column in COLUMNS.values()] for record in records
     ]
-    return as_table(rows, [*COLUMNS])
+    return Table([*COLUMNS], rows).text()
 
 
 def _save(out: Path, campaign: Campaign, summary: dict[str, Any], seed: int) -> None:
