@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from importlib.machinery import ModuleSpec
 from math import inf
 from multiprocessing import get_context, parent_process, process
@@ -25,8 +26,6 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import cloudpickle
-import torch
-from threadpoolctl import threadpool_limits
 
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.calls import Call, Reply, answer
@@ -35,10 +34,12 @@ _FORKS = sys.platform.startswith("linux")
 
 _CONTEXT: Any = get_context("forkserver" if _FORKS else "spawn")
 
+_ONE_THREAD = f"{__package__}.one_thread"
+
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
 
 #: Libraries that a simulator loads use one thread: there is a worker a core.
-_ONE_THREAD = {
+_ENVIRONMENT = {
     f"{name}_NUM_THREADS": "1"
     for name in ("OMP", "MKL", "OPENBLAS", "BLIS", "NUMEXPR", "VECLIB")
 }
@@ -66,11 +67,11 @@ class Worker:
         self._simulator = simulator
         self._has_answered = False
         self.connection, theirs = _CONTEXT.Pipe()
-        environment = {**os.environ, **_ONE_THREAD}
+        environment = {**os.environ, **_ENVIRONMENT}
         self._process = _CONTEXT.Process(target=_work, args=(theirs, environment))
         with _main_module_left_alone():
             if _FORKS:  # of no effect once the server runs
-                _CONTEXT.set_forkserver_preload([__name__])
+                _CONTEXT.set_forkserver_preload([__name__, _ONE_THREAD])
             self._process.start()
         # Its end is ours to see to, not that of the interpreter, which would wait.
         process._children.discard(self._process)  # pyright: ignore
@@ -175,8 +176,7 @@ def _work(connection: Connection, environment: dict[str, str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     if _FORKS:
         _end_with_parent()
-    torch.set_num_threads(1)
-    threadpool_limits(1)
+    import_module(_ONE_THREAD)
     try:
         os.environ.clear()
         os.environ.update(environment)
