@@ -105,6 +105,7 @@ def table(rows: Sequence[Row]) -> list[str]:
 
     as_they_are = np.array([o.probability for o in odds])
     every = [*factors]
+    header = ("by", "area under the curve", "Brier score")
     cells = [
         *(line(name, [name]) for name in every),
         *(line(f"all but {n}", [m for m in every if m != n]) for n in every),
@@ -115,7 +116,7 @@ def table(rows: Sequence[Row]) -> list[str]:
         f"{len(rows)} effects that help, {right.sum()} of them there, "
         f"{len({*machines})} machines, each by the others",
         "",
-        Table(("by", "area under the curve", "Brier score"), cells).markdown(),
+        *Table(header, cells).markdown().splitlines(),
     ]
 
 
