@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import readme
+from sbi_active.display.table import Table
 
 HERE = Path(__file__).parent
 LONGEST = 30  # characters of a text that calls a row; a longer one is a note
@@ -82,6 +83,5 @@ def main(arguments: Settings) -> int:
             for name, value in leaves(json.loads(path.read_text()))
             if any(fnmatch(name, pattern) for pattern in arguments.only)
         ]
-    for row in (header, ["---"] * len(header), *cells):
-        print("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |")
+    print(Table(header, cells).markdown())
     return 0

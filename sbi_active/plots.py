@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.designer import Design
-from sbi_active.page.page import legible
+from sbi_active.display.figures import legible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,14 +136,3 @@ def save(figure: Figure, path: str) -> None:
 
     legible(figure).savefig(path, dpi=110)
     plt.close(figure)
-
-
-def as_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
-    """Return rows of text as aligned columns under a header."""
-    cells = np.array([header, *rows], dtype=object)
-    widths = [max(len(str(c)) for c in column) for column in cells.T]
-    lines = [
-        "  ".join(str(c).rjust(w) for c, w in zip(row, widths, strict=True))
-        for row in cells
-    ]
-    return "\n".join([lines[0], "  ".join("-" * w for w in widths), *lines[1:]])

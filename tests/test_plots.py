@@ -9,7 +9,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, RandomDesigner
 from sbi_active.design.design import Design
-from sbi_active.plots import as_table, plot_belief, plot_rounds, save
+from sbi_active.plots import plot_belief, plot_rounds, save
 
 NAMES = ["mass", "friction"]
 TRUTH = torch.tensor([1.0, 20.0])
@@ -133,12 +133,3 @@ def test_a_saved_figure_has_its_size_and_its_lines(tmp_path):
     red = (pixels[..., 0] == 1) & (pixels[..., 1:3] == 0).all(-1)
     assert red.sum() > 300
     assert not plt.fignum_exists(figure.number)
-
-
-def test_a_table_stands_in_columns():
-    assert as_table([["1", "0.25"], ["12", "3"]], ["round", "x"]).splitlines() == [
-        "round     x",
-        "-----  ----",
-        "    1  0.25",
-        "   12     3",
-    ]

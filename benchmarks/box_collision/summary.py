@@ -11,7 +11,7 @@ from scipy import stats
 
 from benchmarks.published import published
 from benchmarks.rows import read
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 
 __all__ = [
     "REPORTED",
@@ -83,7 +83,7 @@ def errors_table(cells: Cells) -> str:
     header = ["", "method", "trials"]
     for speed in REPORTED:
         header += [f"RepErr({speed:g}), 1e-3", "exact posterior's", "paper"]
-    return as_table(table, header)
+    return Table(header, table).text()
 
 
 def rounds_table(cells: Cells) -> str:
@@ -106,7 +106,7 @@ def rounds_table(cells: Cells) -> str:
             ]
         )
     header = ["", "median log p(truth) by round", "gap: mean +- se, 95 % (se of exact)"]
-    return as_table(table, [*header, "mean speed", "paper", "share off the table"])
+    return Table([*header, "mean speed", "paper", "share off the table"], table).text()
 
 
 def time_table(cells: Cells) -> str:
@@ -122,7 +122,7 @@ def time_table(cells: Cells) -> str:
         table.append(entry)
     names = " + ".join(PARTS)
     header = ["", f"CPU s a round ({names})", "wall s", "simulations a round"]
-    return f"{as_table(table, header)}\npaper, ASBI: {PUBLISHED_TIME}"
+    return f"{Table(header, table).text()}\npaper, ASBI: {PUBLISHED_TIME}"
 
 
 def time_parts(rows: Rows, kind: str) -> dict[str, float]:
@@ -191,7 +191,7 @@ def coverage_table(cells: Cells) -> str:
     if not table:
         return "no trials of three rounds yet"
     header = ["", "round", "trials", "in 50 % region", "in 90 % region", "gap"]
-    return as_table(table, header)
+    return Table(header, table).text()
 
 
 def draw(cells: Cells, folder: Path) -> list[Path]:

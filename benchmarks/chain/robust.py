@@ -24,7 +24,7 @@ import torch
 from benchmarks.chain.run import RESULTS
 from benchmarks.rows import append
 from sbi_active import ASBI
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.pyro import RobustASBI
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
@@ -146,4 +146,4 @@ def summary(rows: pd.DataFrame) -> str:
     header = ["case", "seeds", "median gain", "least to most, nats", "P(outlier)"]
     header += ["largest P of others", "largest r_hat: median (most)"]
     header += ["least effective draws", "divergences"]
-    return as_table(lines, [*header, *(f"CPU s, {m}" for m in METHODS)])
+    return Table([*header, *(f"CPU s, {m}" for m in METHODS)], lines).text()

@@ -35,8 +35,8 @@ from torch import Tensor
 
 from benchmarks.rows import append
 from sbi_active import Campaign, RefinementOptions
+from sbi_active.display.table import Table
 from sbi_active.inference import refine
-from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
 
@@ -172,7 +172,7 @@ def summary(path: Path) -> str:
             }
         )
     rows = [[str(value) for value in line.values()] for line in lines]
-    return as_table(rows, [*lines[0]])
+    return Table([*lines[0]], rows).text()
 
 
 def round_summary(path: Path) -> str:
@@ -189,7 +189,7 @@ def round_summary(path: Path) -> str:
         )
     header = ["parameters", "campaigns", "rounds", "CPU s a round", "most"]
     header += ["its rows' simulation", "design", "training", "update", "trustworthy"]
-    return as_table(lines, header)
+    return Table(header, lines).text()
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from sbi.utils import RestrictedPrior, get_density_thresholder
 
 from benchmarks.rows import append, read
 from sbi_active import Campaign
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
@@ -168,7 +168,7 @@ def table(rows: list[dict[str, str]]) -> str:
         costs.setdefault(task, []).append((name, float(np.median(kl)), used, work))
     header = ["task", "method", "a round", "trials", "gap r4: median / mean"]
     header += ["median KL r4", "regret", "simulations", "CPU s a round"]
-    text = [as_table(lines, header), ""]
+    text = [Table(header, lines).text(), ""]
     prices = [[task] for task in costs]
     for line, options in zip(prices, costs.values(), strict=True):
         good = [o for o in options if o[1] <= 0.2]
@@ -179,7 +179,7 @@ def table(rows: list[dict[str, str]]) -> str:
             best = min(good, key=lambda o: o[2] * price + o[3])
             line.append(f"{best[0]}: {best[2] * price + best[3]:.3g} s")
     text.append("cheapest round with a median KL <= .2 nat, by CPU s of a simulation:")
-    text.append(as_table(prices, ["task", *[f"{p:g} s" for p in PRICES]]))
+    text.append(Table(["task", *[f"{p:g} s" for p in PRICES]], prices).text())
     return "\n".join(text)
 
 

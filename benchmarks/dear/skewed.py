@@ -28,8 +28,8 @@ from torch import Tensor
 
 from benchmarks.dear.run import stock
 from benchmarks.rows import append, read
+from sbi_active.display import Table
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 
 ROWS = Path(__file__).parent / "results" / "skewed.csv"
@@ -158,4 +158,4 @@ def main(given: Settings) -> None:
         if isinstance(key, tuple)
     ]
     header = ["histories", "method", "seeds", "KL: mean / median", "shift [sd]"]
-    print(as_table(lines, [*header, "CPU s"]))
+    print(Table([*header, "CPU s"], lines).text())

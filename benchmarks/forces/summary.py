@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.criticism.intervals import rate
 from sbi_active.criticism.forces.dictionary import FORMS
+from sbi_active.display.table import Table
 
 Row = dict[str, str]
 
@@ -61,8 +62,7 @@ def is_flagged(row: Row) -> bool:
 def summary(rows: Sequence[Row]) -> list[str]:
     """Return the lines of the table, machines apart and together."""
     machines = [*dict.fromkeys(r["machine"] for r in rows)]
-    lines = [f"| measure | {' | '.join(machines)} | all |"]
-    lines.append("|---" * (len(machines) + 2) + "|")
+    lines = []
     for kind, measures in MEASURES.items():
         for name, hit in measures:
             parts = [[r for r in rows if r["machine"] == m] for m in machines]
@@ -71,7 +71,9 @@ def summary(rows: Sequence[Row]) -> list[str]:
                 own = [hit(r) for r in part if r["kind"] == kind]
                 cells.append(f"{sum(own)}/{len(own)}")
             every = [hit(r) for r in rows if r["kind"] == kind]
-            lines.append(f"| {kind}: {name} | {' | '.join(cells)} | {rate(every)} |")
+            lines.append((f"{kind}: {name}", *cells, rate(every)))
+    header = ("measure", *machines, "all")
+    lines = Table(header, lines).markdown().splitlines()
     for name in machines:
         own = [r for r in rows if r["machine"] == name]
         trials, scored, seconds = (

@@ -36,7 +36,7 @@ from torch import Tensor
 from benchmarks.information_gain.guides import conditional, marginal, posterior
 from benchmarks.information_gain.worlds import NUM_PILOT, World, worlds
 from sbi_active import InformationGainDesigner
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.seeding import forked_generators
 
 FINAL = 2_000  # simulations an action of pyro's final estimate
@@ -212,4 +212,4 @@ def main(
         writer = csv.DictWriter(file, [*rows[0]])
         writer.writeheader()
         writer.writerows(rows)
-    print(as_table([[*map(str, r.values())] for r in rows], [*rows[0]]))
+    print(Table([*rows[0]], [[*map(str, r.values())] for r in rows]).text())

@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active import ASBI, InformationGainDesigner, MixtureDensity, simulate
+from sbi_active.display.table import Table
 from sbi_active.inference import Belief
-from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 
@@ -157,4 +157,4 @@ def main(
         writer = csv.DictWriter(file, [*rows[0]])
         writer.writeheader()
         writer.writerows(rows)
-    print(as_table([[str(v) for v in r.values()] for r in rows], [*rows[0]]))
+    print(Table([*rows[0]], [[str(v) for v in r.values()] for r in rows]).text())

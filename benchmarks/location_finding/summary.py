@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.location_finding.bounds import near_cap
 from benchmarks.published import published
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 
 __all__ = ["PUBLISHED", "RESULTS", "Rows", "difference", "mean_and_error", "table"]
 
@@ -106,7 +106,7 @@ def table(folder: Path, num_trials: int, num_contrastive: int) -> str:
         cells += [[name, *pair, "", "", ""] for name, pair in PUBLISHED.items()]
     header = [f"{num_trials} trials (roll-outs)", "sPCE", "sNMC", "lower", "upper"]
     header.append("CPU s: design / belief / bounds")
-    return "\n".join([as_table(cells, header), *lines])
+    return "\n".join([Table(header, cells).text(), *lines])
 
 
 def main(

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.display.table import Table
+
 __all__ = ["called", "tables"]
 
 Array = NDArray[Any]
@@ -45,32 +47,26 @@ def called(row: dict[str, Any]) -> str:
 
 
 def _verdicts(rows: Sequence[dict[str, Any]]) -> str:
-    lines = [
-        "| ball | verdict | P(drag) | log BF | not excluded (90 %) "
-        "| exponent, 5 to 95 % | linear over quadratic, nats |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    header = ["ball", "verdict", "P(drag)", "log BF", "not excluded (90 %)"]
+    header += ["exponent, 5 to 95 %", "linear over quadratic, nats"]
+    lines = []
     for row in rows:
         low, middle, high = row["exponent"]
         verdict, exponent, favor = called(row), "", ""
         if verdict == "drag-like":
             exponent = f"{middle:.2f} ({low:.2f} to {high:.2f})"
             favor = f"{row['linear_over_quadratic']:+.1f}"
-        lines.append(
-            f"| {row['ball'].replace('_', ' ')} | {verdict} | "
-            f"{row['probability_of_drag']:.2f} | {row['log_bayes_factor']:.1f} | "
-            f"{', '.join(row['credible_set'])} | {exponent} | {favor} |"
-        )
-    return "\n".join(lines)
+        odds = f"{row['probability_of_drag']:.2f}", f"{row['log_bayes_factor']:.1f}"
+        ball, kept = row["ball"].replace("_", " "), ", ".join(row["credible_set"])
+        lines.append((ball, verdict, *odds, kept, exponent, favor))
+    return Table(header, lines).markdown()
 
 
 def _errors(rows: Sequence[dict[str, Any]]) -> str:
     """Return root mean squares over folds, with intervals over balls."""
     names = ["before", "after", *(f"{name}, least squares" for name in COLUMNS[2:])]
-    lines = [
-        f"| RMSE, m, {len(rows)} folds | {' | '.join(names)} | after / before |",
-        "|---" * (len(names) + 2) + "|",
-    ]
+    header = [f"RMSE, m, {len(rows)} folds", *names, "after / before"]
+    lines = []
     balls = sorted({row["ball"] for row in rows})
     rng = np.random.default_rng(0)
     resampled = rng.integers(len(balls), size=(NUM_BOOTSTRAP, len(balls)))
@@ -91,16 +87,14 @@ def _errors(rows: Sequence[dict[str, Any]]) -> str:
         )
         low, high = np.quantile(many, [0.05, 0.95])
         cells.append(f"{ratio:.2f} ({low:.2f} to {high:.2f})")
-        lines.append(f"| {what} | {' | '.join(cells)} |")
+        lines.append([what, *cells])
     cover = [
-        np.mean([row[f"coverage {when}"] for row in rows])
+        f"{np.mean([row[f'coverage {when}'] for row in rows]):.2f}"
         for when in ("before", "after")
     ]
-    lines.append(
-        f"| 90 % coverage of the forecast | {cover[0]:.2f} | {cover[1]:.2f} |"
-        + " |" * (len(COLUMNS) - 1)
-    )
-    return "\n".join(lines)
+    rest = [""] * (len(COLUMNS) - 1)
+    lines.append(["90 % coverage of the forecast", *cover, *rest])
+    return Table(header, lines).markdown()
 
 
 def _cell(square: Array, resampled: Array) -> str:
@@ -109,17 +103,13 @@ def _cell(square: Array, resampled: Array) -> str:
 
 
 def _folds(rows: Sequence[dict[str, Any]]) -> str:
-    lines = [
-        "| tested drop | verdict | P(drag) | second drop, m | forecast, m | coverage |",
-        "|---|---|---|---|---|---|",
-    ]
+    errors = ("second drop, m", "forecast, m", "coverage")
+    lines = []
     for row in rows:
         pairs = [
             f"{row[f'{what} before']:.2f} -> {row[f'{what} after']:.2f}"
             for what in ("second drop", "forecast", "coverage")
         ]
-        lines.append(
-            f"| {row['ball'].replace('_', ' ')} {row['tested']} | {called(row)} | "
-            f"{row['probability_of_drag']:.2f} | {' | '.join(pairs)} |"
-        )
-    return "\n".join(lines)
+        drop, drag = f"{row['ball']} {row['tested']}", row["probability_of_drag"]
+        lines.append((drop.replace("_", " "), called(row), f"{drag:.2f}", *pairs))
+    return Table(("tested drop", "verdict", "P(drag)", *errors), lines).markdown()

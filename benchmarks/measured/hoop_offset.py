@@ -19,6 +19,7 @@ from typing import Any
 
 from benchmarks.measured.ball_and_hoop import make_bench
 from benchmarks.measured.record_stages import judge, said
+from sbi_active.display.table import Table
 from sbi_active.tasks.ball_and_hoop import (  # pyright: ignore
     DATA,
     make_prior,
@@ -36,18 +37,14 @@ EVERY = (10, 5, 3)
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the rows in Markdown."""
     first = next(iter(rows.values()))
-    lines = [
-        "| prior of the offset, V | a reading in, s | verdict | held out, V: "
-        f"{' / '.join(first['after'])} | CPU s |",
-        "|---|---|---|---|---|",
-    ]
+    header = ("prior of the offset, V", "a reading in, s", "verdict")
+    held_out = f"held out, V: {' / '.join(first['after'])}"
+    lines = []
     for row in rows.values():
         after = " / ".join(f"{e:.3f}" for e in row["after"].values())
-        lines.append(
-            f"| {row['offset_sd']:g} | {0.1 * row['every']:.1f} | {said(row)} | "
-            f"{after} | {row['cpu_seconds']:.0f} |"
-        )
-    return "\n".join(lines)
+        prior, every = f"{row['offset_sd']:g}", f"{0.1 * row['every']:.1f}"
+        lines.append((prior, every, said(row), after, f"{row['cpu_seconds']:.0f}"))
+    return Table((*header, held_out, "CPU s"), lines).markdown()
 
 
 def main(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sbi_active.display.table import Table
 from sbi_active.tasks.servo_pendulum import Recordings  # pyright: ignore
 
 __all__ = ["tables"]
@@ -34,19 +35,14 @@ def tables(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
 
 
 def _stages(rows: Mapping[str, dict[str, Any]], recordings: Recordings) -> str:
-    lines = [
-        "| stage | trials | verdict | P(cause) | 90 % set | log BF | next trial "
-        "| CPU s |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    header = ["stage", "trials", "verdict", "P(cause)", "90 % set", "log BF"]
+    lines = []
     for name, row in rows.items():
         cause = ", ".join(f"{n} {p:.2f}" for n, p in row["cause"].items())
-        lines.append(
-            f"| {name} | {len(row['fitted'])} | {row['verdict']} | {cause} | "
-            f"{', '.join(row['credible_set'])} | {row['log_bayes_factor']:.1f} | "
-            f"{_next(row, recordings)} | {row['seconds']:.0f} |"
-        )
-    return "\n".join(lines)
+        odds = ", ".join(row["credible_set"]), f"{row['log_bayes_factor']:.1f}"
+        ends = _next(row, recordings), f"{row['seconds']:.0f}"
+        lines.append((name, len(row["fitted"]), row["verdict"], cause, *odds, *ends))
+    return Table([*header, "next trial", "CPU s"], lines).markdown()
 
 
 def _next(row: dict[str, Any], recordings: Recordings) -> str:
@@ -61,10 +57,7 @@ def _models(rows: Mapping[str, dict[str, Any]], stage: str) -> str:
     """Return the models of a stage, the likeliest first."""
     row = rows[stage]
     null = row["log_evidence"]["none"]
-    lines = [
-        f"| {stage}: model | P | log BF | phi, alone |",
-        "|---|---|---|---|",
-    ]
+    lines = []
     for name, p in row["probabilities"].items():
         if p < SHOWN and " + " in name:
             continue
@@ -72,20 +65,15 @@ def _models(rows: Mapping[str, dict[str, Any]], stage: str) -> str:
         if name in row["singles"]:
             mean, sd = row["singles"][name][name]
             phi = f"{mean:.3g} +- {sd:.2g}"
-        lines.append(
-            f"| {name} | {_probability(p)} | "
-            f"{row['log_evidence'][name] - null:.1f} | {phi} |"
-        )
-    return "\n".join(lines)
+        factor = f"{row['log_evidence'][name] - null:.1f}"
+        lines.append((name, _probability(p), factor, phi))
+    return Table((f"{stage}: model", "P", "log BF", "phi, alone"), lines).markdown()
 
 
 def _errors(row: dict[str, Any], recordings: Recordings) -> str:
     """Return the held-out errors beside plain least squares."""
-    each = " | ".join(_named(i, recordings) for i in row["held_out"])
-    lines = [
-        f"| RMSE, rad | fitted | held out | 5 to 95 % | {each} |",
-        "|---" * (4 + len(row["held_out"])) + "|",
-    ]
+    each = [_named(i, recordings) for i in row["held_out"]]
+    lines = []
     total = dict(
         zip(row["before_after"]["metric"], _pairs(row["before_after"]), strict=True)
     )["RMSE" if "RMSE" in row["before_after"]["metric"] else "rmse"]
@@ -93,18 +81,15 @@ def _errors(row: dict[str, Any], recordings: Recordings) -> str:
         (("before", "bare model"), ("after", row["model"]))
     ):
         low, _, high = row["draws"][when]["rmse"]
-        own = " | ".join(f"{v:.3f}" for v in row["rmse"][when])
-        lines.append(
-            f"| **{when}**: {what} | | **{total[i]:.4f}** | {low:.3f} to {high:.3f} | "
-            f"{own} |"
-        )
+        own = [f"{v:.3f}" for v in row["rmse"][when]]
+        spread = f"{low:.3f} to {high:.3f}"
+        lines.append((f"**{when}**: {what}", "", f"**{total[i]:.4f}**", spread, *own))
     for name, found in row["least squares"].items():
-        own = " | ".join(f"{v:.3f}" for v in found["each"])
-        lines.append(
-            f"| least squares: {name} | {found['train']:.4f} | {found['held_out']:.4f} "
-            f"| | {own} |"
-        )
-    return "\n".join(lines)
+        own = [f"{v:.3f}" for v in found["each"]]
+        sizes = f"{found['train']:.4f}", f"{found['held_out']:.4f}"
+        lines.append((f"least squares: {name}", *sizes, "", *own))
+    header = ("RMSE, rad", "fitted", "held out", "5 to 95 %", *each)
+    return Table(header, lines).markdown()
 
 
 def _pairs(table: dict[str, list[float]]) -> list[tuple[float, float]]:
@@ -113,22 +98,19 @@ def _pairs(table: dict[str, list[float]]) -> list[tuple[float, float]]:
 
 def _parameters(row: dict[str, Any]) -> str:
     before, after = row["parameters"]["none"], row["parameters"].get(row["model"], {})
-    lines = ["| parameter | bare model | " + row["model"] + " |", "|---|---|---|"]
+    lines = []
     for name in dict.fromkeys([*before, *after]):
         cells = [
             f"{found[name][0]:.4g} +- {found[name][1]:.2g}" if name in found else ""
             for found in (before, after)
         ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append((name, *cells))
+    return Table(("parameter", "bare model", row["model"]), lines).markdown()
 
 
 def _independent(rows: Mapping[str, dict[str, Any]]) -> str:
     """Return what errors that are forced to be independent change."""
-    lines = [
-        "| stage | errors | verdict | P | log BF: Coulomb / load / torque / viscous |",
-        "|---|---|---|---|---|",
-    ]
+    lines = []
     for stage in ("powered", "motor off"):
         for errors, name in (("default", stage), ("independent", f"{stage}, iid")):
             if name not in rows:
@@ -137,27 +119,25 @@ def _independent(rows: Mapping[str, dict[str, Any]]) -> str:
             z = row["log_evidence"]
             factors = " / ".join(f"{z[n] - z['none']:.0f}" for n in row["singles"])
             p = _probability(row["probabilities"].get(row["model"], 0.0))
-            lines.append(f"| {stage} | {errors} | {row['verdict']} | {p} | {factors} |")
-    return "\n".join(lines)
+            lines.append((stage, errors, row["verdict"], p, factors))
+    factors = "log BF: Coulomb / load / torque / viscous"
+    return Table(("stage", "errors", "verdict", "P", factors), lines).markdown()
 
 
 def _rates(rows: Sequence[dict[str, Any]]) -> str:
     """Return how the evidence grows with the rate at which angles are compared."""
     rates = sorted({row["rate"] for row in rows}, reverse=True)
     found = {(row["model"], row["rate"]): row for row in rows}
-    header = " | ".join(f"{rate:g} Hz" for rate in rates)
-    lines = [
-        f"| log likelihood above none (correlation of innovations) | {header} |",
-        "|---" * (1 + len(rates)) + "|",
-    ]
+    what = "log likelihood above none (correlation of innovations)"
+    lines = []
     for model in dict.fromkeys(row["model"] for row in rows):
         cells = []
         for rate in rates:
             own, null = found[model, rate], found["none", rate]
             gain = own["log_likelihood"] - null["log_likelihood"]
             cells.append(f"{gain:.0f} ({own['innovations']:.2f})")
-        lines.append(f"| {model} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append((model, *cells))
+    return Table((what, *(f"{rate:g} Hz" for rate in rates)), lines).markdown()
 
 
 def _named(trial: int, recordings: Recordings) -> str:

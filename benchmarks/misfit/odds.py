@@ -34,6 +34,7 @@ from benchmarks.misfit.machines import GROUPS
 from benchmarks.rows import append, read
 from sbi_active.criticism import close_loop
 from sbi_active.criticism.under_misfit import DECLARED, FAR, REMAINING, Odds
+from sbi_active.display.table import Table
 
 __all__ = ["COLUMNS", "claims", "main", "table"]
 
@@ -98,22 +99,24 @@ def table(rows: Sequence[Row]) -> list[str]:
         "parameters at bounds": [o.at_bounds for o in odds],
     }
 
-    def line(title: str, names: Sequence[str]) -> str:
+    def line(title: str, names: Sequence[str]) -> tuple[str, ...]:
         found = _predicted(np.array([factors[n] for n in names]).T, right, machines)
-        return f"| {title} | {_scores(right, found)} |"
+        return title, *_scores(right, found)
 
     as_they_are = np.array([o.probability for o in odds])
     every = [*factors]
+    header = ("by", "area under the curve", "Brier score")
+    cells = [
+        *(line(name, [name]) for name in every),
+        *(line(f"all but {n}", [m for m in every if m != n]) for n in every),
+        line("all", every),
+        ("the odds as they are", *_scores(right, as_they_are)),
+    ]
     return [
         f"{len(rows)} effects that help, {right.sum()} of them there, "
         f"{len({*machines})} machines, each by the others",
         "",
-        "| by | area under the curve | Brier score |",
-        "|---|---|---|",
-        *[line(name, [name]) for name in every],
-        *[line(f"all but {n}", [m for m in every if m != n]) for n in every],
-        line("all", every),
-        f"| the odds as they are | {_scores(right, as_they_are)} |",
+        *Table(header, cells).markdown().splitlines(),
     ]
 
 
@@ -141,8 +144,8 @@ def _predicted(
     return np.asarray(found)[:, 1]
 
 
-def _scores(right: NDArray[np.int64], p: NDArray[np.float64]) -> str:
-    return f"{roc_auc_score(right, p):.3f} | {brier_score_loss(right, p):.3f}"
+def _scores(right: NDArray[np.int64], p: NDArray[np.float64]) -> tuple[str, str]:
+    return f"{roc_auc_score(right, p):.3f}", f"{brier_score_loss(right, p):.3f}"
 
 
 @dataclass(frozen=True)

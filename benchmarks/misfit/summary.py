@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.criticism.intervals import rate
 from benchmarks.misfit.machines import get_machine
 from sbi_active.criticism.under_misfit import NAMED
+from sbi_active.display.table import Table
 
 __all__ = ["summary"]
 
@@ -37,10 +38,11 @@ def summary(rows: Sequence[Row]) -> list[str]:
     if not rows:
         return lines
     groups = _groups(rows)
-    lines += ["", "| measure | P(cause) > .5 | helps |", "|---|---|---|"]
-    for name, (own, hit) in _measures(groups).items():
-        cells = [rate([hit(r, column) for r in own]) for column in ("cause", "helps")]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+    cells = [
+        (name, *(rate([hit(r, column) for r in own]) for column in ("cause", "helps")))
+        for name, (own, hit) in _measures(groups).items()
+    ]
+    lines += ["", Table(("measure", "P(cause) > .5", "helps"), cells).markdown()]
     lines += ["", _places(rows), _lost_pairs(groups.get("P matters", []))]
     lines += ["", *_calibration(rows), "", *_coverage(groups), "", *_harm(rows)]
     return [*lines, "", *_cost(rows)]
@@ -240,12 +242,10 @@ def _cost(rows: Iterable[Row]) -> list[str]:
     for r in rows:
         figures = float(r["trial_simulations"]), float(r["cpu_seconds"])
         found.setdefault(r["machine"], []).append(figures)
-    lines = ["| machine | cases | simulated trials, median | largest | CPU s, median |"]
-    lines.append("|---|---|---|---|---|")
+    header = ("machine", "cases", "simulated trials, median", "largest")
+    lines = []
     for machine, figures in found.items():
         trials, seconds = np.array(figures).T
-        lines.append(
-            f"| {machine} | {len(figures)} | {np.median(trials):,.0f} | "
-            f"{trials.max():,.0f} | {np.median(seconds):.0f} |"
-        )
-    return lines
+        sizes = f"{np.median(trials):,.0f}", f"{trials.max():,.0f}"
+        lines.append((machine, len(figures), *sizes, f"{np.median(seconds):.0f}"))
+    return [Table((*header, "CPU s, median"), lines).markdown()]

@@ -45,7 +45,7 @@ from benchmarks.published import published
 from benchmarks.rows import append, read
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task
 
@@ -192,4 +192,4 @@ def main(arguments: Settings) -> None:
     header += [f"RepErr({a:g})" for a in REPORTED]
     header += ["gap: median mean", "mean regret, round 1 / 2 / ..", "C2ST"]
     header += ["simulations a round", "CPU s a round"]
-    print(as_table(table, header))
+    print(Table(header, table).text())

@@ -26,8 +26,8 @@ from benchmarks.published import published
 from benchmarks.rows import append, read
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
+from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.plots import as_table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 
@@ -279,5 +279,5 @@ def main(arguments: Settings) -> None:
     if arguments.truth == "fixed" and arguments.task == "linear":
         beside = published("numerical") | exact_limits()
         table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in beside.items()]
-    print(as_table(table, header), end="\n\n")
+    print(Table(header, table).text(), end="\n\n")
     print("\n".join(lines))

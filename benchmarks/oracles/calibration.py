@@ -18,6 +18,7 @@ import torch
 from scipy.stats import kstest
 
 from benchmarks import rows
+from sbi_active.display.table import Table
 from tests.oracles.problem import Problem
 from tests.oracles.problems import PROBLEMS
 from tests.oracles.ways import WAYS
@@ -70,18 +71,16 @@ def row_of(name: str, way: str, draw: int) -> dict[str, object]:
 
 def text(known: list[dict[str, str]]) -> str:
     """Return the table: is the rank of each parameter uniform?"""
-    lines = [
-        "| problem | way | draws | p-value of each parameter | in the central 90 % |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+    shares = ("p-value of each parameter", "in the central 90 %")
+    lines = []
     for name, way in dict.fromkeys((r["problem"], r["way"]) for r in known):
         own = [r for r in known if (r["problem"], r["way"]) == (name, way)]
         ranks = np.array([[float(v) for v in r["ranks"].split()] for r in own])
         levels = [kstest(column, "uniform").pvalue for column in ranks.T]
         inside = ((ranks > 0.05) & (ranks < 0.95)).mean()
         shown = ", ".join(f"{level:.2f}" for level in levels)
-        lines.append(f"| {name} | {way} | {len(own)} | {shown} | {inside:.3f} |")
-    return "\n".join(lines)
+        lines.append((name, way, len(own), shown, f"{inside:.3f}"))
+    return Table(("problem", "way", "draws", *shares), lines).markdown()
 
 
 def main(*, summary: bool = False, path: Path = ROWS) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from sbi_active.display.table import Table
 from tests.oracles.problems import PROBLEMS
 from tests.oracles.ways import WAYS
 
@@ -38,14 +39,13 @@ def text(rows: Sequence[Row]) -> str:
     Args:
         rows: As in ``rows.csv``.
     """
-    hard = "\n".join(
-        f"| {name} | {fn().dim} | {fn().x.shape[1]} | {fn().hard} |"
-        for name, fn in PROBLEMS.items()
-    )
-    head = "| problem | parameters | numbers a trial | what makes it hard |\n"
+    header = ("problem", "parameters", "numbers a trial", "what makes it hard")
+    hard = [
+        (name, fn().dim, fn().x.shape[1], fn().hard) for name, fn in PROBLEMS.items()
+    ]
     return "\n\n".join(
         [
-            head + "| --- | --- | --- | --- |\n" + hard,
+            Table(header, hard).markdown(),
             'KL divergence of normal fits, nats ("?": right, and says False):',
             crossed(rows, divergence),
             "Error of the log evidence in standard errors:",
@@ -65,8 +65,8 @@ def crossed(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
     """
     known = {(row["problem"], row["way"]): cell(row) for row in reversed(rows)}
     ways = [way for way in WAYS if any(w == way for _, w in known)]
-    lines = [["problem", *ways], ["---"] * (1 + len(ways))]
+    lines = []
     for problem in PROBLEMS:
         if any(p == problem for p, _ in known):
             lines.append([problem, *(known.get((problem, way), "") for way in ways)])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return Table(["problem", *ways], lines).markdown()

@@ -41,7 +41,7 @@ from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power, grid, told_by
 from benchmarks.pouring.run import RESULTS, TEMPERED
 from benchmarks.rows import append, read
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
@@ -311,7 +311,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
         )
     header = ["target", "campaigns", "log p(truth), ours", "reference", "gap, median"]
     header += ["gap on left-out parameters", "reference: in 50 %, 90 %"]
-    return as_table(table, [*header, "pours an action, volume"])
+    return Table([*header, "pours an action, volume"], table).text()
 
 
 def run_missing(

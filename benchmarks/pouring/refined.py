@@ -44,7 +44,7 @@ from benchmarks.pouring.learned import PARTS, ByAction, kept
 from benchmarks.pouring.power import best_power
 from benchmarks.pouring.run import RESULTS
 from benchmarks.rows import append, read
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
 
@@ -191,7 +191,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
         )
     header = ["target", "campaigns", "log p(truth): bank / refined / reference"]
     header += ["on left-out parameters", "gap of the refined", "left out"]
-    return as_table(table, [*header, "pours, CPU s"])
+    return Table([*header, "pours, CPU s"], table).text()
 
 
 @dataclass(frozen=True)

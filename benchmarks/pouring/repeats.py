@@ -22,7 +22,7 @@ from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.learned import ByAction, Learned, kept
 from benchmarks.pouring.likelihood import doubted
 from benchmarks.pouring.power import grid
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
 
@@ -83,7 +83,7 @@ def repeats_table(bank: Path, learned: ByAction) -> str:
             mean = log_density[:, k, num - 1].mean()
             entry.append(f"{mean:.2f}, {half:.2f}, {most:.2f}")
         table.append(entry)
-    return as_table(table, ["c", *[f"{num} pours" for num in SHOWN]])
+    return Table(["c", *[f"{num} pours" for num in SHOWN]], table).text()
 
 
 @dataclass(frozen=True)

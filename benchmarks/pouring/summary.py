@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 
 __all__ = [
     "bank_table",
@@ -82,15 +82,15 @@ def summarize(cells: Cells) -> str:
                 else " / ".join(f"{v:+.2f}" for v in common),
             ]
         )
-    first = as_table(
-        log_p,
+    first = Table(
         ["", "trials", "median log p(truth) by round", "last: min .. max"]
         + ["paper (1,000 cubes)", "mean power", "CPU s a round"],
-    )
-    second = as_table(
-        chosen,
+        log_p,
+    ).text()
+    second = Table(
         ["", "share at h = 20 cm", "share by mesh coverage", "gain: mesh less PCA"],
-    )
+        chosen,
+    ).text()
     shares = [actions_table(cells[key], key[1]) for key in cells if key[0] == "asbi"]
     return "\n\n".join([first, second, *shares, *active_against_random(cells)])
 
@@ -113,7 +113,7 @@ def actions_table(rows: Rows, target: str) -> str:
         ]
         table.append([name, " / ".join(f"{v:.1f}" for v in share)])
     head = f"target {target}: h cm, p cm, v rad/s, summary"
-    return as_table(table, [head, "share of ASBI's trials by round"])
+    return Table([head, "share of ASBI's trials by round"], table).text()
 
 
 def active_against_random(cells: Cells) -> list[str]:
@@ -152,7 +152,7 @@ def coverage_table(cells: Cells) -> str:
             log_p = column(rows, "log_prob_true", number)
             table.append([*entry, f"{log_p.mean():.2f}"])
     header = ["", "round", "truths", "in 50 % region", "in 90 % region", "mean log p"]
-    return as_table(table, header) if table else "no trials yet"
+    return Table(header, table).text() if table else "no trials yet"
 
 
 def bank_table(learned: Sequence[Sequence[Any]]) -> str:
@@ -178,7 +178,7 @@ def bank_table(learned: Sequence[Sequence[Any]]) -> str:
             ]
         )
     header = ["", "pours", "mean log p", "by action", "in 50 % region"]
-    return as_table(table, [*header, "in 90 % region", "mean power"])
+    return Table([*header, "in 90 % region", "mean power"], table).text()
 
 
 def reference_table(
@@ -204,4 +204,6 @@ def reference_table(
                 f"{worst:+.2f}",
             ]
         )
-    return as_table(table, ["", "ABC, mean log p", "less ours", "at worst, an action"])
+    return Table(
+        ["", "ABC, mean log p", "less ours", "at worst, an action"], table
+    ).text()

@@ -40,7 +40,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.actions import ActionSpace
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed
 from sbi_active.tasks import get_task
 
@@ -207,7 +207,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         )
     header = ["case", "search", "runs", "regret", "largest", "<= .05"]
     header += ["error of report", "simulations", "of the grid's", "CPU s"]
-    return as_table(lines, header)
+    return Table(header, lines).text()
 
 
 def main(

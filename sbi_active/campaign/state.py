@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from sbi_active.campaign.display.html import trial_html
+from sbi_active.campaign.cards import trial_html
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.design.designer import Design
 from sbi_active.inference.emulation.pool import Batch

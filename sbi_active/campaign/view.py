@@ -10,17 +10,17 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.cards import campaign_html
 from sbi_active.campaign.checks.calibration import calibration_lost
 from sbi_active.campaign.checks.health import Health, assess
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.frame import to_dataframe
-from sbi_active.campaign.display.html import campaign_html
 from sbi_active.campaign.isolation import isolated
 from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
+from sbi_active.display.figures import legible
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
-from sbi_active.page.page import legible
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
 from sbi_active.cli.given import problem_of
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Outcome, simulate
 from sbi_active.simulation.bank import Bank
@@ -149,14 +149,14 @@ def _outcomes(action: Tensor, status: Tensor) -> str:
     names = ["action", *(o.name.lower() for o in Outcome)]
     if len(distinct) <= LINES:
         cells = [", ".join(f"{a:g}" for a in row) for row in distinct.tolist()]
-        return as_table(_counts(cells, inverse, status), names)
+        return Table(names, _counts(cells, inverse, status)).text()
     tables = []
     for d in range(action.shape[1]):
         edges = torch.linspace(float(action[:, d].min()), float(action[:, d].max()), 11)
         part = torch.bucketize(action[:, d].contiguous(), edges[1:-1])
         cells = [f"{a:g} to {b:g}" for a, b in zip(edges[:-1], edges[1:], strict=True)]
         heading = [f"action {d + 1}", *names[1:]]
-        tables.append(as_table(_counts(cells, part, status), heading))
+        tables.append(Table(heading, _counts(cells, part, status)).text())
     return "\n".join(tables)
 
 

@@ -25,8 +25,9 @@ from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
 from sbi_active.cli.output import as_json
 from sbi_active.cli.trials import described, status, sum_up_campaign
+from sbi_active.display.table import Table
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.plots import as_table, plot_rounds, save
+from sbi_active.plots import plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import Task  # pyright: ignore
@@ -189,7 +190,7 @@ def _table(records: Sequence[dict[str, Any]]) -> str:
         return "-" if shown.get(name) is None else form.format(shown[name])
 
     rows = [[cell(record, *c) for c in COLUMNS.values()] for record in records]
-    return as_table(rows, [*COLUMNS])
+    return Table([*COLUMNS], rows).text()
 
 
 def _save(out: Path, campaign: Campaign, summary: dict[str, Any], seed: int) -> None:

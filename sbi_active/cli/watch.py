@@ -16,7 +16,7 @@ from pathlib import Path
 from sbi_active.campaign import Campaign
 from sbi_active.campaign.display.page import page
 from sbi_active.cli.record import digest
-from sbi_active.page import render
+from sbi_active.display import Page
 from sbi_active.progress import in_words
 from sbi_active.simulation.bank.sqlite import is_locked
 from sbi_active.simulation.bank.store import Store
@@ -66,7 +66,7 @@ class Watched:
                 try:
                     text = self.drawn()
                 except (ValueError, OSError) as error:
-                    text = _with_news(render("Campaign", []), str(error))
+                    text = _with_news(Page("Campaign", []).html(), str(error))
                 script = SCRIPT.replace("VERSION", version)
                 self._page = text.replace("</body>", f"{script}</body>")
                 self._version = version

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.drawing import draw, labels_of
+from sbi_active.display.figures import legible
+from sbi_active.display.notebook import card, facts, items, table
+from sbi_active.display.table import Table, number
 from sbi_active.information_gain.base import Bound
-from sbi_active.notebook import Markup, card, facts, items, number, table
-from sbi_active.page.page import legible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,7 +111,7 @@ class Design:
         best = gain.nan_to_num(nan=-torch.inf).argsort(descending=True, stable=True)
         rows = [
             [
-                Markup("<b>chosen</b>") if k == self.index else "",
+                "chosen" if k == self.index else "",
                 *[f"{v:.4g}" for v in self.candidates[k].tolist()],
                 number(float(gain[k])),
                 number(float(error[k])),
@@ -127,7 +128,8 @@ class Design:
             ("simulations", self.num_simulations or None),
             ("further candidates", left or None),
         ]
-        return card(repr(self), table(header, rows), facts(pairs), items(self.notes))
+        shown = table(Table(header, rows))
+        return card(repr(self), shown, facts(pairs), items(self.notes))
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the expected information gain of the candidates.

@@ -130,7 +130,7 @@ class Calibration:
     def plot(self) -> Figure:
         """Draw ranks as sbi does, coverage, and gaps and coverage by stratum."""
         from sbi_active.diagnostics.figure import plot_calibration
-        from sbi_active.page.page import legible
+        from sbi_active.display.figures import legible
 
         return legible(plot_calibration(self))
 

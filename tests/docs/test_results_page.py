@@ -92,9 +92,9 @@ def test_a_file_is_a_table(capsys, tmp_path):
         run(["table", str(tmp_path / arguments[0]), *arguments[1:]])
     assert capsys.readouterr().out.splitlines() == [
         "| a | b |",
-        "| --- | --- |",
+        "| --- | ---: |",
         "| 1 | x\\|y |",
         "| what | value |",
-        "| --- | --- |",
+        "| --- | ---: |",
         "| cpu, ours | 1.25 |",
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.pouring.summary import Rows
-from sbi_active.plots import as_table
+from sbi_active.display.table import Table
 
 __all__ = ["summarize"]
 
@@ -28,7 +28,7 @@ def summarize(rows: Rows) -> str:
     ]
     header = ["set", "truth", "verdict", "log Bayes factor", "P(truth)"]
     header += ["held-out error, sd", "CPU s"]
-    lines = [as_table(table, header), ""]
+    lines = [Table(header, table).text(), ""]
     hidden, clean, material = (
         [r for r in rows if r["kind"] == kind]
         for kind in ("hidden", "clean", "material")

@@ -13,7 +13,8 @@ import numpy as np
 from benchmarks.pouring.figures import boxes, subplots
 from benchmarks.pouring.summary import Rows
 from benchmarks.rows import read
-from sbi_active.plots import as_table, save
+from sbi_active.display.table import Table
+from sbi_active.plots import save
 
 __all__ = ["checks_table", "intervol_figure", "summarize"]
 
@@ -73,7 +74,7 @@ def summarize(rows: Rows) -> str:
             )
     header = ["", "trials", "median InterVol by round, mm", "last: min .. max"]
     header += ["last to first", "share at p = 0", "paper (1,000, a robot)"]
-    return "\n\n".join([as_table(table, header), *lines])
+    return "\n\n".join([Table(header, table).text(), *lines])
 
 
 def checks_table(rows: Rows) -> str:
@@ -91,7 +92,7 @@ def checks_table(rows: Rows) -> str:
     ]
     gap = np.array([float(r["learned"]) - float(r["poured"]) for r in rows])
     error = np.array([float(r["poured_se"]) for r in rows])
-    text = as_table(table, ["last belief of", "pours", "poured anew", "learned"])
+    text = Table(["last belief of", "pours", "poured anew", "learned"], table).text()
     spread, noise = np.sqrt((gap**2).mean()), np.sqrt((error**2).mean())
     return (
         f"\n{text}\nlearned less poured: {gap.mean():+.0f} mm at the mean, root mean "

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sbi_active.notebook import parameter_rows
-from sbi_active.page import Part, Picture, Table, render
+from sbi_active.display.page import Page, Picture, Section
+from sbi_active.display.table import Table
 from sbi_active.seeding import forked_generators
 
 #: Draws behind the page's numbers: a mean is then known to a 60th of a deviation.
@@ -28,24 +28,33 @@ def page(campaign: Any) -> str:
     has_simulator = campaign.simulator is not None
     figure = campaign.plot(**({} if has_simulator else {"num_predicted": 0}))
     known = _belief(campaign)
-    picture = Picture.of(figure, _in_words(campaign, known))
-    plt.close(figure)
-    limits = _limits(campaign)
-    parts = [
-        Part("Limits", items=limits, warns=True) if limits else None,
-        Part("What is known", table=known, text=_together(campaign)),
-        Part("Course", picture=picture),
-        Part("Trials", table=_trials(campaign)) if campaign.state.trials else None,
-        _verdicts(campaign),
+    picture = Picture("course", _in_words(campaign, known))
+    limits, verdicts = _limits(campaign), _verdicts(campaign)
+    sections = [
+        *([Section("Limits", items=limits, warns=True)] if limits else []),
+        Section("What is known", table=known, text=_together(campaign)),
+        Section("Course", picture=picture),
+        *(
+            [Section("Trials", table=_trials(campaign))]
+            if campaign.state.trials
+            else []
+        ),
+        *(
+            [Section("Compared with what it may lack", table=verdicts)]
+            if verdicts
+            else []
+        ),
     ]
     kinds = {"ok": "good", "watch": "fair", "alarm": "bad"}
-    return render(
+    made = Page(
         f"Campaign: {campaign.actions!r}",
-        [part for part in parts if part is not None],
-        badge=(f"health {campaign.health}", kinds[campaign.health]),
+        sections,
         lead=[_summary(campaign)],
+        badge=(f"health {campaign.health}", kinds[campaign.health]),
         footer=_origin(campaign),
-    )
+    ).html({"course": figure})
+    plt.close(figure)
+    return made
 
 
 def write_page(campaign: Any, path: str | os.PathLike[str]) -> Path:
@@ -66,8 +75,7 @@ def _summary(campaign: Any) -> str:
 def _belief(campaign: Any) -> Table:
     with forked_generators(0, "page"):
         draws = campaign.belief.sample((NUM_DRAWS,))
-    header = ("parameter", "mean", "sd", "central 90 %")
-    return Table(header, parameter_rows(campaign.parameter_names, draws))
+    return Table.of_parameters(campaign.parameter_names, draws)
 
 
 def _together(campaign: Any) -> list[str]:
@@ -90,26 +98,17 @@ def _in_words(campaign: Any, known: Table) -> str:
 
 
 def _trials(campaign: Any) -> Table:
-    frame = campaign.to_dataframe().drop(columns=[*LEFT_OUT], errors="ignore")
-    kept = frame.loc[:, [c for c in frame.columns if not frame[c].isna().all()]]
-    rows = [[_cell(value) for value in row] for row in kept.itertuples(index=False)]
-    return Table([*map(str, kept.columns)], rows)
+    frame = campaign.to_dataframe()
+    return Table.of(frame.drop(columns=[*LEFT_OUT], errors="ignore"))
 
 
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return "" if value != value else f"{value:.4g}"
-    return "" if value is None else f"{value!s:.60}"
-
-
-def _verdicts(campaign: Any) -> Part | None:
+def _verdicts(campaign: Any) -> Table | None:
     rows = [
         (entry["time"][:16].replace("T", " "), entry["verdict"])
         for entry in campaign.events
         if entry["event"] == "examined"
     ]
-    table = Table(("when", "verdict"), rows)
-    return Part("Compared with what it may lack", table=table) if rows else None
+    return Table(("when", "verdict"), rows) if rows else None
 
 
 def _limits(campaign: Any) -> list[str]:

@@ -12,8 +12,8 @@ from scipy.stats import rankdata
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import FEW_TRIALS
+from sbi_active.criticism.report.names import called
 from sbi_active.criticism.report.numbers import number
-from sbi_active.criticism.report.section import called
 from sbi_active.criticism.report.suspects import (
     of_bounds,
     of_missed,

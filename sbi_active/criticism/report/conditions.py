@@ -8,8 +8,8 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import summary_sentence
+from sbi_active.criticism.report.names import named_entries, setting
 from sbi_active.criticism.report.numbers import number
-from sbi_active.criticism.report.section import named_entries, setting
 from sbi_active.criticism.report.suspects import of_bounds, of_missed, of_outlying
 
 #: Parameters and entries of the action that a sentence names at most.

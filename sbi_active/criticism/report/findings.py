@@ -6,6 +6,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import added
+from sbi_active.criticism.report.names import called, joined, named_entries
 from sbi_active.criticism.report.numbers import (
     FEWEST_DRAWS,
     estimated,
@@ -13,14 +14,11 @@ from sbi_active.criticism.report.numbers import (
     probability,
     with_error,
 )
-from sbi_active.criticism.report.section import (
-    Section,
-    called,
-    joined,
-    named_entries,
-)
+from sbi_active.criticism.report.pictures import pictured
 from sbi_active.criticism.report.suspects import label
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, Residuals
+from sbi_active.display.page import Section
+from sbi_active.display.table import Table
 
 SHOWN = 0.01  # probability from which a set of several effects stands in the table
 SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
@@ -91,9 +89,8 @@ def effects(report: Contents) -> Section:
     return Section(
         "Effects",
         tuple(text),
-        header=header,
-        rows=tuple(cells for *_, cells in rows),
-        figure="probabilities",
+        table=Table(header, [cells for *_, cells in rows]),
+        picture=pictured(report, "probabilities"),
     )
 
 
@@ -145,12 +142,12 @@ def residuals(report: Contents) -> Section:
         text.insert(0, found)
     if before.times is not None:
         text.append(f"Correlation of neighboring errors {before.correlation:.2f}.")
+    header = ("residuals [sd]", "refitted", "beyond 2", "predicted", "beyond 2")
     return Section(
         "Residuals",
         tuple(text),
-        header=("residuals [sd]", "refitted", "beyond 2", "predicted", "beyond 2"),
-        rows=tuple(rows),
-        figure="residuals",
+        table=Table(header, rows),
+        picture=pictured(report, "residuals"),
     )
 
 
@@ -210,7 +207,7 @@ def by_trial(report: Contents) -> Section:
     of = "the prediction" if report.tracing.misfit is None else "the sensor"
     where = " where it is largest" if left.shape[2] > 1 else ""
     header = ("trial", f"in units of x{where}", f"in deviations of {of}", "largest")
-    return Section("Residuals by trial", (text,), header=header, rows=(*aside, *rows))
+    return Section("Residuals by trial", (text,), table=Table(header, [*aside, *rows]))
 
 
 def _row(
@@ -272,7 +269,7 @@ def leave_one_out(report: Contents) -> Section:
             "the posterior that its density is a guess, too high as a rule."
         )
     header = ("model", "log density", "largest k", f"trials with k > {limit:.2f}")
-    return Section("Leave one out", tuple(text), header=header, rows=tuple(rows))
+    return Section("Leave one out", tuple(text), table=Table(header, rows))
 
 
 def _sizes(z: Array) -> tuple[str, str]:

@@ -9,13 +9,14 @@ import numpy as np
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import METRICS
 from sbi_active.criticism.report.headline import added
+from sbi_active.criticism.report.names import called, joined, setting
 from sbi_active.criticism.report.numbers import (
     FEWEST_DRAWS,
     estimated,
     number,
     probability,
 )
-from sbi_active.criticism.report.section import Section, called, joined, setting
+from sbi_active.criticism.report.pictures import pictured
 from sbi_active.criticism.results import (
     NONE,
     SCATTER,
@@ -24,6 +25,8 @@ from sbi_active.criticism.results import (
     NextAction,
 )
 from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.display.page import Section
+from sbi_active.display.table import Table
 
 SEVERE = (
     "The first paragraph names the actions that put the verdict to the test most. The "
@@ -81,9 +84,8 @@ def errors(report: Contents) -> Section:
         title,
         tuple(text),
         items=tuple(pairs),
-        header=header,
-        rows=tuple(rows),
-        figure="before_after",
+        table=Table(header, rows),
+        picture=pictured(report, "before_after"),
     )
 
 
@@ -120,14 +122,9 @@ def parameters(report: Contents) -> Section:
             "few for a deviation.",
         )
     if report.verdict == NONE:
-        return Section(
-            "Parameters",
-            text,
-            header=(*header[:2],),
-            rows=tuple(row[:2] for row in rows),
-        )
-    title = "Parameters before and after"
-    return Section(title, text, header=(*header,), rows=tuple(rows))
+        alone = Table(header[:2], [row[:2] for row in rows])
+        return Section("Parameters", text, table=alone)
+    return Section("Parameters before and after", text, table=Table(header, rows))
 
 
 def next_action(report: Contents) -> Section:

@@ -11,12 +11,16 @@ import cloudpickle
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.report import rendering
 from sbi_active.criticism.report.cautions import find_warnings
+from sbi_active.criticism.report.conditions import first_paragraph
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.headline import verdict_line
+from sbi_active.criticism.report.pictures import figures
+from sbi_active.criticism.report.sections import page
+from sbi_active.display.figures import legible
+from sbi_active.display.notebook import card, items, table
+from sbi_active.display.table import Table, number
 from sbi_active.messages import explained
-from sbi_active.page.page import legible
 
 
 class Report(Contents):
@@ -26,13 +30,28 @@ class Report(Contents):
     """
 
     def __str__(self) -> str:
-        return rendering.to_text(self)
+        return page(self).text()
 
     def __repr__(self) -> str:
         return f"Report({verdict_line(self)!r})"
 
     def _repr_html_(self) -> str:
-        return rendering.to_notebook(self)
+        scored = self.before_after
+        numbers = scored[["before", "after", "ratio"]].to_numpy(dtype=float)
+        errors = [
+            (name, *map(number, row))
+            for name, row in zip(scored["metric"], numbers, strict=True)
+        ]
+        likely = sorted(self.probabilities.items(), key=lambda item: -item[1])[:5]
+        return card(
+            verdict_line(self),
+            first_paragraph(self),
+            table(
+                Table(("model", "probability"), [(n, f"{p:.2f}") for n, p in likely])
+            ),
+            table(Table(("metric", "before", "after", "ratio or difference"), errors)),
+            items(self.warnings),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Effects are lambdas and local functions as a rule, which pickle refuses.
@@ -41,11 +60,11 @@ class Report(Contents):
 
     def to_markdown(self) -> str:
         """Return the report as Markdown, figures by the names that ``save`` gives."""
-        return rendering.to_markdown(self)
+        return page(self).markdown()
 
     def to_html(self) -> str:
         """Return the report as one self-contained page with its figures."""
-        return rendering.to_html(self)
+        return page(self).html(figures(self))
 
     def save(self, directory: str | Path) -> Path:
         """Write report.txt, report.md, report.html and the figures as PNG.
@@ -64,11 +83,11 @@ class Report(Contents):
         (directory / "report.md").write_text(
             self.to_markdown(), encoding="utf-8", errors="replace"
         )
-        page = directory / "report.html"
-        page.write_text(self.to_html(), encoding="utf-8", errors="replace")
-        for name, figure in rendering.figures(self).items():
+        path = directory / "report.html"
+        path.write_text(self.to_html(), encoding="utf-8", errors="replace")
+        for name, figure in figures(self).items():
             legible(figure).savefig(directory / f"{name}.png", dpi=150)
-        return page
+        return path
 
 
 def build_report(

@@ -1,19 +1,25 @@
-"""What a report says, part by part."""
+"""What a report says, section by section."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 from sbi_active.criticism.report import findings, outlook
+from sbi_active.criticism.report.conditions import first_paragraph
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.section import Section
+from sbi_active.criticism.report.headline import verdict_line
 from sbi_active.criticism.report.under_misfit import admitted_models
+from sbi_active.display.page import Page, Section
 
 
-def sections(report: Contents) -> Iterator[Section]:
-    """Yield the parts of a report in order."""
+def page(report: Contents) -> Page:
+    """Return a report as a page, the verdict its title."""
+    return Page(verdict_line(report), [*_sections(report)], [first_paragraph(report)])
+
+
+def _sections(report: Contents) -> Iterator[Section]:
     if report.warnings:
-        yield Section("Warnings", items=report.warnings)
+        yield Section("Warnings", items=report.warnings, warns=True)
     if report.tracing.misfit is not None:
         yield admitted_models(report, report.tracing.misfit)
     yield findings.effects(report)

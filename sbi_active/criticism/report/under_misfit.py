@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from math import isnan
 
 from sbi_active.criticism.report.contents import Contents
+from sbi_active.criticism.report.names import joined, named_entries
 from sbi_active.criticism.report.numbers import number, probability, stated
-from sbi_active.criticism.report.section import Section, joined, named_entries
 from sbi_active.criticism.results import Array, ModelKey
 from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
+from sbi_active.display.page import Section
+from sbi_active.display.table import Table
 
 
 def misfit_line(verdict: str, misfit: Misfit) -> str:
@@ -169,8 +171,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
         "Models that predict",
         tuple(text),
         items=tuple(items),
-        header=tuple(header),
-        rows=tuple(rows),
+        table=Table(header, rows),
     )
 
 

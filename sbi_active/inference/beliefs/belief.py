@@ -13,9 +13,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from sbi_active.display.notebook import card, table
+from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.messages import warn
-from sbi_active.notebook import card, parameters
 from sbi_active.seeding import forked_generators
 from sbi_active.support import support_of, within_support
 
@@ -146,7 +147,7 @@ class Belief(Distribution, ABC):
         draws = self.quick_sample(NUM_SHOWN, seed=0)
         return card(
             f"Belief: {self.label}",
-            parameters(names_of(self, draws.shape[1]), draws),
+            table(Table.of_parameters(names_of(self, draws.shape[1]), draws)),
             self.diagnostics._repr_html_(),
         )
 

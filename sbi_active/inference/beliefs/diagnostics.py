@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
+from sbi_active.display.notebook import badge, card, facts, items
+from sbi_active.display.table import number
 from sbi_active.inference.beliefs.identifiability import Combinations
 from sbi_active.messages import explained, warn
-from sbi_active.notebook import badge, card, facts, items, number
 
 VERDICTS = {
     True: ("good", "trustworthy"),

@@ -35,13 +35,10 @@ class IdleWorkers:
             is_same = key == self._key
             self._key = key
             workers = self._withdraw()
-        if not is_same:
-            _end(workers)
-            return []
         # One that waits has nothing to say, unless it has died.
-        dead = [w for w in workers if w.connection.poll()]
-        _end(dead)
-        return [w for w in workers if w not in dead]
+        useful = [w for w in workers if is_same and not w.connection.poll()]
+        _end([w for w in workers if w not in useful])
+        return useful
 
     def give(self, key: str, workers: Sequence[Worker], *, at_most: int) -> None:
         """Let workers wait that have answered all their calls.
@@ -52,16 +49,25 @@ class IdleWorkers:
             at_most: How many of them may wait; the others end.
         """
         with self._lock:
+            room = 0
             if key == self._key:  # nobody has come with another one meanwhile
                 room = max(at_most - len(self._workers), 0)
-                self._workers += workers[:room]
-                workers = workers[room:]
-                self._restart_timer()
-        _end(workers)
+                self._workers = self._withdraw() + [*workers[:room]]
+                self._timer = threading.Timer(self.SECONDS, self.end, [self._workers])
+                self._timer.daemon = True
+                self._timer.start()
+        _end(workers[room:])
 
-    def end(self) -> None:
-        """End the workers that wait."""
+    def end(self, workers: list[Worker] | None = None) -> None:
+        """End the workers that wait.
+
+        Args:
+            workers: Only if these are they; a timer that is cancelled while it fires
+                has nothing to end any more.
+        """
         with self._lock:
+            if workers is not None and workers is not self._workers:
+                return
             workers = self._withdraw()
         _end(workers)
 
@@ -71,21 +77,6 @@ class IdleWorkers:
             self._timer = None
         workers, self._workers = self._workers, []
         return workers
-
-    def _restart_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = threading.Timer(self.SECONDS, self._expire)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def _expire(self) -> None:
-        with self._lock:
-            # A timer that is cancelled while it fires has nothing to end any more.
-            if self._timer is not threading.current_thread():
-                return
-            workers = self._withdraw()
-        _end(workers)
 
 
 def _end(workers: Sequence[Worker]) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
 from math import inf
 from multiprocessing.connection import wait
 from typing import Any
@@ -17,7 +18,7 @@ from typing_extensions import override
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.idle import IDLE
 from sbi_active.simulation.workers.pickling import pickled
-from sbi_active.simulation.workers.processes import Worker, surroundings
+from sbi_active.simulation.workers.processes import Worker
 
 
 class Pool(ABC):
@@ -92,11 +93,11 @@ class WorkerPool(Pool):
     def __init__(self, simulator: Callable[..., Any], num_workers: int) -> None:
         self.num_slots = num_workers
         self._simulator = pickled(simulator)
-        self._surroundings = surroundings()
-        key = pickle.dumps((self._simulator, self._surroundings))
+        surroundings = os.getcwd(), sys.path, dict(os.environ)
+        key = pickle.dumps((self._simulator, surroundings))
         self._key = hashlib.sha256(key).hexdigest()
         self._idle = IDLE.take(self._key)
-        self._busy: dict[Worker, _Running] = {}
+        self._busy: list[Worker] = []
 
     @property
     @override
@@ -105,31 +106,26 @@ class WorkerPool(Pool):
 
     @override
     def submit(self, call: Call, time_limit: float | None) -> None:
-        if self._idle:
-            worker = self._idle.pop()
-        else:
-            worker = Worker(self._simulator, self._surroundings)
-        self._busy[worker] = _Running(call, time_limit)
-        with suppress(OSError):  # it has died, as collect() will find
-            worker.send(pickle.dumps(call, protocol=5))
-        if worker.is_ready:
-            self._busy[worker].start()
+        worker = self._idle.pop() if self._idle else Worker(self._simulator)
+        self._busy.append(worker)
+        worker.start(call, time_limit)
 
     @override
     def collect(self) -> list[tuple[Call, Reply]]:
         done: list[tuple[Call, Reply]] = []
         while self._busy and not done:
-            first = min(r.deadline for r in self._busy.values())
+            first = min(w.deadline for w in self._busy)
             timeout = None if first == inf else max(first - time.monotonic(), 0.0)
             wait([w.connection for w in self._busy], timeout=timeout)
-            for worker, running in list(self._busy.items()):
-                reply = self._look(worker, running)
+            for worker in [*self._busy]:
+                reply = worker.reply()
                 if reply is not None:
-                    del self._busy[worker]
-                    done.append((running.call, reply))
+                    self._busy.remove(worker)
+                    done.append((worker.call, reply))
                     if reply.fault in ("timed out", "worker died", "not loaded"):
-                        continue
-                    self._idle.append(worker)
+                        worker.end()
+                    else:
+                        self._idle.append(worker)
         return done
 
     @override
@@ -137,52 +133,4 @@ class WorkerPool(Pool):
         for worker in self._busy:
             worker.end()
         IDLE.give(self._key, self._idle, at_most=self.num_slots)
-        self._idle, self._busy = [], {}
-
-    def _look(self, worker: Worker, running: _Running) -> Reply | None:
-        """Return what came of a call; None while it runs."""
-        try:
-            while worker.connection.poll():
-                reply = pickle.loads(worker.connection.recv_bytes())
-                if isinstance(reply, Reply):
-                    if reply.fault == "not loaded":
-                        worker.end()
-                    return reply
-                worker.is_ready = True
-                running.start()
-        except (EOFError, OSError):
-            code = worker.end()
-            if worker.is_ready:
-                return Reply(
-                    fault="worker died",
-                    traceback=f"worker died: its process {_ending(code)} during the "
-                    "call, without an exception",
-                )
-            return Reply(
-                fault="not loaded",
-                traceback=f"the process {_ending(code)} while it loaded the simulator",
-            )
-        if time.monotonic() < running.deadline:
-            return None
-        worker.end()
-        return Reply(
-            fault="timed out",
-            traceback=f"timed out: no answer within {running.time_limit:g} s",
-        )
-
-
-class _Running:
-    """A call with its deadline, which begins once the simulator has been loaded."""
-
-    def __init__(self, call: Call, time_limit: float | None) -> None:
-        self.call = call
-        self.time_limit = time_limit
-        self.deadline = inf
-
-    def start(self) -> None:
-        if self.time_limit is not None:
-            self.deadline = time.monotonic() + self.time_limit
-
-
-def _ending(code: int) -> str:
-    return f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        self._idle, self._busy = [], []

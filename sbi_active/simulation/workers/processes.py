@@ -1,16 +1,13 @@
 """Worker processes that may die: cheap to start, and each killed without the others.
 
 A worker imports torch and this package, which takes seconds, so a simulator that kills
-its process now and then would spend the night on imports. Here a *nest*, a clean
-process that has imported them and does nothing else, forks the workers in
-milliseconds. The nest is started by loky, which does not run the user's main module
-again, and is kept for the next simulations of this process. Where there is no safe
-fork (Windows, macOS) each worker is started by loky itself.
+its process now and then would spend the night on imports. The fork server of
+:mod:`multiprocessing` imports them once and forks the workers in milliseconds. Where
+there is no safe fork (Windows, macOS) each worker is spawned.
 """
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import os
 import pickle
@@ -19,233 +16,170 @@ import sys
 import threading
 import time
 import traceback
-from contextlib import suppress
-from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle, send_handle
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+from math import inf
+from multiprocessing import get_context, parent_process, process
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import cloudpickle
-import torch
-from joblib.externals.loky.backend import get_context
 
 from sbi_active.simulation.model import SimulatorModel
-from sbi_active.simulation.workers.calls import Reply, answer
+from sbi_active.simulation.workers.calls import Call, Reply, answer
 
 _FORKS = sys.platform.startswith("linux")
 
-_LOKY: Any = get_context("loky")
+_CONTEXT: Any = get_context("forkserver" if _FORKS else "spawn")
 
-_PATIENCE = 1.0  # s
+_ONE_THREAD = f"{__package__}.one_thread"
+
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
 
-#: A worker's libraries use one thread: there is a worker a core.
-_ONE_THREAD = {
+#: Libraries that a simulator loads use one thread: there is a worker a core.
+_ENVIRONMENT = {
     f"{name}_NUM_THREADS": "1"
     for name in ("OMP", "MKL", "OPENBLAS", "BLIS", "NUMEXPR", "VECLIB")
 }
 
 
-def surroundings() -> dict[str, Any]:
-    """Return folder, path and environment, which may change while the nest lives."""
-    return {
-        "folder": os.getcwd(),
-        "path": list(sys.path),
-        "environment": {**os.environ, **_ONE_THREAD},
-    }
-
-
 class Worker:
     """A process that has been sent a simulator and answers calls, one at a time.
 
+    It has the folder, path and environment of this process at its start.
+
     Args:
         simulator: Pickled.
-        surroundings: Where it runs, see :func:`surroundings`.
 
     Attributes:
-        connection: Gives None once the simulator is loaded, then a reply a call, all
-            pickled; and an end of file where the process died.
-        is_ready: Whether the simulator has been loaded.
+        connection: Gives None at the start of a call and then its reply, both pickled;
+            and an end of file where the process died.
+        call: What it was given last.
+        deadline: When that is given up, which is known once it has been started.
     """
 
-    def __init__(self, simulator: bytes, surroundings: dict[str, Any]) -> None:
-        self.is_ready = False
-        self.connection, theirs = _LOKY.Pipe()
-        if _FORKS:
-            self._nest = _nest()
-            self.pid = self._nest.fork(theirs, surroundings)
-        else:
-            self._process = _LOKY.Process(
-                target=_work, args=(theirs, surroundings), env=_ONE_THREAD
-            )
+    call: Call
+    deadline: float
+
+    def __init__(self, simulator: bytes) -> None:
+        self._simulator = simulator
+        self._has_answered = False
+        self.connection, theirs = _CONTEXT.Pipe()
+        environment = {**os.environ, **_ENVIRONMENT}
+        self._process = _CONTEXT.Process(target=_work, args=(theirs, environment))
+        with _main_module_left_alone():
+            if _FORKS:  # of no effect once the server runs
+                _CONTEXT.set_forkserver_preload([__name__, _ONE_THREAD])
             self._process.start()
+        # Its end is ours to see to, not that of the interpreter, which would wait.
+        process._children.discard(self._process)  # pyright: ignore
         theirs.close()
         with suppress(OSError):
-            self.send(simulator)
+            self.connection.send_bytes(simulator)
 
-    def send(self, message: bytes) -> None:
-        """Send the simulator or a call, pickled."""
-        self.connection.send_bytes(message)
+    def start(self, call: Call, time_limit: float | None) -> None:
+        """Send a call."""
+        self.call, self.deadline = call, inf
+        self._time_limit = time_limit
+        self._has_started = False
+        with suppress(OSError):  # it has died, as reply() will find
+            self.connection.send_bytes(pickle.dumps(call, protocol=5))
+
+    def reply(self) -> Reply | None:
+        """Return what came of the call; None while it runs."""
+        try:
+            while self.connection.poll():
+                reply = pickle.loads(self.connection.recv_bytes())
+                if reply is not None:
+                    self._has_answered = True
+                    return reply
+                self._has_started = True
+                if self._time_limit is not None:
+                    self.deadline = time.monotonic() + self._time_limit
+        except (EOFError, OSError):
+            return self._last_words()
+        if time.monotonic() < self.deadline:
+            return None
+        text = f"timed out: no answer within {self._time_limit:g} s"
+        return Reply(fault="timed out", traceback=text)
+
+    def _last_words(self) -> Reply | None:
+        code = self.end()
+        how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        if self._has_started:
+            text = f"worker died: its process {how} during the call, without an"
+            return Reply(fault="worker died", traceback=f"{text} exception")
+        if not self._has_answered:
+            text = f"the process {how} while it loaded the simulator"
+            return Reply(fault="not loaded", traceback=text)
+        self.__init__(self._simulator)  # it died while it waited, which costs no row
+        self.start(self.call, self._time_limit)
+        return None
 
     def end(self) -> int:
-        """Kill the process if it lives; return its exit code, minus the signal."""
+        """Kill the process and what it started; return its exit code.
+
+        That is the negative signal of one that was killed.
+        """
+        if self.connection.closed:
+            return self._process.exitcode or 0
         self.connection.close()
+        # One that died by itself is given a moment to be seen dead, for its own code.
+        self._process.join(0.02)
         if _FORKS:
-            return self._nest.end(self.pid)
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
         self._process.kill()
         self._process.join()
         return self._process.exitcode or 0
 
 
-class _Nest:
-    """The process that forks workers, seen from the process that asks for them."""
-
-    def __init__(self) -> None:
-        self.owner = os.getpid()
-        self._lock = threading.Lock()
-        self._control, theirs = _LOKY.Pipe()
-        self._process: Any = _LOKY.Process(
-            target=_hatch, args=(theirs,), env=_ONE_THREAD
-        )
-        self._process.start()
-        theirs.close()
-        atexit.register(self.close)
-
-    @property
-    def is_alive(self) -> bool:
-        # A child of this process inherits the object, but not the process.
-        return self.owner == os.getpid() and self._process.is_alive()
-
-    def fork(self, connection: Connection, surroundings: dict[str, Any]) -> int:
-        """Return the process number of a new worker that reads the connection."""
-        try:
-            return self._ask("fork", surroundings, connection)
-        except (EOFError, OSError) as error:
-            raise RuntimeError(
-                "expected a process that starts workers; got its end (code "
-                f"{self._process.exitcode}); look for its last words above, or "
-                "simulate with num_workers=1"
-            ) from error
-
-    def end(self, pid: int) -> int:
-        """Kill a worker and what it started; return its exit code."""
-        try:
-            return self._ask("end", pid)
-        except (EOFError, OSError):
-            return -signal.SIGKILL  # the nest is gone, and its workers with it
-
-    def _ask(
-        self, order: str, argument: Any, connection: Connection | None = None
-    ) -> int:
-        with self._lock:
-            try:
-                self._control.send((order, argument))
-                if connection is not None:
-                    send_handle(self._control, connection.fileno(), self._process.pid)
-                return self._control.recv()
-            except BaseException:
-                # An interrupt here would leave an answer to be mistaken for the next.
-                self.close()
-                raise
-
-    def close(self) -> None:
-        """Let the nest and its workers end."""
-        if self.owner == os.getpid():
-            self._control.close()
-            self._process.join()
+_START = threading.Lock()
 
 
-_NEST: _Nest | None = None
+@contextmanager
+def _main_module_left_alone() -> Iterator[None]:
+    """Have a worker not run the main module again, which may lack a guard.
 
-
-def _nest() -> _Nest:
-    global _NEST
-    if _NEST is None or not _NEST.is_alive:
-        _NEST = _Nest()
-    return _NEST
-
-
-def _hatch(control: Connection) -> None:
-    """Fork and end workers as asked, until the asking process is gone."""
-    # A signal to the whole group must not end it before the workers, nor if the asking
-    # process goes on.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    workers: set[int] = set()
-    with suppress(EOFError, OSError):
-        while _has_order(control):
-            order, argument = control.recv()
-            if order == "end":
-                workers.discard(argument)
-                control.send(_end(argument))
-            else:
-                pid = _fork(control, argument)
-                workers.add(pid)
-                control.send(pid)
-    for pid in workers:
-        _end(pid)
-
-
-def _has_order(control: Connection) -> bool:
-    """Wait for an order; return False once the asking process is gone.
-
-    Its death closes the connection, but not where a child of it holds a copy.
+    `multiprocessing` does not run one that bears this name.
     """
-    parent = os.getppid()
-    while not control.poll(_PATIENCE):
-        if os.getppid() != parent:
-            return False
-    return True
-
-
-def _fork(control: Connection, surroundings: dict[str, Any]) -> int:
-    handle = recv_handle(control)
-    nest = os.getpid()
-    pid = os.fork()
-    if pid == 0:
-        control.close()
+    main = sys.modules["__main__"]
+    with _START:
+        spec = main.__spec__
+        main.__spec__ = ModuleSpec("__main__", None)
         try:
-            _die_with(nest)
-            for number in (signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, signal.SIG_DFL)
-            os.setpgid(0, 0)  # so that what a simulator starts ends with it
-            _work(Connection(handle), surroundings)
+            yield
         finally:
-            os._exit(0)  # the nest's own clean-up is not the worker's
-    with suppress(OSError):  # the worker may have been faster
-        os.setpgid(pid, pid)
-    os.close(handle)
-    return pid
+            main.__spec__ = spec
 
 
-def _die_with(parent: int) -> None:
-    """Have Linux kill this process when its parent ends, in whatever way."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it was faster
-        os._exit(1)
+def _forget() -> None:
+    # A forked child can neither ask nor wait for the server of its parent, and would
+    # keep it alive.
+    from multiprocessing import forkserver
+
+    server: Any = forkserver.ensure_running.__self__  # pyright: ignore
+    if server._forkserver_alive_fd is not None:
+        os.close(server._forkserver_alive_fd)
+    server.__init__()
+    _START.__init__()
 
 
-def _end(pid: int) -> int:
-    # One that died by itself is given a moment to be seen dead, for its own exit code.
-    # Until waited for it keeps its number, so that the signal hits nothing else.
-    peek = os.WEXITED | os.WNOHANG | os.WNOWAIT
-    for _ in range(20):
-        if os.waitid(os.P_PID, pid, peek) is not None:
-            break
-        time.sleep(1e-3)
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(pid, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+if _FORKS:
+    os.register_at_fork(after_in_child=_forget)
 
 
-def _work(connection: Connection, surroundings: dict[str, Any]) -> None:
+def _work(connection: Connection, environment: dict[str, str]) -> None:
     """Load a simulator and answer calls, until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    torch.set_num_threads(1)
+    if _FORKS:
+        _end_with_parent()
+    import_module(_ONE_THREAD)
     try:
         os.environ.clear()
-        os.environ.update(surroundings["environment"])
-        sys.path[:] = surroundings["path"]
-        os.chdir(surroundings["folder"])
+        os.environ.update(environment)
         simulator = cloudpickle.loads(connection.recv_bytes())
         if isinstance(simulator, SimulatorModel):
             simulator.prepare()  # no row's time limit counts it
@@ -253,14 +187,29 @@ def _work(connection: Connection, surroundings: dict[str, Any]) -> None:
         reply = Reply(fault="not loaded", traceback=traceback.format_exc())
         connection.send_bytes(pickle.dumps(reply))
         return
-    connection.send_bytes(pickle.dumps(None))
-    while True:
-        try:
+    with suppress(EOFError, OSError):  # nobody waits for it any more
+        while True:
             call = pickle.loads(connection.recv_bytes())
-        except (EOFError, OSError):
-            return
-        reply = answer(simulator, call, catches=BaseException)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        with suppress(OSError):  # nobody waits for it any more
+            connection.send_bytes(pickle.dumps(None))
+            reply = answer(simulator, call, catches=BaseException)
+            sys.stdout.flush()
+            sys.stderr.flush()
             connection.send_bytes(pickle.dumps(reply, protocol=5))
+
+
+def _end_with_parent() -> None:
+    """End with whoever asked for this process, and with the server that forked it."""
+    os.setpgid(0, 0)  # so that what a simulator starts ends with it
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    threading.Thread(target=_outlive_nobody, daemon=True).start()
+
+
+def _outlive_nobody() -> None:
+    parent = parent_process()
+    assert parent is not None
+    assert parent.pid is not None
+    with suppress(OSError):  # no such process
+        # A forked child of the parent may hold the other end of the sentinel open.
+        while not wait([parent.sentinel], timeout=1.0):
+            os.kill(parent.pid, 0)
+    os.killpg(0, signal.SIGKILL)

@@ -1,32 +1,10 @@
-"""A part of a report, apart from how it is set."""
+"""Names in a row, those of trials, and those of the entries of an action."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of a report.
-
-    Attributes:
-        title: Its heading.
-        text: Paragraphs.
-        items: A list of points.
-        header: Of the table.
-        rows: Of the table, cells as text.
-        figure: Name of the figure.
-    """
-
-    title: str
-    text: tuple[str, ...] = ()
-    items: tuple[str, ...] = ()
-    header: tuple[str, ...] = ()
-    rows: tuple[tuple[str, ...], ...] = ()
-    figure: str | None = None
 
 
 def joined(names: Sequence[str] | frozenset[str]) -> str:

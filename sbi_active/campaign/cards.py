@@ -6,7 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from sbi_active.notebook import badge, card, facts, number, table
+from sbi_active.display.notebook import badge, card, facts, table
+from sbi_active.display.table import Table, number
 
 MOST_TRIALS = 12  # of a table, the last ones
 MOST_NUMBERS = 6  # of an outcome
@@ -37,7 +38,7 @@ def trial_html(trial: Any) -> str:
 def campaign_html(campaign: Any) -> str:
     """Return a :class:`.Campaign` as HTML: health, belief and the last trials."""
     state, trials = campaign.state, campaign.state.trials
-    health = badge(campaign.health, KINDS[campaign.health])
+    health = badge(f"health {campaign.health}", KINDS[campaign.health])
     done, pending = len(campaign.history), campaign.pending
     waiting = "" if pending is None else f", trial {pending.index} pending"
     belief: Any = campaign.belief
@@ -57,11 +58,10 @@ def campaign_html(campaign: Any) -> str:
     left = len(trials) - len(rows)
     return card(
         f"Campaign: {state.method}, {done} trials{waiting}",
-        f"<div>health {health}</div>",
-        table(header, rows) if rows else "",
-        f"<div>and {left} before</div>" if left else "",
-        '<div style="margin-top:.6em"></div>',
-        page() if page is not None else "<div>the belief is the prior</div>",
+        health,
+        table(Table(header, rows)),
+        f"and {left} before" if left else "",
+        page() if page is not None else "the belief is the prior",
     )
 
 

@@ -4,10 +4,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from sbi_active.campaign.display.page import page as campaign_page
-from sbi_active.page import Part, Picture, Table, render
+from sbi_active.display import Page, Section, Table, svg
 from tests.campaign.storage.campaigns import MODEL, go_on, new
 from tests.criticism.report.reports import report
-from tests.page.browser import assert_reads_well, look
+from tests.display.browser import assert_reads_well, look
 
 TABLE = Table(
     ("name", "value"),
@@ -16,8 +16,9 @@ TABLE = Table(
 
 
 def test_all_text_is_escaped():
-    parts = [Part("<b>", text=["<i>"], items=["<u>"], table=Table(("<p>",), [("&",)]))]
-    made = render("<h>", parts, lead=["<q>"], badge=("<x>", "bad"), footer="<y>")
+    table = Table(("<p>",), [("&",)])
+    sections = [Section("<b>", text=["<i>"], items=["<u>"], table=table)]
+    made = Page("<h>", sections, ["<q>"], badge=("<x>", "bad"), footer="<y>").html()
     for tag in ["<b>", "<i>", "<u>", "<h>", "<q>", "<x>", "<y>"]:
         assert tag not in made
         assert tag.replace("<", "&lt;").replace(">", "&gt;") in made
@@ -27,11 +28,11 @@ def test_all_text_is_escaped():
 def test_the_same_figure_is_the_same_picture():
     figure = Figure()
     figure.subplots().plot([1, 2])
-    assert Picture.of(figure, "a line") == Picture.of(figure, "a line")
+    assert svg(figure) == svg(figure)
 
 
 def test_tables_are_sorted_by_a_click_numbers_as_numbers(tmp_path):
-    made = render("Sorted", [Part("numbers", table=TABLE)])
+    made = Page("Sorted", [Section("numbers", table=TABLE)]).html()
     frames, console = look(made, tmp_path)
     assert console == []
     ((up, down, state),) = frames["390"]["sorted"]
@@ -43,7 +44,7 @@ def test_tables_are_sorted_by_a_click_numbers_as_numbers(tmp_path):
 
 def test_the_browser_sees_what_is_wrong(tmp_path):
     """Gray on gray, a word wider than the screen, and an error are found."""
-    made = render("Bad", [Part("words", text=["gray"])])
+    made = Page("Bad", [Section("words", text=["gray"])]).html()
     made = made.replace("<p>gray", '<p style="color:#888;background:#999">gray')
     made = made.replace("</h2>", '</h2><pre style="width:900px">wide</pre>')
     made = made.replace("<script>", "<script>console.error('broken');")

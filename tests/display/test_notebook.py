@@ -15,9 +15,10 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.campaign import Trial
+from sbi_active.display.notebook import badge, card, facts, items, table
+from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.notebook import card, facts, items, parameters, table
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, outcome
 from tests.criticism.report.reports import report
 
@@ -82,7 +83,7 @@ def campaign():
 def test_a_campaign_has_its_health_belief_and_trials(campaign):
     page = page_of(campaign)
     assert "Campaign: asbi, 1 trials, trial 1 pending" in page.text
-    assert "ok" in page.texts
+    assert "health ok" in page.texts
     assert "mass" in page.texts
     assert EVIL[:8] in page.texts
     assert any(text.startswith(f"speed {EVIL}") for text in page.texts)
@@ -164,15 +165,18 @@ def test_a_report_has_its_verdict():
 def test_pieces_are_escaped():
     pieces = [
         card(EVIL),
-        table([EVIL], [[EVIL]]),
+        card("title", EVIL),
+        table(Table([EVIL], [[EVIL]])),
+        badge(EVIL),
         facts([(EVIL, EVIL)]),
         items([EVIL]),
-        parameters([EVIL], torch.randn(20, 1)),
+        table(Table.of_parameters([EVIL], torch.randn(20, 1))),
     ]
     for piece in pieces:
         assert EVIL in Page(piece).texts
 
 
 def test_many_parameters_are_cut():
-    page = Page(parameters([f"p{i}" for i in range(40)], torch.randn(50, 40)))
+    names = [f"p{i}" for i in range(40)]
+    page = Page(table(Table.of_parameters(names, torch.randn(50, 40))))
     assert "and 10 more" in page.texts

@@ -1,0 +1,143 @@
+"""A page in sections: as text, as Markdown, and as one file of HTML."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from sbi_active.display.figures import UNSEEN, svg
+from sbi_active.display.table import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDTH = 88  # of lines of text; tables are as wide as they are
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The place of a figure.
+
+    Attributes:
+        name: Of the figure.
+        words: What it shows, for who does not see it.
+        caption: Below it.
+    """
+
+    name: str
+    words: str = ""
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page.
+
+    Attributes:
+        title: Its heading.
+        text: Paragraphs.
+        items: A list of points.
+        table: Below them; one without rows is left out.
+        picture: At its end.
+        warns: Whether the points limit what the page says.
+    """
+
+    title: str
+    text: Sequence[str] = ()
+    items: Sequence[str] = ()
+    table: Table | None = None
+    picture: Picture | None = None
+    warns: bool = False
+
+
+@dataclass(frozen=True)
+class Page:
+    """A title and what stands below it.
+
+    Attributes:
+        title: The headline.
+        sections: In order.
+        lead: Paragraphs before them.
+        badge: A word and its kind, "good", "fair" or "bad", before the lead.
+        footer: Where it comes from.
+    """
+
+    title: str
+    sections: Sequence[Section]
+    lead: Sequence[str] = ()
+    badge: tuple[str, str] | None = None
+    footer: str = ""
+
+    def text(self) -> str:
+        """Return plain text, the title in the first line."""
+        lines = [self.title, *(_wrapped(paragraph) for paragraph in self.lead)]
+        for section in self.sections:
+            lines += ["", section.title, "-" * len(section.title)]
+            lines += [_wrapped(paragraph) for paragraph in section.text]
+            lines += [_wrapped(f"- {item}", indent="  ") for item in section.items]
+            if section.table and section.table.rows:
+                between = [""] if section.text or section.items else []
+                lines += [*between, section.table.text()]
+        return "\n".join(lines)
+
+    def markdown(self) -> str:
+        """Return Markdown; a figure is a file of PNG with its name."""
+        blocks = [f"# {self.title}", *self.lead]
+        for section in self.sections:
+            blocks += [f"## {section.title}", *section.text]
+            blocks += ["\n".join(f"- {item}" for item in section.items)]
+            if section.table and section.table.rows:
+                blocks.append(section.table.markdown())
+            if section.picture:
+                blocks.append(
+                    f"![{section.picture.caption}]({section.picture.name}.png)"
+                )
+        return "\n\n".join(filter(None, blocks)) + "\n"
+
+    def html(self, figures: Mapping[str, Figure] | None = None) -> str:
+        """Return HTML: light and dark, for screens and paper, without network.
+
+        All text is escaped.
+
+        Args:
+            figures: By their names, one for each picture.
+        """
+        template = templates().get_template("page.html.jinja")
+        return UNSEEN.sub("\ufffd", template.render(page=self, figures=figures))
+
+
+@cache
+def templates() -> Any:
+    """Return the templates of this room."""
+    # Not at import: most who import the package make no page.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("sbi_active", "display"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_with_signs,
+    )
+    environment.filters["svg"] = svg
+    return environment
+
+
+def _with_signs(value: Any) -> Any:
+    if type(value) is not str:  # what is HTML already stays as it is
+        return value
+    return value.replace(" +- ", " \N{PLUS-MINUS SIGN} ")
+
+
+def _wrapped(text: str, indent: str = "") -> str:
+    return textwrap.fill(
+        text,
+        WIDTH,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
