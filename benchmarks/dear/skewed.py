@@ -31,6 +31,7 @@ from benchmarks.rows import append, read
 from sbi_active.display import Table
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.support import within_support
 
 ROWS = Path(__file__).parent / "results" / "skewed.csv"
 COLUMNS = ["method", "histories", "seed", "kl", "shift", "trustworthy", "cpu"]
@@ -82,8 +83,7 @@ def judged(task: Skewed, belief: Any, x: Tensor) -> dict[str, float]:
     rng = np.random.default_rng(0)
     root = np.linalg.cholesky(WIDER * cov)
     u = mean + rng.standard_normal((NUM_REFERENCE, len(mean))) @ root.T
-    inside = task.prior.support.check(torch.from_numpy(u).float()).numpy()
-    u = u[inside]
+    u = u[within_support(task.prior, torch.from_numpy(u).float()).numpy()]
     log_q = -0.5 * (np.linalg.solve(root, (u - mean).T) ** 2).sum(0)
     log_w = task.log_likelihood(u, x) - log_q
     weight = np.exp(log_w - log_w.max())
