@@ -92,7 +92,7 @@ class AugmentedSimulator(SimulatorModel):
             inputs=base.inputs,
         )
         self._unchecked = [e for e in effects if e not in before]
-        if check is not None:
+        if check is not None and self._unchecked:
             known = sum(e.phi_dim for e in before if e.scope == "campaign")
             theta, action, *own = check
             context = self._row_context(action, given=own[0] if own else None)

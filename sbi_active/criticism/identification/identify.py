@@ -16,8 +16,11 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
-from sbi_active.criticism.identification.errors import whitened
-from sbi_active.criticism.identification.fitting import Fitted, fitted
+from sbi_active.criticism.identification.fitting import (
+    Fitted,
+    IdentifySettings,
+    fitted,
+)
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
@@ -30,7 +33,7 @@ Array = NDArray[Any]
 #: Draws at which the linear model is compared with the simulator, the deviation of the
 #: log density ratio up to which it will do, nats, and the draws that are weighed
 #: where it will not.
-NUM_CHECKED, LINEAR, NUM_WEIGHED = 16, 0.5, 400
+NUM_CHECKED, LINEAR, NUM_WEIGHED = 10, 0.5, 400
 #: Effective draws below which a belief is not to be trusted, and those that weights
 #: leave at least.
 FEWEST, FEWEST_KEPT = 50, 100
@@ -142,22 +145,24 @@ def identify(
     if int(some.valid.sum()) > 1:  # a single log is as good, if it is long
         require_fitting(model, prior, trials, (), None)
     seed = derive_seed(seed, "identify")
-    found = fitted(model, prior, some, beside, known_sd=known_sd, seed=seed)
+    own = IdentifySettings()
+    found = fitted(
+        *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
+    )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    own = found.rival.theta_dim
     u, effective, is_linear = _weighed(found, rng)
-    parts = spread(found)
-    notes = []
-    c = found.rival.coordinates
+    parts, c, notes = spread(found), found.rival.coordinates, []
+    u = (found.origin + u)[:, : found.rival.theta_dim]
+    low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
     if parts.disagree:
-        theta = parts.widen(found.u[:own] + u[:, :own], rng)
-        u[:, :own] = _reflected(theta, c.low[:own], c.high[:own]) - found.u[:own]
-    names = model.parameter_names or [f"theta_{k + 1}" for k in range(own)]
-    sides = c.sides((found.u + u)[:, :own])
+        u = _reflected(parts.widen(u, rng), low, high)
+    names = model.parameter_names or [f"theta_{k + 1}" for k in range(u.shape[1])]
+    sides = c.sides(u)
     for k in np.flatnonzero(sides):
-        bound = (c.low if sides[k] < 0 else c.high)[k] - found.u[k]
+        bound = (low if sides[k] < 0 else high)[k]
         u[:, k] = bound - sides[k] * _opened(sides[k] * (bound - u[:, k]), parts.sd[k])
-    theta = c.to_z(np.clip(found.u + u, c.low, c.high))[:, :own]
+    rest = np.broadcast_to(found.origin[u.shape[1] :], (len(u), c.dim - u.shape[1]))
+    theta = c.to_z(np.concatenate([np.clip(u, low, high), rest], 1))[:, : u.shape[1]]
     belief = IdentifiedBelief(prior, torch.from_numpy(theta))
     belief.parameter_names = (*names,)
     belief.sides = sides
@@ -245,18 +250,16 @@ def _weighed(found: Fitted, rng: np.random.Generator) -> tuple[Array, float, boo
 
 def _log_ratio(found: Fitted, at: Array) -> Array:
     """Return the log density of draws beside that of the linear model, (k,)."""
-    m, draws = found.rival.simulator.measurements, found.draws
-    u = draws.u[at]
-    true = found.rival.residual(found.u + u)[0] / found.unit
-    linear = found.rows[:, 0] + u @ found.rows[:, 1:].T
-    chosen = np.array([np.bincount(h).argmax() for h in draws.errors.T])
-    both = whitened(np.concatenate([true, linear]).T, m, found.hypotheses, chosen)
-    size = np.median(draws.size, 0)[m.channel]
-    square = ((both / size[:, None]) ** 2).sum(0)
+    u, m = found.draws.u[at], found.measurements
+    true = found.rival.residual(found.origin + u)[0] / found.unit
+    rows = found.rows
+    linear = rows[:, 0] + u @ rows[:, 1:].T
+    both = found.whitened(np.concatenate([true, linear]).T, 0 * m.trial)
+    square = (both**2).sum(0)
     p, c = found.unknowns, found.rival.coordinates
     gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
     # At a bound, where absent effects stand, rounding would be outside.
-    inside = np.clip(found.u + u, c.low + INSIDE, c.high - INSIDE)
+    inside = np.clip(found.origin + u, c.low + INSIDE, c.high - INSIDE)
     log_w = c.log_prob(inside) - gaussian
     log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
     return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
@@ -276,16 +279,13 @@ def _beside(found: Fitted) -> dict[str, float]:
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
     """Return what the errors of each channel are like, posterior medians."""
-    m, draws, known = found.rival.simulator.measurements, found.draws, found.hypotheses
-    channels = int(m.channel.max()) + 1
-    names = model.channel_names or [f"channel {c}" for c in range(channels)]
-    said = {}
-    for c in range(channels):
-        unit = float(found.unit[m.channel == c][0])
+    draws, known, said = found.draws, found.errors, {}
+    names = model.channel_names
+    for c, unit in enumerate(found.sizes.tolist()):
         h = draws.errors[:, c]
-        said[names[c]] = {
+        said[names[c] if names else f"channel {c}"] = {
             "sd": unit * float(np.median(draws.size[:, c])),
-            "white": float(np.median(known.share[h])),
+            "white": float(np.median(known.white[h])),
             "time": float(np.median(np.where(h > 0, known.time[h], 0.0))),
         }
     return said
@@ -295,12 +295,12 @@ def _beyond(
     found: Fitted, errors: dict[str, dict[str, float]], declared: Array
 ) -> list[str]:
     """Return in which channels residuals are far larger than the declared error."""
-    channel, notes = found.rival.simulator.measurements.channel, []
+    notes = []
     for c, (name, own) in enumerate(errors.items()):
         if own["sd"] <= BEYOND * declared[c]:
             continue
         # What is left, since shapes of the error only have sizes some steps apart.
-        ratio = float(found.unit[channel == c][0]) / declared[c]
+        ratio = found.sizes[c] / declared[c]
         notes.append(
             f"residuals of {name} are {ratio:.2g} times the declared error: the model "
             "lacks something, or the error is declared too small; ask close_loop what "

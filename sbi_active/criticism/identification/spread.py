@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.identification.errors import grams
 from sbi_active.criticism.identification.fitting import Fitted
 
 Array = NDArray[Any]
@@ -64,20 +63,14 @@ def spread(found: Fitted) -> Spread:
     Args:
         found: The model, linear.
     """
-    m, draws = found.rival.simulator.measurements, found.draws
-    own = found.rival.theta_dim
-    free = found.rival.coordinates.trial_of() < 0
-    effect = found.unknowns.effect
-    likely = draws.present.mean(0) > 0.5
-    free &= (effect < 0) | likely[effect] if len(likely) else True
-    precision, linear = 0.0, 0.0
-    rows = found.rows[:, np.append(True, free)]
-    for k, gram in enumerate(grams(rows, m, found.hypotheses, _parts(m))):
-        h = int(np.bincount(draws.errors[:, k]).argmax())
-        variance = np.mean(draws.size[draws.errors[:, k] == h, k] ** 2)
-        precision = precision + gram.gram[h][:, 1:, 1:] / variance
-        linear = linear - gram.gram[h][:, 1:, 0] / variance
-    precision, linear = np.asarray(precision), np.asarray(linear)
+    draws, m, own = found.draws, found.measurements, found.rival.theta_dim
+    likely = np.append(draws.present.mean(0) > 0.5, True)
+    free = (found.rival.coordinates.trial_of() < 0) & likely[found.effect]
+    parts = _parts(m)
+    white = found.whitened(found.rows[:, np.append(True, free)], parts)
+    each = [white[parts == f] for f in range(int(parts.max()) + 1)]
+    grams = np.stack([rows.T @ rows for rows in each])
+    precision, linear = grams[:, 1:, 1:], -grams[:, 1:, 0]
     total = precision.sum(0)
     ridge = np.diag(1e-6 * np.diag(total) + 1e-12)
     best = np.linalg.solve(total + ridge, linear.sum(0))

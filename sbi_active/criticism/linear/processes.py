@@ -85,6 +85,12 @@ class Processes:
         ]
         return cls(*full)
 
+    def beside_white(self) -> Processes:
+        """Return these and white noise of variance one, which comes first."""
+        values = 1.0, 0.0, np.inf, False
+        parts = self.white, self.process, self.time, self.smooth
+        return Processes(*(np.append(v, p) for v, p in zip(values, parts, strict=True)))
+
     def __len__(self) -> int:
         return len(self.white)
 
@@ -145,6 +151,32 @@ class Filters:
                 gram[:, group] += found[:, b]
                 log_det[:, group] += own.log_det
         return Grams(gram, log_det, np.bincount(self.group, minlength=num))
+
+
+def whitened(
+    rows: Array,
+    processes: Processes,
+    m: Measurements,
+    chosen: Array,
+    fold: NDArray[np.int64],
+) -> Array:
+    """Return rows (N, k) in the metric of one hypothesis a channel.
+
+    Args:
+        rows: Shape (N, k).
+        processes: Hypotheses of the errors.
+        m: In the order trial, channel, time.
+        chosen: Hypothesis of each channel, shape (c,).
+        fold: Part of each number, shape (N,); it starts a new series.
+    """
+    found = np.empty_like(rows)
+    for places in alike(m, fold):
+        channel = m.channel[places[:, 0]]
+        for c in np.unique(channel):
+            at = places[channel == c]
+            own = Filter(processes.only(int(chosen[c])), m.time[at[0]])
+            found[at] = own.whitened(rows[at])[0]
+    return found
 
 
 def series_of(m: Measurements, fold: NDArray[np.int64]) -> list[NDArray[np.intp]]:

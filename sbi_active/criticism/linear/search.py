@@ -25,7 +25,7 @@ from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import along_secants, best_fit, polished
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.library import Library
-from sbi_active.criticism.linear.model import LinearModel, enlarged
+from sbi_active.criticism.linear.model import LinearModel, chords, enlarged
 from sbi_active.criticism.linear.nulls import at_null, has_null
 from sbi_active.criticism.linear.settings import FitSettings
 from sbi_active.criticism.results import ModelKey
@@ -208,11 +208,7 @@ class Search:
         start = np.empty(rival.dim)
         own = ~self.columns(key, base)
         start[~own], start[own] = model.u, null
-        where = np.flatnonzero(own)
-        points = np.repeat(start[None], len(where), 0)
-        points[np.arange(len(where)), where] += step
-        r = rival.residual(points)[0] / self.unit
-        slope = ((r - model.residual) / step[:, None]).T
+        slope = chords(rival, start, own, step, model.residual, self.unit)
         return enlarged(model, rival, own, null, slope), own
 
     def rms(self, key: ModelKey, u: Array) -> float:
