@@ -71,10 +71,15 @@ class IdentifySettings:
         shares: Of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
             their digits.
+        num_compared: Draws at which the linear model is compared with the simulator.
+        linear: Deviation of the log density ratio up to which it will do, nats.
+        num_weighed: Draws that are weighed where it will not.
+        fewest: Effective draws below which a belief is not to be trusted.
+        fewest_kept: Those that weights leave at least.
     """
 
-    num_screened: int = 40
-    screened_each: int = 13
+    num_screened: int = 24
+    screened_each: int = 8
     fit: FitSettings = FitSettings(num_starts=4, first=5)
     starts_each: float = 1.25
     kept_each: float = 0.5
@@ -91,6 +96,11 @@ class IdentifySettings:
     smallest: float = 1e-9
     shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
     least: float = 1e-12
+    num_compared: int = 8
+    linear: float = 0.5
+    num_weighed: int = 400
+    fewest: int = 50
+    fewest_kept: int = 100
 
     def errors(self, m: Measurements, declared: float) -> Processes:
         """Return hypotheses of errors of size one, white noise first.

@@ -30,13 +30,6 @@ from sbi_active.simulation import GaussianNoise, SimulatorModel
 
 Array = NDArray[Any]
 
-#: Draws at which the linear model is compared with the simulator, the deviation of the
-#: log density ratio up to which it will do, nats, and the draws that are weighed
-#: where it will not.
-NUM_CHECKED, LINEAR, NUM_WEIGHED = 10, 0.5, 400
-#: Effective draws below which a belief is not to be trusted, and those that weights
-#: leave at least.
-FEWEST, FEWEST_KEPT = 50, 100
 #: From a bound, in deviations of the prior.
 INSIDE = 1e-6
 #: Multiple of the declared deviation from which errors are no longer the sensor's.
@@ -150,7 +143,7 @@ def identify(
         *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
     )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    u, effective, is_linear = _weighed(found, rng)
+    u, effective, is_linear = _weighed(found, rng, own)
     parts, c, notes = spread(found), found.rival.coordinates, []
     u = (found.origin + u)[:, : found.rival.theta_dim]
     low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
@@ -173,7 +166,7 @@ def identify(
             "the model lacks something, and intervals are as wide as they disagree; "
             "ask close_loop what it lacks"
         )
-    if effective < FEWEST:
+    if effective < own.fewest:
         notes.append(
             f"{effective:.0f} effective draws: the posterior is not that of a nearly "
             "linear model; use Campaign, or a narrower prior"
@@ -230,22 +223,31 @@ def _with_noise(
     return model, sd
 
 
-def _weighed(found: Fitted, rng: np.random.Generator) -> tuple[Array, float, bool]:
-    """Return draws of u - found.u, how many they count for, and if it is linear."""
-    every = found.draws.u
-    order = rng.permutation(len(every))
-    log_w = _log_ratio(found, order[:NUM_CHECKED])
-    if log_w.std() < LINEAR:
-        return every.copy(), float(len(every)), True
-    some = order[:NUM_WEIGHED]
+def _weighed(
+    found: Fitted, rng: np.random.Generator, settings: IdentifySettings
+) -> tuple[Array, float, bool]:
+    """Return draws of u - origin, how many they count for, and if it is linear.
+
+    Of effects that were not fitted a chord is all that is known: draws that have one
+    are not compared with the simulator.
+    """
+    own, draws = settings, found.draws
+    faint = draws.present.mean(0) <= own.likely
+    is_fitted = ~(draws.present & faint).any(1)
+    order = rng.permutation(np.flatnonzero(is_fitted))
+    log_w = _log_ratio(found, order[: own.num_compared])
+    if log_w.std() < own.linear:
+        return draws.u.copy(), float(len(draws.u)), True
+    some = order[: own.num_weighed]
     log_w = _log_ratio(found, some)
     effective = effective_sample_size(log_w)
     # Few draws would make for a narrow interval: rather that of the linear model.
     power = 1.0
-    while effective_sample_size(power * log_w) < FEWEST_KEPT:
+    while effective_sample_size(power * log_w) < own.fewest_kept:
         power *= 0.8
-    picked = rng.choice(len(some), size=len(every), p=normalized(power * log_w))
-    return every[some[picked]].copy(), effective, False
+    u, p = draws.u.copy(), normalized(power * log_w)
+    u[order] = u[rng.choice(some, size=len(order), p=p)]
+    return u, effective, False
 
 
 def _log_ratio(found: Fitted, at: Array) -> Array:

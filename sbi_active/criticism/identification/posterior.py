@@ -51,9 +51,9 @@ class SamplerSettings:
     """
 
     chains: int = 64
-    burnt: int = 8
-    few: int = 8
-    many: int = 30
+    burnt: int = 6
+    few: int = 6
+    many: int = 26
     absent: float = 0.5
     flat: float = 1e-4
 
@@ -151,8 +151,8 @@ def sample(
             chosen.append(h)
             sizes.append(np.sqrt(variance))
         swept = _Swept(precision, linear).turned(np.flatnonzero(p.effect < 0))
-        for e in range(p.num_effects):
-            swept.take(swept.turned(np.flatnonzero(p.effect == e)), present[:, e])
+        for e, there in enumerate(present.T):
+            swept[there] = swept[there].turned(np.flatnonzero(p.effect == e))
         present = _present(swept, p, present, settings.absent, rng)
         u = _moved(u, precision, swept, p, rng)
         if sweep >= settings.burnt:
@@ -204,11 +204,19 @@ class _Swept:
         self.log_det = np.zeros(len(linear))
         self.free = np.zeros(linear.shape, dtype=bool)
 
+    def __getitem__(self, rows: Any) -> _Swept:
+        new = copy(self)
+        new.table, new.free = self.table[rows].copy(), self.free[rows].copy()
+        new.log_det = self.log_det[rows].copy()
+        return new
+
+    def __setitem__(self, rows: Any, other: _Swept) -> None:
+        self.table[rows], self.free[rows] = other.table, other.free
+        self.log_det[rows] = other.log_det
+
     def turned(self, places: NDArray[np.intp]) -> _Swept:
         """Return those where some coordinates are free that were not, or vice versa."""
-        new = copy(self)
-        new.table, new.free = self.table.copy(), self.free.copy()
-        new.log_det = self.log_det.copy()
+        new = self[:]
         for k in places:
             row = new.table[:, k].copy()
             pivot = row[:, [k]]
@@ -220,11 +228,6 @@ class _Swept:
             new.log_det += np.log(np.abs(pivot[:, 0]))
             new.free[:, k] = ~new.free[:, k]
         return new
-
-    def take(self, other: _Swept, rows: Flags) -> None:
-        """Be another one in some rows, shape (n,)."""
-        self.table[rows], self.log_det[rows] = other.table[rows], other.log_det[rows]
-        self.free[rows] = other.free[rows]
 
     def log_evidence(self, p: Unknowns) -> Array:
         """Return the log evidence of what is free, up to what all share, (n,)."""
@@ -259,7 +262,7 @@ def _present(
         flip = rng.logistic(size=len(gain)) < gain
         present[:, e] ^= flip
         log_z = np.where(flip, log_other, log_z)
-        swept.take(other, flip)
+        swept[flip] = other[flip]
     return present
 
 
