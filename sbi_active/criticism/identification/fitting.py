@@ -20,20 +20,14 @@ from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
 from sbi_active.criticism.identification.posterior import (
     TINY,
     Draws,
-    SamplerSettings,
     Unknowns,
     sample,
 )
+from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import LinearModel, chords, enlarged, linearize
 from sbi_active.criticism.linear.nulls import at_null
-from sbi_active.criticism.linear.processes import (
-    Filters,
-    Processes,
-    time_scales,
-    whitened,
-)
-from sbi_active.criticism.linear.settings import FitSettings
+from sbi_active.criticism.linear.processes import Filters, Processes, whitened
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
@@ -42,79 +36,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class IdentifySettings:
-    """How much is spent, and what is told apart.
-
-    Attributes:
-        num_screened: Draws of the prior that are looked at, at least.
-        screened_each: The same for each parameter: the more there are, the more optima.
-        fit: Searches from these, at least, and how far they go.
-        starts_each: Searches for each parameter.
-        kept_each: Searches that go on, for each parameter.
-        sampler: Draws of the linear model.
-        num_checked: Trials in which effects are compared with the simulator at their
-            null.
-        step: Of finite differences, in deviations of the prior.
-        tried: Deviations of the prior by which an effect that is absent is tried: many
-            are flat at their null.
-        alias: Share of an effect's column that is no combination of the parameters'
-            own, below which it is an alias of them.
-        likely: Probability from which an effect is fitted.
-        linearized: Times at most that the model is linearized anew.
-        moved: A move that is worth it, in posterior deviations.
-        rounds: Times at most that channels are weighed by their residuals.
-        worth: Mean fall of the logarithm of these sizes that is worth another time.
-        smallest: Residual that a channel is taken to have at least, in its deviations.
-        shares: Of the variance that are white, of errors of unknown size.
-        least: Smallest share of a declared white error: below it sums of squares lose
-            their digits.
-        num_compared: Draws at which the linear model is compared with the simulator.
-        linear: Deviation of the log density ratio up to which it will do, nats.
-        num_weighed: Draws that are weighed where it will not.
-        fewest: Effective draws below which a belief is not to be trusted.
-        fewest_kept: Those that weights leave at least.
-    """
-
-    num_screened: int = 24
-    screened_each: int = 8
-    fit: FitSettings = FitSettings(num_starts=4, first=5)
-    starts_each: float = 1.25
-    kept_each: float = 0.5
-    sampler: SamplerSettings = SamplerSettings()
-    num_checked: int = 2
-    step: float = 1e-4
-    tried: float = 0.05
-    alias: float = 0.02
-    likely: float = 0.1
-    linearized: int = 6
-    moved: float = 0.3
-    rounds: int = 10
-    worth: float = 0.01
-    smallest: float = 1e-9
-    shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
-    least: float = 1e-12
-    num_compared: int = 8
-    linear: float = 0.5
-    num_weighed: int = 400
-    fewest: int = 50
-    fewest_kept: int = 100
-
-    def errors(self, m: Measurements, declared: float) -> Processes:
-        """Return hypotheses of errors of size one, white noise first.
-
-        Args:
-            m: Which say what time scales can be told.
-            declared: Share of the variance of residuals that a declared white error
-                has at least in all channels; shares go on by tens to a tenth of it.
-        """
-        tens = np.log10(self.shares[0] / max(declared / 10, self.least))
-        below = self.shares[0] * 10.0 ** -np.arange(max(np.ceil(tens), 0), 0, -1)
-        share = np.array([*below, *self.shares])
-        variances = np.stack([share, 1 - share], 1)
-        return Processes.grid(variances, time_scales(m, m.trial)).beside_white()
 
 
 @dataclass(frozen=True)

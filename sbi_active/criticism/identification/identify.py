@@ -16,11 +16,8 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
-from sbi_active.criticism.identification.fitting import (
-    Fitted,
-    IdentifySettings,
-    fitted,
-)
+from sbi_active.criticism.identification.fitting import Fitted, fitted
+from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
@@ -29,14 +26,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 
 Array = NDArray[Any]
-
-#: From a bound, in deviations of the prior.
-INSIDE = 1e-6
-#: Multiple of the declared deviation from which errors are no longer the sensor's.
-BEYOND = 3.0
-#: Deviation of half a Gaussian: beside a bound draws that are narrower say that trials
-#: ask for what is beyond it, and not how well they tell the parameter.
-HALF = 0.6
 
 
 class IdentifiedBelief(KernelBelief):
@@ -87,6 +76,7 @@ def identify(
     *,
     beside: Sequence[Effect] = (),
     seed: int = 0,
+    settings: IdentifySettings = IdentifySettings(),  # noqa: B008  (frozen)
 ) -> IdentifiedBelief:
     r"""Return what trajectories tell of the parameters, with intervals that hold.
 
@@ -107,6 +97,7 @@ def identify(
         beside: What the model may lack. Those of scope "trial" are there, with a
             nuisance in each trial.
         seed: Of all draws.
+        settings: How much is spent, and what decides.
 
     Returns:
         A belief with ``interval(level)`` by parameter. Its ``diagnostics`` have
@@ -138,31 +129,35 @@ def identify(
     if int(some.valid.sum()) > 1:  # a single log is as good, if it is long
         require_fitting(model, prior, trials, (), None)
     seed = derive_seed(seed, "identify")
-    own = IdentifySettings()
+    own = settings
     found = fitted(
         *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
     )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
     u, effective, is_linear = _weighed(found, rng, own)
-    parts, c, notes = spread(found), found.rival.coordinates, []
+    parts, c = spread(found, own.fewest_parts), found.rival.coordinates
     u = (found.origin + u)[:, : found.rival.theta_dim]
     low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
-    if parts.disagree:
-        u = _reflected(parts.widen(u, rng), low, high)
+    least = float(parts.p_value.min(initial=1.0))
+    disagree = least * len(parts.p_value) < own.level
+    if disagree:
+        u = _reflected(parts.widen(u, own.wider, rng), low, high)
     names = model.parameter_names or [f"theta_{k + 1}" for k in range(u.shape[1])]
     sides = c.sides(u)
     for k in np.flatnonzero(sides):
         bound = (low if sides[k] < 0 else high)[k]
-        u[:, k] = bound - sides[k] * _opened(sides[k] * (bound - u[:, k]), parts.sd[k])
+        inside = _opened(sides[k] * (bound - u[:, k]), parts.sd[k], own.half)
+        u[:, k] = bound - sides[k] * inside
     rest = np.broadcast_to(found.origin[u.shape[1] :], (len(u), c.dim - u.shape[1]))
     theta = c.to_z(np.concatenate([np.clip(u, low, high), rest], 1))[:, : u.shape[1]]
     belief = IdentifiedBelief(prior, torch.from_numpy(theta))
     belief.parameter_names = (*names,)
     belief.sides = sides
-    if parts.disagree:
+    notes: list[str] = []
+    if disagree:
         worst = names[int(np.argmin(parts.p_value))]
         notes.append(
-            f"single trials disagree about {worst} (p = {parts.p_value.min():.1g}): "
+            f"single trials disagree about {worst} (p = {least:.1g}): "
             "the model lacks something, and intervals are as wide as they disagree; "
             "ask close_loop what it lacks"
         )
@@ -174,7 +169,7 @@ def identify(
     notes += _at_bounds(belief)
     errors = _errors(found, model)
     if known_sd is not None:
-        notes += _beyond(found, errors, known_sd)
+        notes += _beyond(found, errors, known_sd, own.beyond)
     belief.diagnostics = (
         Diagnostics(trustworthy=True)
         .warned(*notes)
@@ -261,8 +256,7 @@ def _log_ratio(found: Fitted, at: Array) -> Array:
     p, c = found.unknowns, found.rival.coordinates
     gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
     # At a bound, where absent effects stand, rounding would be outside.
-    inside = np.clip(found.origin + u, c.low + INSIDE, c.high - INSIDE)
-    log_w = c.log_prob(inside) - gaussian
+    log_w = c.log_prob(np.clip(found.origin + u, c.low, c.high)) - gaussian
     log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
     return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
 
@@ -294,12 +288,12 @@ def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]
 
 
 def _beyond(
-    found: Fitted, errors: dict[str, dict[str, float]], declared: Array
+    found: Fitted, errors: dict[str, dict[str, float]], declared: Array, times: float
 ) -> list[str]:
     """Return in which channels residuals are far larger than the declared error."""
     notes = []
     for c, (name, own) in enumerate(errors.items()):
-        if own["sd"] <= BEYOND * declared[c]:
+        if own["sd"] <= times * declared[c]:
             continue
         # What is left, since shapes of the error only have sizes some steps apart.
         ratio = found.sizes[c] / declared[c]
@@ -311,7 +305,7 @@ def _beyond(
     return notes
 
 
-def _opened(inside: Array, sd: float) -> Array:
+def _opened(inside: Array, sd: float, half: float) -> Array:
     """Return how far draws are inside a bound, as half a Gaussian at least, (n,).
 
     Where trials ask for what is far beyond it, the posterior within has no width, which
@@ -320,8 +314,9 @@ def _opened(inside: Array, sd: float) -> Array:
     Args:
         inside: How far they are, shape (n,).
         sd: Deviation that the parameter has without bounds.
+        half: Share of it that is wide enough.
     """
-    if inside.std() >= HALF * sd:
+    if inside.std() >= half * sd:
         return inside
     probability = (rankdata(inside, "ordinal") - 0.5) / len(inside)
     return np.maximum(inside, sd * norm.ppf(0.5 + probability / 2))

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.identification.settings import SamplerSettings
 from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
@@ -32,30 +33,6 @@ Array = NDArray[Any]
 Flags = NDArray[np.bool_]
 
 TINY = 1e-300  # keeps logarithms finite
-
-
-@dataclass(frozen=True, kw_only=True)
-class SamplerSettings:
-    """How much is drawn, and what is known of doubtful effects and of errors before.
-
-    Attributes:
-        chains: Independent ones, side by side.
-        burnt: Sweeps that are left out of each: after half as many draws are those of
-            later ones, since u moves as a whole.
-        few: Sweeps where only means are asked for.
-        many: Sweeps of a belief: ends of a 95 % interval are then known to some .5 %.
-        absent: Prior probability that no doubtful effect is there, one half for want
-            of anything better; and that a channel's errors are white.
-        flat: Precision in units of the inverse square of a range, which leaves uniform
-            priors as they are and directions that nothing tells solvable.
-    """
-
-    chains: int = 64
-    burnt: int = 6
-    few: int = 6
-    many: int = 26
-    absent: float = 0.5
-    flat: float = 1e-4
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from sbi_active.criticism.linear.processes import (
     Filters,
     Grams,
     Processes,
+    parts_of,
     time_scales,
 )
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
@@ -118,7 +119,8 @@ class Errors:
     ) -> None:
         m = self.measurements = measurements
         self.unit = unit
-        self.fold, self.is_by_trial = _folds(m)
+        self.fold = parts_of(m, FEWEST, NUM_FOLDS)
+        self.is_by_trial = len(np.unique(m.trial)) >= FEWEST
         self.num_folds = int(self.fold.max()) + 1
         self.is_scored = np.ones(len(m), dtype=bool)
         if self.is_by_trial:
@@ -294,18 +296,3 @@ def integrated(
 
 def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:
     return NoiseCell(cell.log_weight, cell.sd / unit, cell.rho, cell.df)
-
-
-def _folds(m: Measurements) -> tuple[NDArray[np.int64], bool]:
-    """Return the part of each number, and whether parts are trials."""
-    trials, code = np.unique(m.trial, return_inverse=True)
-    if len(trials) >= FEWEST:
-        return code.astype(np.int64), True
-    each = -(-NUM_FOLDS // len(trials))
-    fold = np.empty(len(m), dtype=np.int64)
-    for t in range(len(trials)):
-        at = code == t
-        time = m.time[at]
-        edges = np.quantile(time, np.linspace(0, 1, each + 1)[1:-1])
-        fold[at] = t * each + np.searchsorted(edges, time, side="left")
-    return np.unique(fold, return_inverse=True)[1].astype(np.int64), False

@@ -179,6 +179,27 @@ def whitened(
     return found
 
 
+def parts_of(m: Measurements, fewest: int, num: int) -> NDArray[np.int64]:
+    """Return the part of each number: trials, or parts of them where they are few.
+
+    Args:
+        m: The measurements.
+        fewest: Trials from which on each is a part.
+        num: Parts of fewer ones, at least; each of equally many samples.
+    """
+    trials, code = np.unique(m.trial, return_inverse=True)
+    if len(trials) >= fewest:
+        return code.astype(np.int64)
+    each = -(-num // len(trials))
+    fold = np.empty(len(m), dtype=np.int64)
+    for t in range(len(trials)):
+        at = code == t
+        time = m.time[at]
+        edges = np.quantile(time, np.linspace(0, 1, each + 1)[1:-1])
+        fold[at] = t * each + np.searchsorted(edges, time, side="left")
+    return np.unique(fold, return_inverse=True)[1].astype(np.int64)
+
+
 def series_of(m: Measurements, fold: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     """Return the numbers of each trial, channel and part, in the order of time."""
     starts = ~np.isfinite(m.gap)
