@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
@@ -16,7 +15,6 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
 from sbi_active.criticism.identification.posterior import (
     TINY,
     Draws,
@@ -32,7 +30,6 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
@@ -214,13 +211,8 @@ def _rivals(
     seed: int,
 ) -> Callable[[Sequence[Effect]], Rival]:
     """Return what makes a rival of some effects; all share their simulations."""
-    some = torch.arange(min(settings.num_checked, len(trials)))
-    with forked_generators(seed, "check"):
-        theta = prior.sample(torch.Size([len(some)]))
-    run = conditions_of_trials(trials, some, model)
-    check = (theta, trials.action[some].to(theta.dtype), run)
     index = int(trials.index.max()) + 1
-    augmented = AugmentedSimulator(model, beside, check=check, next_index=index)
+    augmented = AugmentedSimulator(model, beside, next_index=index)
     simulator = TrialSimulator(augmented, trials, seed=seed)
     m = simulator.measurements
     if not m.has_time or not len(m):
@@ -313,10 +305,8 @@ def _beside(
 def _aliases(found: Linear, least: float) -> tuple[str, ...]:
     """Return the effects that a change of the parameters imitates."""
     jacobian, effect = found.model.jacobian, found.effect
-    basis, triangle = np.linalg.qr(jacobian[:, effect < 0])
-    size = np.abs(np.diag(triangle))
-    basis = basis[:, size > 1e-9 * max(size.max(initial=0.0), TINY)]
-    left = jacobian - basis @ (basis.T @ jacobian)
+    rest = jacobian[:, effect < 0]
+    left = jacobian - rest @ np.linalg.lstsq(rest, jacobian, rcond=1e-9)[0]
     own, whole = (
         np.sqrt(np.bincount(effect + 1, (part**2).sum(0))[1:])
         for part in (left, jacobian)

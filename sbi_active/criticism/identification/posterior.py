@@ -209,11 +209,12 @@ class _Swept:
     def log_evidence(self, p: Unknowns) -> Array:
         """Return the log evidence of what is free, up to what all share, (n,)."""
         some = np.isfinite(p.low) | np.isfinite(p.high)
+        free = self.free[:, some]
         variance = -np.einsum("nii->ni", self.table)[:, :-1][:, some]
-        sd = np.sqrt(np.maximum(variance, TINY))
-        mean = self.table[:, :-1, -1][:, some]
+        sd = np.sqrt(np.where(free, variance, 1.0))
+        mean = np.where(free, self.table[:, :-1, -1][:, some], 0.0)
         inside = log_inside(mean, sd, p.low[some], p.high[some])
-        log_z = np.where(self.free[:, some], inside, 0.0).sum(1)
+        log_z = np.where(free, inside, 0.0).sum(1)
         return log_z - 0.5 * (self.table[:, -1, -1] + self.log_det)
 
 

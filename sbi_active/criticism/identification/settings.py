@@ -46,8 +46,6 @@ class IdentifySettings:
         starts_each: Searches for each parameter.
         kept_each: Searches that go on, for each parameter.
         sampler: Draws of the linear model.
-        num_checked: Trials in which effects are compared with the simulator at their
-            null.
         step: Of finite differences, in deviations of the prior.
         tried: Deviations of the prior by which an effect that is absent is tried: many
             are flat at their null.
@@ -86,7 +84,6 @@ class IdentifySettings:
     starts_each: float = 1.25
     kept_each: float = 0.5
     sampler: SamplerSettings = SamplerSettings()
-    num_checked: int = 2
     step: float = 1e-4
     tried: float = 0.05
     alias: float = 0.02
