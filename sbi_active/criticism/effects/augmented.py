@@ -22,6 +22,9 @@ from sbi_active.simulation.model import NOISE_STREAM
 
 #: Rows on which an effect is compared with the simulator without it.
 NUM_CHECKED = 16
+#: The same of rows that are simulated in any case: with two, x of two channels would
+#: leave a single one to compare, which hides what is spread over the wrong axis.
+NUM_FIRST = 3
 #: Largest difference at the null, in deviations of x over the checked rows: single
 #: precision, with room for a formula's rounding.
 TOLERANCE = 1e-4
@@ -259,7 +262,7 @@ class AugmentedSimulator(SimulatorModel):
     def _check_first(self, theta: Tensor, action: Tensor, context: Context) -> None:
         """Compare effects that were not yet with the simulator on a few rows."""
         if self._unchecked and len(theta):
-            few = slice(NUM_CHECKED)
+            few = slice(NUM_FIRST)
             self._check_null(theta[few], action[few], context.at(few))
 
     def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:

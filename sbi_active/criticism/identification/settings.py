@@ -78,11 +78,11 @@ class IdentifySettings:
             parameter.
     """
 
-    num_screened: int = 24
-    screened_each: int = 8
-    fit: FitSettings = FitSettings(num_starts=4, first=5)
-    starts_each: float = 1.25
-    kept_each: float = 0.5
+    num_screened: int = 16
+    screened_each: int = 5
+    fit: FitSettings = FitSettings(num_starts=3, num_kept=1, first=5)
+    starts_each: float = 1.0
+    kept_each: float = 0.3
     sampler: SamplerSettings = SamplerSettings()
     step: float = 1e-4
     tried: float = 0.05
