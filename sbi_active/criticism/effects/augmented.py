@@ -20,11 +20,9 @@ from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
 from sbi_active.simulation.model import NOISE_STREAM
 
-#: Rows on which an effect is compared with the simulator without it.
-NUM_CHECKED = 16
-#: The same of rows that are simulated in any case: with two, x of two channels would
-#: leave a single one to compare, which hides what is spread over the wrong axis.
-NUM_FIRST = 3
+#: Rows on which an effect is compared with the simulator without it; of those that are
+#: simulated in any case, so many that x of two channels leaves more than one.
+NUM_CHECKED, NUM_FIRST = 16, 3
 #: Largest difference at the null, in deviations of x over the checked rows: single
 #: precision, with room for a formula's rounding.
 TOLERANCE = 1e-4
@@ -70,10 +68,9 @@ class AugmentedSimulator(SimulatorModel):
         check: tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Context] | None = None,
         next_index: int = 0,
     ) -> None:
-        base, before = model, []
-        if isinstance(model, AugmentedSimulator):
-            base, before = model.base, model.effects
-        self.base: SimulatorModel = base
+        is_more = isinstance(model, AugmentedSimulator)
+        before = model.effects if is_more else []
+        base = self.base = model.base if is_more else model
         self.takes_times = takes_times(base)
         self.effects = [*before, *effects]
         require_distinct(self.effects, base.parameter_names or ())
@@ -261,8 +258,8 @@ class AugmentedSimulator(SimulatorModel):
 
     def _check_first(self, theta: Tensor, action: Tensor, context: Context) -> None:
         """Compare effects that were not yet with the simulator on a few rows."""
+        few = slice(NUM_FIRST)
         if self._unchecked and len(theta):
-            few = slice(NUM_FIRST)
             self._check_null(theta[few], action[few], context.at(few))
 
     def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:
