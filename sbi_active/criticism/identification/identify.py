@@ -82,8 +82,8 @@ def identify(
 
     The best fit is found by least squares, and the model is linear around it. Errors
     of each channel may be white or last, for a time and in a size that nobody knows
-    (:mod:`.errors`). Effects ``beside`` may be there or not, each with its own
-    parameter (:mod:`.posterior`); fits follow where they are. Where single trials
+    (:mod:`..linear.processes`). Effects ``beside`` may be there or not, each with its
+    own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
     their disagreement says (:mod:`.spread`). Where the likelihood is not that of a
     linear model, draws are weighed by the simulator.

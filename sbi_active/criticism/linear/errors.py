@@ -1,17 +1,16 @@
 r"""The errors that all models share: the sensor's alone, or beside a residual process.
 
 .. math::
-    C = \sigma^2 (I + s^2 K), \qquad
-    K(d) = e^{-d / \tau} \ \text{or}\
-    \bigl(1 + \tfrac{\sqrt3 d}{\tau}\bigr) e^{-\sqrt3 d / \tau},
+    C = \sigma^2 (I + s^2 K_\tau)
 
-in each trial and channel, with :math:`\sigma` of the sensor. The size s (from .3 up)
-and the time scale :math:`\tau` (from a sample to most of a trial) are log-uniform and
-summed out, in *every* model: what a simulator gets wrong along a trajectory is no
-evidence for whichever model is a little less wrong. Or a parameter differs from trial
-to trial, with :math:`K = j j^T` in each trial across its channels and j the derivative
-of the bare model by it, mean square one: this and a process are equally likely. Models
-are linear here (:mod:`.linear`), so that all of it is algebra of Gram matrices.
+in each trial and channel, with :math:`\sigma` of the sensor and the kernels of
+:mod:`.processes`. The size s (from .3 up) and the time scale :math:`\tau` (from a
+sample to most of a trial) are log-uniform and summed out, in *every* model: what a
+simulator gets wrong along a trajectory is no evidence for whichever model is a little
+less wrong. Or a parameter differs from trial to trial, with :math:`K = j j^T` in each
+trial across its channels and j the derivative of the bare model by it, mean square one:
+this and a process are equally likely. Models are linear here (:mod:`.model`), so that
+all of it is algebra of Gram matrices.
 
 References:
     Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
