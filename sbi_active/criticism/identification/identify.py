@@ -228,8 +228,8 @@ def _weighed(
     """
     own, draws = settings, found.draws
     faint = draws.present.mean(0) <= own.likely
-    is_fitted = ~(draws.present & faint).any(1)
-    order = rng.permutation(np.flatnonzero(is_fitted))
+    fit = np.flatnonzero(~(draws.present & faint).any(1))
+    order = rng.permutation(fit if len(fit) >= own.fewest_kept else len(draws.u))
     log_w = _log_ratio(found, order[: own.num_compared])
     if log_w.std() < own.linear:
         return draws.u.copy(), float(len(draws.u)), True
