@@ -257,14 +257,12 @@ def _searched(
     r = bare.residual(u)[0]
     best = np.argmin(((r / bare.spread) ** 2).sum(1))
     unit = _sizes(bare, r[best], own)
-    starts, kept = (
-        max(few, round(each * bare.theta_dim))
-        for few, each in (
-            (own.fit.num_starts, own.starts_each),
-            (own.fit.num_kept, own.kept_each),
-        )
+    fit, dim = own.fit, bare.theta_dim
+    fit = replace(
+        fit,
+        num_starts=max(fit.num_starts, round(own.starts_each * dim)),
+        num_kept=max(fit.num_kept, round(own.kept_each * dim)),
     )
-    fit = replace(own.fit, num_starts=starts, num_kept=kept)
     return _settled(bare, best_fit(bare, u, unit, fit).u, unit, own)
 
 
