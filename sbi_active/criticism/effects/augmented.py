@@ -20,8 +20,9 @@ from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
 from sbi_active.simulation.model import NOISE_STREAM
 
-#: Rows on which an effect is compared with the simulator without it.
-NUM_CHECKED = 16
+#: Rows on which an effect is compared with the simulator without it; of those that are
+#: simulated in any case, so many that x of two channels leaves more than one.
+NUM_CHECKED, NUM_FIRST = 16, 3
 #: Largest difference at the null, in deviations of x over the checked rows: single
 #: precision, with room for a formula's rounding.
 TOLERANCE = 1e-4
@@ -67,10 +68,9 @@ class AugmentedSimulator(SimulatorModel):
         check: tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Context] | None = None,
         next_index: int = 0,
     ) -> None:
-        base, before = model, []
-        if isinstance(model, AugmentedSimulator):
-            base, before = model.base, model.effects
-        self.base: SimulatorModel = base
+        is_more = isinstance(model, AugmentedSimulator)
+        before = model.effects if is_more else []
+        base = self.base = model.base if is_more else model
         self.takes_times = takes_times(base)
         self.effects = [*before, *effects]
         require_distinct(self.effects, base.parameter_names or ())
@@ -92,7 +92,7 @@ class AugmentedSimulator(SimulatorModel):
             inputs=base.inputs,
         )
         self._unchecked = [e for e in effects if e not in before]
-        if check is not None:
+        if check is not None and self._unchecked:
             known = sum(e.phi_dim for e in before if e.scope == "campaign")
             theta, action, *own = check
             context = self._row_context(action, given=own[0] if own else None)
@@ -258,8 +258,8 @@ class AugmentedSimulator(SimulatorModel):
 
     def _check_first(self, theta: Tensor, action: Tensor, context: Context) -> None:
         """Compare effects that were not yet with the simulator on a few rows."""
+        few = slice(NUM_FIRST)
         if self._unchecked and len(theta):
-            few = slice(NUM_CHECKED)
             self._check_null(theta[few], action[few], context.at(few))
 
     def _active(self, hook: str, phi: dict[str, Tensor]) -> list[Effect]:

@@ -16,8 +16,8 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
-from sbi_active.criticism.identification.errors import whitened
 from sbi_active.criticism.identification.fitting import Fitted, fitted
+from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
@@ -26,21 +26,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 
 Array = NDArray[Any]
-
-#: Draws at which the linear model is compared with the simulator, the deviation of the
-#: log density ratio up to which it will do, nats, and the draws that are weighed
-#: where it will not.
-NUM_CHECKED, LINEAR, NUM_WEIGHED = 16, 0.5, 400
-#: Effective draws below which a belief is not to be trusted, and those that weights
-#: leave at least.
-FEWEST, FEWEST_KEPT = 50, 100
-#: From a bound, in deviations of the prior.
-INSIDE = 1e-6
-#: Multiple of the declared deviation from which errors are no longer the sensor's.
-BEYOND = 3.0
-#: Deviation of half a Gaussian: beside a bound draws that are narrower say that trials
-#: ask for what is beyond it, and not how well they tell the parameter.
-HALF = 0.6
 
 
 class IdentifiedBelief(KernelBelief):
@@ -91,13 +76,14 @@ def identify(
     *,
     beside: Sequence[Effect] = (),
     seed: int = 0,
+    settings: IdentifySettings = IdentifySettings(),  # noqa: B008  (frozen)
 ) -> IdentifiedBelief:
     r"""Return what trajectories tell of the parameters, with intervals that hold.
 
     The best fit is found by least squares, and the model is linear around it. Errors
     of each channel may be white or last, for a time and in a size that nobody knows
-    (:mod:`.errors`). Effects ``beside`` may be there or not, each with its own
-    parameter (:mod:`.posterior`); fits follow where they are. Where single trials
+    (:mod:`..linear.processes`). Effects ``beside`` may be there or not, each with its
+    own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
     their disagreement says (:mod:`.spread`). Where the likelihood is not that of a
     linear model, draws are weighed by the simulator.
@@ -111,6 +97,7 @@ def identify(
         beside: What the model may lack. Those of scope "trial" are there, with a
             nuisance in each trial.
         seed: Of all draws.
+        settings: How much is spent, and what decides.
 
     Returns:
         A belief with ``interval(level)`` by parameter. Its ``diagnostics`` have
@@ -142,33 +129,39 @@ def identify(
     if int(some.valid.sum()) > 1:  # a single log is as good, if it is long
         require_fitting(model, prior, trials, (), None)
     seed = derive_seed(seed, "identify")
-    found = fitted(model, prior, some, beside, known_sd=known_sd, seed=seed)
+    own = settings
+    found = fitted(
+        *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
+    )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    own = found.rival.theta_dim
-    u, effective, is_linear = _weighed(found, rng)
-    parts = spread(found)
-    notes = []
-    c = found.rival.coordinates
-    if parts.disagree:
-        theta = parts.widen(found.u[:own] + u[:, :own], rng)
-        u[:, :own] = _reflected(theta, c.low[:own], c.high[:own]) - found.u[:own]
-    names = model.parameter_names or [f"theta_{k + 1}" for k in range(own)]
-    sides = c.sides((found.u + u)[:, :own])
+    u, effective, is_linear = _weighed(found, rng, own)
+    parts, c = spread(found, own.fewest_parts), found.rival.coordinates
+    u = (found.origin + u)[:, : found.rival.theta_dim]
+    low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
+    least = float(parts.p_value.min(initial=1.0))
+    disagree = least * len(parts.p_value) < own.level
+    if disagree:
+        u = _reflected(parts.widen(u, own.wider, rng), low, high)
+    names = model.parameter_names or [f"theta_{k + 1}" for k in range(u.shape[1])]
+    sides = c.sides(u)
     for k in np.flatnonzero(sides):
-        bound = (c.low if sides[k] < 0 else c.high)[k] - found.u[k]
-        u[:, k] = bound - sides[k] * _opened(sides[k] * (bound - u[:, k]), parts.sd[k])
-    theta = c.to_z(np.clip(found.u + u, c.low, c.high))[:, :own]
+        bound = (low if sides[k] < 0 else high)[k]
+        inside = _opened(sides[k] * (bound - u[:, k]), parts.sd[k], own.half)
+        u[:, k] = bound - sides[k] * inside
+    rest = np.broadcast_to(found.origin[u.shape[1] :], (len(u), c.dim - u.shape[1]))
+    theta = c.to_z(np.concatenate([np.clip(u, low, high), rest], 1))[:, : u.shape[1]]
     belief = IdentifiedBelief(prior, torch.from_numpy(theta))
     belief.parameter_names = (*names,)
     belief.sides = sides
-    if parts.disagree:
+    notes: list[str] = []
+    if disagree:
         worst = names[int(np.argmin(parts.p_value))]
         notes.append(
-            f"single trials disagree about {worst} (p = {parts.p_value.min():.1g}): "
+            f"single trials disagree about {worst} (p = {least:.1g}): "
             "the model lacks something, and intervals are as wide as they disagree; "
             "ask close_loop what it lacks"
         )
-    if effective < FEWEST:
+    if effective < own.fewest:
         notes.append(
             f"{effective:.0f} effective draws: the posterior is not that of a nearly "
             "linear model; use Campaign, or a narrower prior"
@@ -176,7 +169,7 @@ def identify(
     notes += _at_bounds(belief)
     errors = _errors(found, model)
     if known_sd is not None:
-        notes += _beyond(found, errors, known_sd)
+        notes += _beyond(found, errors, known_sd, own.beyond)
     belief.diagnostics = (
         Diagnostics(trustworthy=True)
         .warned(*notes)
@@ -225,39 +218,45 @@ def _with_noise(
     return model, sd
 
 
-def _weighed(found: Fitted, rng: np.random.Generator) -> tuple[Array, float, bool]:
-    """Return draws of u - found.u, how many they count for, and if it is linear."""
-    every = found.draws.u
-    order = rng.permutation(len(every))
-    log_w = _log_ratio(found, order[:NUM_CHECKED])
-    if log_w.std() < LINEAR:
-        return every.copy(), float(len(every)), True
-    some = order[:NUM_WEIGHED]
+def _weighed(
+    found: Fitted, rng: np.random.Generator, settings: IdentifySettings
+) -> tuple[Array, float, bool]:
+    """Return draws of u - origin, how many they count for, and if it is linear.
+
+    Of effects that were not fitted a chord is all that is known: draws that have one
+    are not compared with the simulator.
+    """
+    own, draws = settings, found.draws
+    faint = draws.present.mean(0) <= own.likely
+    fit = np.flatnonzero(~(draws.present & faint).any(1))
+    order = rng.permutation(fit if len(fit) >= own.fewest_kept else len(draws.u))
+    log_w = _log_ratio(found, order[: own.num_compared])
+    if log_w.std() < own.linear:
+        return draws.u.copy(), float(len(draws.u)), True
+    some = order[: own.num_weighed]
     log_w = _log_ratio(found, some)
     effective = effective_sample_size(log_w)
     # Few draws would make for a narrow interval: rather that of the linear model.
     power = 1.0
-    while effective_sample_size(power * log_w) < FEWEST_KEPT:
+    while effective_sample_size(power * log_w) < own.fewest_kept:
         power *= 0.8
-    picked = rng.choice(len(some), size=len(every), p=normalized(power * log_w))
-    return every[some[picked]].copy(), effective, False
+    u, p = draws.u.copy(), normalized(power * log_w)
+    u[order] = u[rng.choice(some, size=len(order), p=p)]
+    return u, effective, False
 
 
 def _log_ratio(found: Fitted, at: Array) -> Array:
     """Return the log density of draws beside that of the linear model, (k,)."""
-    m, draws = found.rival.simulator.measurements, found.draws
-    u = draws.u[at]
-    true = found.rival.residual(found.u + u)[0] / found.unit
-    linear = found.rows[:, 0] + u @ found.rows[:, 1:].T
-    chosen = np.array([np.bincount(h).argmax() for h in draws.errors.T])
-    both = whitened(np.concatenate([true, linear]).T, m, found.hypotheses, chosen)
-    size = np.median(draws.size, 0)[m.channel]
-    square = ((both / size[:, None]) ** 2).sum(0)
+    u, m = found.draws.u[at], found.measurements
+    true = found.rival.residual(found.origin + u)[0] / found.unit
+    rows = found.rows
+    linear = rows[:, 0] + u @ rows[:, 1:].T
+    both = found.whitened(np.concatenate([true, linear]).T, 0 * m.trial)
+    square = (both**2).sum(0)
     p, c = found.unknowns, found.rival.coordinates
     gaussian = -0.5 * (p.precision * (u - p.center) ** 2).sum(1)
     # At a bound, where absent effects stand, rounding would be outside.
-    inside = np.clip(found.u + u, c.low + INSIDE, c.high - INSIDE)
-    log_w = c.log_prob(inside) - gaussian
+    log_w = c.log_prob(np.clip(found.origin + u, c.low, c.high)) - gaussian
     log_w = log_w + 0.5 * (square[len(at) :] - square[: len(at)])
     return np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
 
@@ -276,31 +275,28 @@ def _beside(found: Fitted) -> dict[str, float]:
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
     """Return what the errors of each channel are like, posterior medians."""
-    m, draws, known = found.rival.simulator.measurements, found.draws, found.hypotheses
-    channels = int(m.channel.max()) + 1
-    names = model.channel_names or [f"channel {c}" for c in range(channels)]
-    said = {}
-    for c in range(channels):
-        unit = float(found.unit[m.channel == c][0])
+    draws, known, said = found.draws, found.errors, {}
+    names = model.channel_names
+    for c, unit in enumerate(found.sizes.tolist()):
         h = draws.errors[:, c]
-        said[names[c]] = {
+        said[names[c] if names else f"channel {c}"] = {
             "sd": unit * float(np.median(draws.size[:, c])),
-            "white": float(np.median(known.share[h])),
+            "white": float(np.median(known.white[h])),
             "time": float(np.median(np.where(h > 0, known.time[h], 0.0))),
         }
     return said
 
 
 def _beyond(
-    found: Fitted, errors: dict[str, dict[str, float]], declared: Array
+    found: Fitted, errors: dict[str, dict[str, float]], declared: Array, times: float
 ) -> list[str]:
     """Return in which channels residuals are far larger than the declared error."""
-    channel, notes = found.rival.simulator.measurements.channel, []
+    notes = []
     for c, (name, own) in enumerate(errors.items()):
-        if own["sd"] <= BEYOND * declared[c]:
+        if own["sd"] <= times * declared[c]:
             continue
         # What is left, since shapes of the error only have sizes some steps apart.
-        ratio = float(found.unit[channel == c][0]) / declared[c]
+        ratio = found.sizes[c] / declared[c]
         notes.append(
             f"residuals of {name} are {ratio:.2g} times the declared error: the model "
             "lacks something, or the error is declared too small; ask close_loop what "
@@ -309,7 +305,7 @@ def _beyond(
     return notes
 
 
-def _opened(inside: Array, sd: float) -> Array:
+def _opened(inside: Array, sd: float, half: float) -> Array:
     """Return how far draws are inside a bound, as half a Gaussian at least, (n,).
 
     Where trials ask for what is far beyond it, the posterior within has no width, which
@@ -318,8 +314,9 @@ def _opened(inside: Array, sd: float) -> Array:
     Args:
         inside: How far they are, shape (n,).
         sd: Deviation that the parameter has without bounds.
+        half: Share of it that is wide enough.
     """
-    if inside.std() >= HALF * sd:
+    if inside.std() >= half * sd:
         return inside
     probability = (rankdata(inside, "ordinal") - 0.5) / len(inside)
     return np.maximum(inside, sd * norm.ppf(0.5 + probability / 2))

@@ -3,48 +3,47 @@ r"""Draws of parameters of a linear model with unknown errors and doubtful effec
 .. math::
     r(u) = r_0 + J u, \qquad r_c \sim \mathcal N(0, \sigma_c^2 C_{h_c})
 
-in every channel c, with u = (theta, phi) between bounds. An effect is absent, phi at
-its null, unless it is there: what may be missing widens the intervals by as much as the
-logs leave it open, and hardly where they exclude it. Blocks of the Gibbs sampler are
-the errors' shape and size by channel, each effect's presence with all of u summed out,
-and u along the eigenvectors of its precision.
+in every channel c, with u = (theta, phi) between bounds. An effect is absent, its part
+of u zero, unless it is there: what may be missing widens the intervals by as much as
+the logs leave it open, and hardly where they exclude it. Blocks of the Gibbs sampler
+are the errors' shape and size by channel, each effect's presence with all of u summed
+out, and u: as it is without bounds where that is within them, else along the
+eigenvectors of its precision.
 
 References:
     George & McCulloch, Statistica Sinica 7 (1997), for the presence of variables.
+    Goodnight, The American Statistician 33 (1979), for the sweep operator.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.identification.errors import Grams, Hypotheses
+from sbi_active.criticism.identification.settings import SamplerSettings
+from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 
 Array = NDArray[Any]
+Flags = NDArray[np.bool_]
 
-#: Chains, and the sweeps that are left out of them.
-CHAINS, BURNT = 64, 15
-#: Prior probability that no doubtful effect is there.
-NONE = 0.5
-TINY = 1e-300
+TINY = 1e-300  # keeps logarithms finite
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is known of u before the logs, d coordinates from where they are zero.
+    """What is known of u before the logs, d coordinates from where effects vanish.
 
     Attributes:
         low: Shape (d,).
         high: Shape (d,).
         center: Of a Gaussian prior, shape (d,).
         precision: Of it, 0 for uniform ones, shape (d,).
-        null: Of effects, shape (d,); 0 for others.
         effect: Number of the effect that a coordinate belongs to, -1 for theta, (d,).
     """
 
@@ -52,13 +51,22 @@ class Unknowns:
     high: Array
     center: Array
     precision: Array
-    null: Array
     effect: NDArray[np.int64]
 
     @property
     def num_effects(self) -> int:
         """Number of doubtful effects."""
         return int(self.effect.max(initial=-1)) + 1
+
+    @property
+    def log_density(self) -> Array:
+        """What the prior's constant adds by each effect that is there, shape (e,)."""
+        own = np.flatnonzero(self.effect >= 0)
+        center, precision = self.center[own], self.precision[own]
+        log_p = 0.5 * (np.log(np.maximum(precision, TINY)) - precision * center**2)
+        sd = 1 / np.sqrt(np.maximum(precision, TINY))
+        log_p = log_p - log_inside(center, sd, self.low[own], self.high[own])
+        return np.bincount(self.effect[own], log_p, self.num_effects)
 
 
 @dataclass(frozen=True)
@@ -73,54 +81,58 @@ class Draws:
     """
 
     u: Array
-    present: NDArray[np.bool_]
+    present: Flags
     errors: NDArray[np.int64]
     size: Array
 
-    @classmethod
-    def none(cls, dim: int) -> Draws:
-        """Return no draws of u with d coordinates."""
-        shape, whole = (0, 0), np.empty((0, 0), dtype=np.int64)
-        return cls(np.empty((0, dim)), np.empty(shape, dtype=bool), whole, whole * 1.0)
-
 
 def sample(
-    channels: Sequence[Grams],
-    hypotheses: Hypotheses,
+    grams: Grams,
+    processes: Processes,
     unknowns: Unknowns,
-    known_size: Sequence[float | None],
+    known_size: list[float | None],
     rng: np.random.Generator,
     *,
     sweeps: int,
+    settings: SamplerSettings = SamplerSettings(),  # noqa: B008  (frozen)
 ) -> Draws:
-    """Return posterior draws, of 64 chains.
+    """Return posterior draws of all chains.
 
     Args:
-        channels: Gram matrices of (r_0, J) by channel.
-        hypotheses: Of the errors.
+        grams: Of (r_0, J), by channel.
+        processes: Hypotheses of the errors, white noise first, of size one.
         unknowns: Priors.
         known_size: Deviation of the white part by channel; None where it is unknown.
         rng: Source of the draws.
         sweeps: Of each chain, after those that are left out.
+        settings: Numbers of draws, and priors.
     """
-    p, d = unknowns, len(unknowns.low)
-    sums = [g.total for g in channels]
-    u = np.clip(np.zeros((CHAINS, d)), p.low, p.high)
-    present = np.ones((CHAINS, p.num_effects), dtype=bool)
+    p, num, d = unknowns, settings.chains, len(unknowns.low)
+    ridge = p.precision + settings.flat / (p.high - p.low) ** 2
+    shapes = max(len(processes) - 1, 1)
+    log_prior = np.full(len(processes), np.log((1 - settings.absent) / shapes))
+    log_prior[0] = np.log(settings.absent)
+    u = np.clip(np.zeros((num, d)), p.low, p.high)
+    present = np.ones((num, p.num_effects), dtype=bool)
     kept: list[tuple[Array, ...]] = []
-    for sweep in range(BURNT + sweeps):
-        precision = np.zeros((CHAINS, d, d))
-        linear = np.zeros((CHAINS, d))
+    for sweep in range(settings.burnt + sweeps):
+        precision = np.broadcast_to(np.diag(ridge), (num, d, d)).copy()
+        linear = np.broadcast_to(p.precision * p.center, (num, d)).copy()
         chosen, sizes = [], []
-        for (gram, log_det, count), size in zip(sums, known_size, strict=True):
-            h, variance = _errors(gram, log_det, count, hypotheses, size, u, rng)
-            precision += gram[h][:, 1:, 1:] / variance[:, None, None]
-            linear -= gram[h][:, 1:, 0] / variance[:, None]
+        for c, size in enumerate(known_size):
+            own = grams.gram[:, c], grams.log_det[:, c], int(grams.count[c])
+            h, variance = _errors(*own, processes, log_prior, size, u, rng)
+            gram = own[0][h] / variance[:, None, None]
+            precision += gram[:, 1:, 1:]
+            linear -= gram[:, 1:, 0]
             chosen.append(h)
             sizes.append(np.sqrt(variance))
-        present = _present(precision, linear, p, present, rng)
-        u = _moved(u, precision, linear, p, present, rng)
-        if sweep >= BURNT:
+        swept = _Swept(precision, linear).turned(np.flatnonzero(p.effect < 0))
+        for e, there in enumerate(present.T):
+            swept[there] = swept[there].turned(np.flatnonzero(p.effect == e))
+        present = _present(swept, p, present, settings.absent, rng)
+        u = _moved(u, precision, swept, p, rng)
+        if sweep >= settings.burnt:
             parts = (u, present, np.stack(chosen, 1), np.stack(sizes, 1))
             kept.append(tuple(part.copy() for part in parts))
     return Draws(*(np.concatenate(part) for part in zip(*kept, strict=True)))
@@ -130,124 +142,137 @@ def _errors(
     gram: Array,
     log_det: Array,
     count: int,
-    hypotheses: Hypotheses,
+    processes: Processes,
+    log_prior: Array,
     size: float | None,
     u: Array,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.intp], Array]:
     """Return the shape and the variance of one channel's errors, given u."""
     one = np.concatenate([np.ones((len(u), 1)), u], 1)
-    square = np.einsum("ni,hij,nj->nh", one, gram, one, optimize=True)
-    square = np.maximum(square, TINY)
-    log_p = hypotheses.log_prior - 0.5 * log_det
+    square = (one[:, :, None] * one[:, None]).reshape(len(u), -1)
+    square = np.maximum(square @ gram.reshape(len(gram), -1).T, TINY)
+    log_p = log_prior - 0.5 * log_det
     if size is None:  # with the variance summed out, p(v) = 1 / v
         log_p = log_p - 0.5 * count * np.log(square)
     else:
-        every = size**2 / hypotheses.share
+        every = size**2 / processes.white
         log_p = log_p - 0.5 * (square / every + count * np.log(every))
-    h = _picked(log_p, rng)
+    h = np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=1)  # of softmax
     if size is not None:
-        return h, size**2 / hypotheses.share[h]
-    rows = np.arange(len(u))
-    return h, square[rows, h] / (2 * rng.gamma(0.5 * count, size=len(u)))
+        return h, size**2 / processes.white[h]
+    return h, square[np.arange(len(u)), h] / (2 * rng.gamma(0.5 * count, size=len(u)))
+
+
+class _Swept:
+    r"""Gaussians of u without bounds, given what is free of it, by the sweep operator.
+
+    Attributes:
+        table: Minus the covariance of what is free, its mean in the last column, and
+            in the corner :math:`-b^T P^{-1} b`; shape (n, d + 1, d + 1).
+        log_det: Of the precision of what is free, shape (n,).
+        free: Shape (n, d).
+    """
+
+    def __init__(self, precision: Array, linear: Array) -> None:
+        table = np.concatenate([precision, linear[:, None]], 1)
+        right = np.concatenate([linear, np.zeros((len(linear), 1))], 1)
+        self.table = np.concatenate([table, right[:, :, None]], 2)
+        self.log_det = np.zeros(len(linear))
+        self.free = np.zeros(linear.shape, dtype=bool)
+
+    def __getitem__(self, rows: Any) -> _Swept:
+        new = copy(self)
+        new.table, new.free = self.table[rows].copy(), self.free[rows].copy()
+        new.log_det = self.log_det[rows].copy()
+        return new
+
+    def __setitem__(self, rows: Any, other: _Swept) -> None:
+        self.table[rows], self.free[rows] = other.table, other.free
+        self.log_det[rows] = other.log_det
+
+    def turned(self, places: NDArray[np.intp]) -> _Swept:
+        """Return those where some coordinates are free that were not, or vice versa."""
+        new = self[:]
+        for k in places:
+            row = new.table[:, k].copy()
+            pivot = row[:, [k]]
+            over = row / pivot
+            new.table -= over[:, :, None] * row[:, None]
+            over = np.where(new.free[:, [k]], -over, over)
+            new.table[:, k], new.table[:, :, k] = over, over
+            new.table[:, k, k] = -1 / pivot[:, 0]
+            new.log_det += np.log(np.abs(pivot[:, 0]))
+            new.free[:, k] = ~new.free[:, k]
+        return new
+
+    def log_evidence(self, p: Unknowns) -> Array:
+        """Return the log evidence of what is free, up to what all share, (n,)."""
+        some = np.isfinite(p.low) | np.isfinite(p.high)
+        free = self.free[:, some]
+        variance = -np.einsum("nii->ni", self.table)[:, :-1][:, some]
+        sd = np.sqrt(np.where(free, variance, 1.0))
+        mean = np.where(free, self.table[:, :-1, -1][:, some], 0.0)
+        inside = log_inside(mean, sd, p.low[some], p.high[some])
+        log_z = np.where(free, inside, 0.0).sum(1)
+        return log_z - 0.5 * (self.table[:, -1, -1] + self.log_det)
 
 
 def _present(
-    precision: Array,
-    linear: Array,
-    p: Unknowns,
-    present: NDArray[np.bool_],
-    rng: np.random.Generator,
-) -> NDArray[np.bool_]:
-    """Return which effects are there, one after the other given all others."""
-    if not p.num_effects:
-        return present
-    present = present.copy()
-    absent = NONE ** (1 / p.num_effects)
-    log_odds = np.log1p(-absent) - np.log(absent)
-    log_z = _log_evidence(precision, linear, p, present)
+    swept: _Swept, p: Unknowns, present: Flags, absent: float, rng: np.random.Generator
+) -> Flags:
+    """Return which effects are there, one after the other given all others.
+
+    Args:
+        swept: Given those that are there; follows.
+        p: Priors.
+        present: Which are there so far, shape (n, e).
+        absent: Prior probability that none is there.
+        rng: Source of the draws.
+    """
+    present, num = present.copy(), max(p.num_effects, 1)
+    log_odds = np.log(absent ** (-1 / num) - 1) + p.log_density
+    log_z = swept.log_evidence(p)
     for e in rng.permutation(p.num_effects):
-        other = present.copy()
-        other[:, e] = ~present[:, e]
-        log_other = _log_evidence(precision, linear, p, other)
-        gain = log_other - log_z + np.where(other[:, e], log_odds, -log_odds)
-        flip = rng.random(len(gain)) < 1 / (1 + np.exp(np.clip(-gain, -700, 700)))
-        present[flip, e] = other[flip, e]
+        other = swept.turned(np.flatnonzero(p.effect == e))
+        log_other = other.log_evidence(p)
+        gain = log_other - log_z + np.where(present[:, e], -1, 1) * log_odds[e]
+        flip = rng.logistic(size=len(gain)) < gain
+        present[:, e] ^= flip
         log_z = np.where(flip, log_other, log_z)
+        swept[flip] = other[flip]
     return present
 
 
-def _conditional(
-    precision: Array, linear: Array, p: Unknowns, present: NDArray[np.bool_]
-) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-    """Return what is free given what is absent: precision, linear part, mask, rest.
-
-    Coordinates that are absent have a precision of one apart from all others, and stand
-    at their null; ``rest`` is the log density that these have.
-    """
-    free = np.ones((len(linear), len(p.low)), dtype=bool)
-    own = p.effect >= 0
-    free[:, own] = present[:, p.effect[own]]
-    absent = np.where(free, 0.0, p.null)
-    at_null = np.einsum("nij,nj->ni", precision, absent)
-    rest = (absent * (linear - 0.5 * at_null)).sum(1)
-    full = precision * (free[:, :, None] & free[:, None, :])
-    full = full + np.where(free, p.precision, 1.0)[:, None] * np.eye(len(own))
-    rhs = np.where(free, linear - at_null + p.precision * p.center, 0.0)
-    # An effect's prior is a normalized density; theta is in every model.
-    log_prior = 0.5 * np.log(np.maximum(p.precision, TINY))
-    log_prior = log_prior - 0.5 * p.precision * p.center**2
-    scale = 1 / np.sqrt(np.maximum(p.precision, TINY))
-    log_prior = log_prior - log_inside(p.center, scale, p.low, p.high)
-    rest = rest + (np.where(own, log_prior, 0.0) * free).sum(1)
-    return full, rhs, free, rest
-
-
-def _log_evidence(
-    precision: Array, linear: Array, p: Unknowns, present: NDArray[np.bool_]
-) -> Array:
-    """Return the log evidence of which effects are there, up to what all share."""
-    full, rhs, free, rest = _conditional(precision, linear, p, present)
-    ridge = 1e-10 * np.einsum("nii->ni", full)[:, :, None] * np.eye(len(p.low))
-    cov = np.linalg.inv(full + ridge)
-    mean = np.einsum("nij,nj->ni", cov, rhs)
-    sd = np.sqrt(np.maximum(np.einsum("nii->ni", cov), TINY))
-    inside = log_inside(mean, sd, p.low, p.high)
-    log_z = rest + 0.5 * (mean * rhs).sum(1) + 0.5 * np.linalg.slogdet(cov)[1]
-    return log_z + np.where(free, inside, 0.0).sum(1)
-
-
 def _moved(
-    u: Array,
-    precision: Array,
-    linear: Array,
-    p: Unknowns,
-    present: NDArray[np.bool_],
-    rng: np.random.Generator,
+    u: Array, precision: Array, swept: _Swept, p: Unknowns, rng: np.random.Generator
 ) -> Array:
-    """Return u drawn along the eigenvectors of its precision, within its bounds."""
-    full, rhs, free, _ = _conditional(precision, linear, p, present)
-    u = np.where(free, u, p.null)
-    values, vectors = eigh(full)
+    """Return u drawn within its bounds.
+
+    As if there were none, where that is within them; else along the eigenvectors of its
+    precision. The first is exact, and whether it is chosen depends on no earlier u.
+    """
+    free = swept.free
+    mean = np.where(free, swept.table[:, :-1, -1], 0.0)
+    full = np.where(free[:, :, None] & free[:, None], precision, np.eye(len(p.low)))
+    upper = np.swapaxes(np.linalg.cholesky(full), 1, 2)
+    new = np.linalg.solve(upper, rng.standard_normal((*u.shape, 1)))[..., 0]
+    new = np.where(free, mean + new, 0.0)
+    out = np.flatnonzero(((new < p.low) | (new > p.high)).any(1))
+    if not len(out):
+        return new
+    u, mean, free = np.where(free, u, 0.0)[out], mean[out], free[out]
+    values, vectors = eigh(full[out])
+    sd = 1 / np.sqrt(values)
     for j in range(u.shape[1]):
-        e = np.where(free, vectors[:, :, j], 0.0)
-        e = np.where(np.abs(e) < 1e-12, 0.0, e)
+        e = np.where(free & (np.abs(vectors[:, :, j]) > 1e-12), vectors[:, :, j], 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.stack([(p.low - u) / e, (p.high - u) / e])
         ends = np.where(e == 0, np.array([-np.inf, np.inf])[:, None, None], ends)
         low = np.minimum(ends.min(0).max(1), 0.0)
         high = np.maximum(ends.max(0).min(1), 0.0)
-        slope = (e * (rhs - np.einsum("nij,nj->ni", full, np.where(free, u, 0)))).sum(1)
-        sd = 1 / np.sqrt(np.maximum(values[:, j], 1e-12))
-        step = truncated_normal(slope * sd**2, sd, low, high, rng)
-        step = np.where((e != 0).any(1), step, 0.0)
-        u = np.clip(u + step[:, None] * e, p.low, p.high)
-        u = np.where(free, u, p.null)
-    return u
-
-
-def _picked(log_p: Array, rng: np.random.Generator) -> NDArray[np.intp]:
-    p = np.exp(log_p - log_p.max(1, keepdims=True))
-    steps = np.cumsum(p, 1)
-    place = (steps < rng.random((len(p), 1)) * steps[:, -1:]).sum(1)
-    return np.minimum(place, p.shape[1] - 1)
+        off = (e * (mean - u)).sum(1)  # along it u is independent of all others
+        step = truncated_normal(off, sd[:, j], low, high, rng)
+        u = np.clip(u + np.where(e.any(1), step, 0.0)[:, None] * e, p.low, p.high)
+    new[out] = np.where(free, u, 0.0)
+    return new

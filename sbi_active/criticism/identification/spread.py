@@ -18,18 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.identification.errors import grams
 from sbi_active.criticism.identification.fitting import Fitted
+from sbi_active.criticism.linear.processes import parts_of
 
 Array = NDArray[Any]
-
-#: Parts of the trials at least, for which trials are divided in time.
-FEWEST = 4
-#: Tail probability below which they disagree.
-LEVEL = 0.01
-#: Deviations between parts by which all of them may be off.
-WIDER = 3.0
 
 
 @dataclass(frozen=True)
@@ -47,37 +39,27 @@ class Spread:
     deviation: Array
     sd: Array
 
-    @property
-    def disagree(self) -> bool:
-        """Whether some parameter is not the same in all parts."""
-        return float(self.p_value.min(initial=1.0)) * len(self.p_value) < LEVEL
-
-    def widen(self, u: Array, rng: np.random.Generator) -> Array:
-        """Return draws (n, d) as far off as the parts are from each other."""
+    def widen(self, u: Array, by: float, rng: np.random.Generator) -> Array:
+        """Return draws (n, d) as far off as the parts are from each other, times by."""
         weight = rng.standard_normal((len(u), len(self.deviation)))
-        return u + WIDER * weight @ self.deviation
+        return u + by * weight @ self.deviation
 
 
-def spread(found: Fitted) -> Spread:
+def spread(found: Fitted, fewest: int) -> Spread:
     """Return how parts of the trials disagree about theta.
 
     Args:
         found: The model, linear.
+        fewest: Number of parts at least.
     """
-    m, draws = found.rival.simulator.measurements, found.draws
-    own = found.rival.theta_dim
-    free = found.rival.coordinates.trial_of() < 0
-    effect = found.unknowns.effect
-    likely = draws.present.mean(0) > 0.5
-    free &= (effect < 0) | likely[effect] if len(likely) else True
-    precision, linear = 0.0, 0.0
-    rows = found.rows[:, np.append(True, free)]
-    for k, gram in enumerate(grams(rows, m, found.hypotheses, _parts(m))):
-        h = int(np.bincount(draws.errors[:, k]).argmax())
-        variance = np.mean(draws.size[draws.errors[:, k] == h, k] ** 2)
-        precision = precision + gram.gram[h][:, 1:, 1:] / variance
-        linear = linear - gram.gram[h][:, 1:, 0] / variance
-    precision, linear = np.asarray(precision), np.asarray(linear)
+    draws, m, own = found.draws, found.measurements, found.rival.theta_dim
+    likely = np.append(draws.present.mean(0) > 0.5, True)
+    free = (found.rival.coordinates.trial_of() < 0) & likely[found.effect]
+    parts = parts_of(m, fewest, fewest)
+    white = found.whitened(found.rows[:, np.append(True, free)], parts)
+    each = [white[parts == f] for f in range(int(parts.max()) + 1)]
+    grams = np.stack([rows.T @ rows for rows in each])
+    precision, linear = grams[:, 1:, 1:], -grams[:, 1:, 0]
     total = precision.sum(0)
     ridge = np.diag(1e-6 * np.diag(total) + 1e-12)
     best = np.linalg.solve(total + ridge, linear.sum(0))
@@ -95,15 +77,3 @@ def spread(found: Fitted) -> Spread:
     p_value = chi2.sf(square, max(freedom, 1))
     whole = np.sqrt(np.diag(np.linalg.inv(total + ridge)))[:own]
     return Spread(p_value, off * np.sqrt(variance), whole)
-
-
-def _parts(m: Measurements) -> NDArray[np.int64]:
-    """Return the part of each number: trials, or parts of them where they are few."""
-    _, trial = np.unique(m.trial, return_inverse=True)
-    each = -(-FEWEST // (int(trial.max()) + 1))
-    place = np.zeros(len(m), dtype=np.int64)
-    for t in range(int(trial.max()) + 1):
-        time = m.time[trial == t]
-        edges = np.linspace(time.min(), time.max(), each + 1)[1:-1]
-        place[trial == t] = np.searchsorted(edges, time, side="right")
-    return trial * each + place

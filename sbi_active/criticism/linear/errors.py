@@ -1,17 +1,16 @@
 r"""The errors that all models share: the sensor's alone, or beside a residual process.
 
 .. math::
-    C = \sigma^2 (I + s^2 K), \qquad
-    K(d) = e^{-d / \tau} \ \text{or}\
-    \bigl(1 + \tfrac{\sqrt3 d}{\tau}\bigr) e^{-\sqrt3 d / \tau},
+    C = \sigma^2 (I + s^2 K_\tau)
 
-in each trial and channel, with :math:`\sigma` of the sensor. The size s (from .3 up)
-and the time scale :math:`\tau` (from a sample to most of a trial) are log-uniform and
-summed out, in *every* model: what a simulator gets wrong along a trajectory is no
-evidence for whichever model is a little less wrong. Or a parameter differs from trial
-to trial, with :math:`K = j j^T` in each trial across its channels and j the derivative
-of the bare model by it, mean square one: this and a process are equally likely. Models
-are linear here (:mod:`.linear`), so that all of it is algebra of Gram matrices.
+in each trial and channel, with :math:`\sigma` of the sensor and the kernels of
+:mod:`.processes`. The size s (from .3 up) and the time scale :math:`\tau` (from a
+sample to most of a trial) are log-uniform and summed out, in *every* model: what a
+simulator gets wrong along a trajectory is no evidence for whichever model is a little
+less wrong. Or a parameter differs from trial to trial, with :math:`K = j j^T` in each
+trial across its channels and j the derivative of the bare model by it, mean square one:
+this and a process are equally likely. Models are linear here (:mod:`.model`), so that
+all of it is algebra of Gram matrices.
 
 References:
     Kennedy & O'Hagan, Journal of the Royal Statistical Society B 63 (2001).
@@ -19,7 +18,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,9 +26,15 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.processes import (
+    Filters,
+    Grams,
+    Processes,
+    parts_of,
+    time_scales,
+)
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
 from sbi_active.criticism.steps.nuisances import is_first_part
-from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -38,40 +42,12 @@ Array = NDArray[Any]
 
 #: Factors on the scale of an effect's prior, equally likely.
 WIDTHS = (1 / 3, 1.0, 3.0)
-#: Sizes of the process in sensor deviations, a factor apart, and its time scales: from
-#: this share of a sample to this share of a trial, about a factor apart.
+#: Sizes of the process in sensor deviations, a factor apart.
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
-SAMPLE, TRIAL, APART = 0.8, 0.8, 2.1
 #: Every so many of the sizes is one of what differs from trial to trial.
 THINNED = 2
 #: Trials below which parts of them are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
-
-
-def _ornstein_uhlenbeck(d: Array) -> Array:
-    return np.exp(-d)
-
-
-def _matern(d: Array) -> Array:
-    return (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d)
-
-
-KERNELS: tuple[Callable[[Array], Array], ...] = (_ornstein_uhlenbeck, _matern)
-
-
-@dataclass(frozen=True)
-class Grams:
-    """Gram matrices of a model's rows in the metric of each error, part by part.
-
-    Attributes:
-        gram: Shape (h, f, 1 + d, 1 + d).
-        log_det: Of each error's covariance, shape (h, f).
-        count: Numbers in each part, shape (f,).
-    """
-
-    gram: Array
-    log_det: Array
-    count: Array
 
 
 @dataclass(frozen=True)
@@ -142,7 +118,8 @@ class Errors:
     ) -> None:
         m = self.measurements = measurements
         self.unit = unit
-        self.fold, self.is_by_trial = _folds(m)
+        self.fold = parts_of(m, FEWEST, NUM_FOLDS)
+        self.is_by_trial = len(np.unique(m.trial)) >= FEWEST
         self.num_folds = int(self.fold.max()) + 1
         self.is_scored = np.ones(len(m), dtype=bool)
         if self.is_by_trial:
@@ -150,17 +127,15 @@ class Errors:
         top = max(LARGEST, 2 * largest)
         num = 1 + round(np.log(top / SMALLEST) / np.log(FACTOR))
         self.sizes = np.geomspace(SMALLEST, top, num)
-        span = np.median([np.ptp(m.time[at]) for at in self._blocks()])
-        span = max(float(span), m.step)
-        low, high = SAMPLE * m.step, max(TRIAL * span, 2 * SAMPLE * m.step)
-        num = 2 + round(np.log(high / low) / np.log(APART))
         # Numbers that do not follow each other have errors of their own.
-        self.kernels = KERNELS if m.is_sequence else KERNELS[:1]
-        self.times = np.geomspace(low, high, num if m.is_sequence else 1)
+        self.kernels = (False, True) if m.is_sequence else (False,)
+        self.times = time_scales(m, self.fold)[: None if m.is_sequence else 1]
+        variances = np.stack([np.ones(num), self.sizes**2], 1)
+        self.processes = Processes.grid(variances, self.times, self.kernels)
+        self.filters = Filters(self.processes, m, self.fold, self.fold)
         self.cells = [_in_units(cell, unit) for cell in cells]
         total = log_sum_exp(np.array([c.log_weight for c in self.cells]))
         self.log_cells = np.array([c.log_weight for c in self.cells]) - total
-        self.patterns = self._by_pattern()
         if varying is None or not self.is_by_trial:
             varying = np.empty((len(m), 0))
         size = np.sqrt((varying**2).mean(0))
@@ -169,7 +144,7 @@ class Errors:
     @property
     def num_processes(self) -> int:
         """Errors with a process: kernels, time scales and sizes."""
-        return len(self.kernels) * len(self.times) * len(self.sizes)
+        return len(self.processes)
 
     @property
     def spreads(self) -> Array:
@@ -195,21 +170,10 @@ class Errors:
             for j in range(f):
                 own = white[self.fold == j]
                 gram[i, j] = own.T @ own
-        for places, folds, bases in self.patterns:
-            blocks = rows[places]  # (b, n, k)
-            at = len(self.cells)
-            for values, vectors in bases:
-                y = np.einsum("nm,bnk->bmk", vectors, blocks)
-                product = (y[..., :, None] * y[..., None, :]).reshape(*y.shape[:2], -1)
-                v = 1 + self.sizes[:, None] ** 2 * values  # (s, m)
-                weighted = np.einsum("sm,bmq->sbq", 1 / v, product)
-                logs = np.log(v).sum(1)
-                for b, fold in enumerate(folds):
-                    own = slice(at, at + len(self.sizes))
-                    gram[own, fold] += weighted[:, b].reshape(-1, k, k)
-                    log_det[own, fold] += logs
-                at += len(self.sizes)
         at = len(self.cells) + self.num_processes
+        process = self.filters.grams(rows)
+        gram[len(self.cells) : at] = process.gram
+        log_det[len(self.cells) : at] = process.log_det
         for j in range(f) if self.varying.size else ():
             own = rows[self.fold == j]
             plain = own.T @ own
@@ -301,31 +265,6 @@ class Errors:
         weight = 1 / mean[self.fold]
         return weight / weight.mean()
 
-    def _blocks(self) -> list[NDArray[np.intp]]:
-        """Return the numbers of each part and channel, in the order of time."""
-        m = self.measurements
-        code = self.fold * (int(m.channel.max()) + 1) + m.channel
-        return [np.flatnonzero(code == c) for c in np.unique(code)]
-
-    def _by_pattern(self) -> list[tuple[Array, Array, list[tuple[Array, Array]]]]:
-        """Return blocks of equal time stamps with the eigenbases of their kernels."""
-        m, same = self.measurements, {}
-        for at in self._blocks():
-            stamps = np.round((m.time[at] - m.time[at[0]]) / m.step, 6)
-            same.setdefault(stamps.tobytes(), []).append(at)
-        found = []
-        for blocks in same.values():
-            places = np.stack(blocks)
-            time = m.time[places[0]]
-            apart = np.abs(time[:, None] - time)
-            bases = []
-            for kernel in self.kernels:
-                for tau in self.times:
-                    values, vectors = eigh(kernel(apart / tau))
-                    bases.append((np.clip(values, 0, None), vectors))
-            found.append((places, self.fold[places[:, 0]], bases))
-        return found
-
 
 def integrated(
     gram: Array, model: LinearModel, width: float
@@ -356,18 +295,3 @@ def integrated(
 
 def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:
     return NoiseCell(cell.log_weight, cell.sd / unit, cell.rho, cell.df)
-
-
-def _folds(m: Measurements) -> tuple[NDArray[np.int64], bool]:
-    """Return the part of each number, and whether parts are trials."""
-    trials, code = np.unique(m.trial, return_inverse=True)
-    if len(trials) >= FEWEST:
-        return code.astype(np.int64), True
-    each = -(-NUM_FOLDS // len(trials))
-    fold = np.empty(len(m), dtype=np.int64)
-    for t in range(len(trials)):
-        at = code == t
-        time = m.time[at]
-        edges = np.quantile(time, np.linspace(0, 1, each + 1)[1:-1])
-        fold[at] = t * each + np.searchsorted(edges, time, side="left")
-    return np.unique(fold, return_inverse=True)[1].astype(np.int64), False

@@ -99,14 +99,14 @@ class LinearModel:
         return np.where(self.scaled, width * self.sd, self.sd)
 
 
-def linearize(rival: Rival, u: Array, unit: Array, step: float) -> LinearModel:
+def linearize(rival: Rival, u: Array, unit: Array, step: float | Array) -> LinearModel:
     """Return a rival linearized at one point.
 
     Args:
         rival: Of effects that change the prediction.
         u: Where, shape (d,).
         unit: Standard deviation of the sensor, shape (N,).
-        step: Of finite differences.
+        step: Of finite differences, one or one a coordinate, shape (d,).
     """
     r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
     return with_prior(rival, u, r[0], jacobian[0])
@@ -159,3 +159,35 @@ def enlarged(
     u[~new], jacobian[:, ~new] = model.u, model.jacobian
     u[new], jacobian[:, new] = values, columns
     return with_prior(rival, u, model.residual, jacobian)
+
+
+def chords(
+    rival: Rival,
+    u: Array,
+    new: NDArray[np.bool_],
+    tried: Array | float,
+    residual: Array,
+    unit: Array,
+) -> Array:
+    """Return derivatives of the residual by some coordinates, shape (N, k).
+
+    Of a step as long as one tries, within the bounds, and no tangent: many effects are
+    flat at their null.
+
+    Args:
+        rival: The model.
+        u: From where, shape (d,).
+        new: Which coordinates, bool, shape (d,).
+        tried: Length of the step, one or one each, shape (k,).
+        residual: At u, in units, shape (N,).
+        unit: Standard deviation of each number's error, shape (N,).
+    """
+    where = np.flatnonzero(new)
+    beyond = u[where] + np.abs(tried) > rival.coordinates.high[where]
+    step = np.where(beyond, -np.abs(tried), np.abs(tried))
+    points = np.repeat(u[None], len(where), 0)
+    points[np.arange(len(where)), where] += step
+    if not len(where):
+        return np.empty((len(residual), 0))
+    r = rival.residual(points)[0] / unit
+    return ((r - residual) / step[:, None]).T

@@ -17,20 +17,17 @@ def at_null(rival: Rival, effect: Effect, tried: float) -> tuple[Array, Array]:
     """Return the null of an effect among the coordinates, and a step from it, (k,).
 
     Args:
-        rival: With this effect alone.
+        rival: With this effect.
         effect: The effect.
         tried: Length of the step.
     """
     c, place = rival.coordinates, rival.columns()[effect.name]
-    null = effect.null_phi(1).double().numpy()
     z = c.to_z(np.clip(np.zeros((1, rival.dim)), c.low, c.high))
-    low, high = c.low[place], c.high[place]
-    if has_null(effect):
-        z[:, place] = null
-        u = c.from_z(z)[0, place]
-    else:  # the end of the prior that is nearest to it
-        u = np.where(null[0] > 0, high, low)
-    return np.clip(u, low, high), np.where(u + tried > high, -tried, tried)
+    # Where no number makes it vanish, the end of the prior that is nearest to it.
+    z[:, place] = effect.null_phi(1, finite=True).double().numpy()
+    with np.errstate(divide="ignore"):
+        u = np.clip(c.from_z(z)[0], c.low, c.high)[place]
+    return u, np.where(u + tried > c.high[place], -tried, tried)
 
 
 def has_null(effect: Effect) -> bool:

@@ -22,16 +22,16 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.candidate import Candidate
 from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.fits import along_secants, best_fit, polished
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.library import Library
-from sbi_active.criticism.linear.model import LinearModel, enlarged, linearize
+from sbi_active.criticism.linear.model import LinearModel, chords, enlarged
 from sbi_active.criticism.linear.nulls import at_null, has_null
 from sbi_active.criticism.linear.settings import FitSettings
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.combinations import log_prior
-from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -208,11 +208,7 @@ class Search:
         start = np.empty(rival.dim)
         own = ~self.columns(key, base)
         start[~own], start[own] = model.u, null
-        where = np.flatnonzero(own)
-        points = np.repeat(start[None], len(where), 0)
-        points[np.arange(len(where)), where] += step
-        r = rival.residual(points)[0] / self.unit
-        slope = ((r - model.residual) / step[:, None]).T
+        slope = chords(rival, start, own, step, model.residual, self.unit)
         return enlarged(model, rival, own, null, slope), own
 
     def rms(self, key: ModelKey, u: Array) -> float:
@@ -281,19 +277,11 @@ class Search:
     # The fits.
 
     def _fit_bare(self) -> LinearModel:
-        own, rival = self.settings, self._rival(ModelKey())
+        rival = self._rival(ModelKey())
         # Those of the prior predictive, which are simulated already.
         seed = derive_seed(self.rivals.seed, "spread")
         u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
-        r = rival.residual(u)[0] / self.unit
-        order = np.argsort((r**2).sum(1))
-        half = own.num_starts // 2
-        far = order[half :: own.num_starts][: own.num_starts - half]
-        u = np.concatenate([u[order[:half]], u[far]])
-        scale = max(float(np.sqrt(np.mean(r[order[0]] ** 2))), 1.0)
-        u, cost = self._secant(rival, u, scale, own.first)
-        some = [self._polished(rival, p) for p in u[np.argsort(cost)[: own.num_kept]]]
-        return min(some, key=lambda model: model.rms)
+        return best_fit(rival, u, self.unit, self.settings)
 
     def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:
         """Fit a set of effects from the smaller one that leaves least."""
@@ -306,13 +294,14 @@ class Search:
         scale = max(model.rms, 1.0)
         known = model.residual[None] / scale, model.jacobian[None] / scale
         u = np.clip(model.u, model.low, model.high)[None]
-        u, _ = self._secant(rival, u, scale, known=known)
+        secant, unit = self.settings.secant, self.unit * scale
+        u, _ = along_secants(rival, u, unit, secant, known)
         fits = [self._polished(rival, u[0])]
         effects = [self.rivals.effects[n] for n in key.effects]
         is_far = not all(map(has_null, effects))
         if is_far or (len(effects) == 1 and not is_force(effects[0])):
             # Not linear in phi: it may be far from where its column was taken.
-            u, cost = self._secant(rival, self._starts(key, parent), scale)
+            u, cost = along_secants(rival, self._starts(key, parent), unit, secant)
             fits += [self._polished(rival, p) for p in u[np.argsort(cost)[:2]]]
         best = min(fits, key=lambda fit: fit.rms)
         if best.rms > self.found[parent].model.rms:
@@ -365,34 +354,4 @@ class Search:
         return u
 
     def _polished(self, rival: Rival, u: Array) -> LinearModel:
-        """Return a model linearized at the best fit from a start near it."""
-        model = linearize(rival, u, self.unit, self.rivals.step)
-        for _ in range(self.settings.rounds - 1):
-            scale = max(model.rms, 1.0)
-            if model.promised < self.settings.worth * scale**2:
-                break
-            known = model.residual[None] / scale, model.jacobian[None] / scale
-            start = np.clip(model.u, model.low, model.high)[None]
-            new, _ = self._secant(rival, start, scale, known=known)
-            if (new[0] == model.u).all():
-                break
-            model = linearize(rival, new[0], self.unit, self.rivals.step)
-        return model
-
-    def _secant(
-        self,
-        rival: Rival,
-        u: Array,
-        scale: float,
-        steps: int | None = None,
-        *,
-        known: tuple[Array, Array] | None = None,
-    ) -> tuple[Array, Array]:
-        """Return starts improved along secants, and their cost."""
-        steps = self.settings.secant if steps is None else steps
-        unit = self.unit * scale
-        return descend(
-            *(rival, u, lambda r: r / unit, self.rivals.step, steps),
-            secant=True,
-            known=known,
-        )
+        return polished(rival, u, self.unit, self.settings)

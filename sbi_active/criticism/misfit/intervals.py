@@ -18,6 +18,7 @@ which predicts new trials better.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from scipy import stats
 from sbi_active.criticism.linear.errors import WIDTHS, Errors, Posterior, integrated
 from sbi_active.criticism.linear.left_out import LeftOut
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.processes import Filter, Processes, alike
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -98,34 +100,31 @@ def shared_process(
     Returns:
         Shapes (d,) and (d, d); None where trials are not sampled at the same times.
     """
-    patterns = errors.patterns
+    m, num = errors.measurements, errors.num_folds
+    patterns = alike(m, errors.fold)
     if not errors.is_by_trial or len(patterns) != 1:
         return None
-    places, folds, bases = patterns[0]
-    num = errors.num_folds
-    order = np.argsort(folds, kind="stable")  # by trial, then channel
-    channels = len(folds) // num
-    if len(folds) != channels * num:
+    (places,) = patterns  # by trial, then channel
+    channels = len(places) // num
+    if len(places) != channels * num:
         return None
     rows = model.rows.copy()
     rows[:, 0] -= rows[:, 1:] @ model.center
-    blocks = rows[places[order]].reshape(num, channels, places.shape[1], -1)
+    blocks = rows[places].reshape(num, -1)
+    variance = errors.sizes[::THINNED] ** 2
+    variances = np.stack([np.ones(len(variance)), variance], 1)
+    own = Processes.grid(variances, errors.times, errors.kernels)
     means, covs, logs = [], [], []
-    sizes = errors.sizes[::THINNED]
-    for values, vectors in bases:
-        along = np.einsum("nm,tcnk->tcmk", vectors, blocks)
-        for weights, basis in _between(action, num):
-            turned = np.einsum("tu,tcmk->ucmk", basis, along)
-            flat = turned.reshape(-1, turned.shape[-1])
-            product = (flat[:, :, None] * flat[:, None, :]).reshape(len(flat), -1)
-            variance = np.repeat(np.outer(weights, values), channels, 0)
-            variance = variance.reshape(num, channels, -1).ravel()
-            v = 1 + sizes[:, None] ** 2 * variance
-            gram = ((1 / v) @ product).reshape(len(sizes), flat.shape[1], -1)
-            log_z, mean, cov = integrated(gram, model, 1.0)
-            logs.append(log_z - 0.5 * np.log(v).sum(1))
-            means.append(mean)
-            covs.append(cov)
+    for weights, basis in _between(action, num):
+        # Along these directions trials have processes of their own, of other sizes.
+        turned = (basis.T @ blocks).reshape(*places.shape, -1)
+        each = own.process[:, None] * np.repeat(weights, channels)
+        filters = Filter(replace(own, process=each), m.time[places[0]])
+        gram = filters.grams(turned).sum(1)
+        log_z, mean, cov = integrated(gram, model, 1.0)
+        logs.append(log_z - 0.5 * filters.log_det.sum(1))
+        means.append(mean)
+        covs.append(cov)
     log_p, mean = np.concatenate(logs), np.concatenate(means)
     p = np.exp(log_p - log_sum_exp(log_p))
     center = p @ mean

@@ -160,19 +160,20 @@ def _that_matter(
         index=torch.arange(len(theta), dtype=torch.float64),
         **{k: v for k, v in call.items() if k not in ("theta", "action")},
     )
-    x = AugmentedSimulator(bare, ()).evaluate(theta, {}, action, context=context)
-    scale = float(np.nanstd(x.double().numpy())) or 1.0
-    kept = []
+    new = []
     for effect in effects:
         change = getattr(effect.apply, "key", None)
-        if isinstance(change, QuantityChange) and is_parameter(
-            function.machines[0].parameters, change
-        ):
-            continue
+        known = function.machines[0].parameters
+        if not (isinstance(change, QuantityChange) and is_parameter(known, change)):
+            new.append(effect)
+    augmented = AugmentedSimulator(bare, new)
+    x = augmented.evaluate(theta, {}, action, context=context)
+    scale = float(np.nanstd(x.double().numpy())) or 1.0
+    kept = []
+    for effect in new:
         draws = effect.declared_draws()[: len(theta)].to(theta.dtype)
-        changed = AugmentedSimulator(bare, [effect]).evaluate(
-            theta, {effect.name: draws}, action, context=context
-        )
+        phi = {effect.name: draws}
+        changed = augmented.evaluate(theta, phi, action, context=context)
         moved = (changed - x).abs()
         if bool((moved.nan_to_num(torch.inf) > NOTHING * scale).any()):
             kept.append(effect)

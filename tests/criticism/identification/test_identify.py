@@ -8,7 +8,7 @@ from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.identification import identify
+from sbi_active.criticism.identification import IdentifySettings, identify
 from sbi_active.mujoco import randomization
 
 TIMES = torch.arange(120, dtype=torch.float64) / 20
@@ -190,6 +190,10 @@ def test_trials_that_disagree_widen_it():
     assert not belief.diagnostics.trustworthy
     low, high = belief.interval()["frequency"]
     assert low < 3.0 < high
+    trials = Trials(ACTION, x + errors(tuple(x.shape), 0, 1))
+    alike = identify(model(), PRIOR, trials, settings=IdentifySettings(wider=0.0))
+    one, two = alike.interval()["frequency"]
+    assert two - one < 0.2 * (high - low)
 
 
 def test_what_it_does_not_take():

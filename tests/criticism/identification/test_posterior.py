@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.identification.errors import Grams, Hypotheses
 from sbi_active.criticism.identification.posterior import Unknowns, sample
+from sbi_active.criticism.linear.processes import Grams, Processes
 
-WHITE = Hypotheses(np.ones(1), np.full(1, np.inf), np.zeros(1, bool), np.zeros(1))
+WHITE = Processes(np.ones(1), np.zeros(1), np.full(1, np.inf), np.zeros(1, bool))
 
 
 def linear(num=200, strength=0.0, seed=0):
@@ -27,14 +27,13 @@ def unknowns(low=-np.inf, effect=(-1, -1, 0)):
         np.full(3, np.inf),
         np.zeros(3),
         precision,
-        np.zeros(3),
         np.array(effect),
     )
 
 
 def draws(grams, own, size: float | None = 1.0, seed=0):
     rng = np.random.default_rng(seed)
-    return sample([grams], WHITE, own, [size], rng, sweeps=60)
+    return sample(grams, WHITE, own, [size], rng, sweeps=60)
 
 
 def test_without_doubt_it_is_least_squares():

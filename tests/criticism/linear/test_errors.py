@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal, norm
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.errors import KERNELS, WIDTHS, Errors, integrated
+from sbi_active.criticism.linear.errors import WIDTHS, Errors, integrated
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
@@ -16,6 +16,10 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell
 
 NUM, SAMPLES = 7, 5
+KERNELS = (
+    lambda d: np.exp(-d),
+    lambda d: (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d),
+)
 
 
 def problem(*, low=-np.inf, ragged=False, num=NUM):

@@ -8,6 +8,7 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.linear.fits import along_secants
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_error
 from sbi_active.criticism.results import ModelKey
@@ -81,11 +82,11 @@ def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
     search = Search(loop.rivals, sensor[0], log_priors(loop.effects, ()), sensor[1])
     search.fit_singles()
     part = search.found[ModelKey(("cubic",))].model
-    descend, faint, again = search._secant, search._faint, []
+    faint, again = search._faint, []
 
     def lost(rival, u, *arguments, **options):
         if again:
-            return descend(rival, u, *arguments, **options)
+            return along_secants(rival, u, *arguments, **options)
         u = u.copy()
         u[:, rival.columns()["friction"]] = 20.0
         return u, (rival.residual(u)[0] ** 2).sum(1)
@@ -96,7 +97,9 @@ def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
         assert (u[search.columns(key, parent)] == part.u).all()
         return u
 
-    monkeypatch.setattr(search, "_secant", lost)
+    for module in ("search", "fits"):
+        name = f"sbi_active.criticism.linear.{module}.along_secants"
+        monkeypatch.setattr(name, lost)
     monkeypatch.setattr(search, "_faint", from_its_part)
     both = search.fit_set(ModelKey(("cubic", "friction"))).model
     assert again == [ModelKey(("cubic",))]

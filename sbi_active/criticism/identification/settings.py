@@ -1,0 +1,121 @@
+"""How much an identification spends, and what decides in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.linear.processes import Processes, time_scales
+from sbi_active.criticism.linear.settings import FitSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerSettings:
+    """How much is drawn, and what is known of doubtful effects and of errors before.
+
+    Attributes:
+        chains: Independent ones, side by side.
+        burnt: Sweeps that are left out of each: after half as many draws are those of
+            later ones, since u moves as a whole.
+        few: Sweeps where only means are asked for.
+        many: Sweeps of a belief: ends of a 95 % interval are then known to some .5 %.
+        absent: Prior probability that no doubtful effect is there, one half for want
+            of anything better; and that a channel's errors are white.
+        flat: Precision in units of the inverse square of a range, which leaves uniform
+            priors as they are and directions that nothing tells solvable.
+    """
+
+    chains: int = 64
+    burnt: int = 6
+    few: int = 6
+    many: int = 26
+    absent: float = 0.5
+    flat: float = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifySettings:
+    """How much is spent, and what is told apart.
+
+    Attributes:
+        num_screened: Draws of the prior that are looked at, at least.
+        screened_each: The same for each parameter: the more there are, the more optima.
+        fit: Searches from these, at least, and how far they go.
+        starts_each: Searches for each parameter.
+        kept_each: Searches that go on, for each parameter.
+        sampler: Draws of the linear model.
+        step: Of finite differences, in deviations of the prior.
+        tried: Deviations of the prior by which an effect that is absent is tried: many
+            are flat at their null.
+        alias: Share of an effect's column that is no combination of the parameters'
+            own, below which it is an alias of them.
+        likely: Probability from which an effect is fitted.
+        linearized: Times at most that the model is linearized anew.
+        moved: A move that is worth it, in posterior deviations.
+        rounds: Times at most that channels are weighed by their residuals.
+        worth: Mean fall of the logarithm of these sizes that is worth another time.
+        smallest: Residual that a channel is taken to have at least, in its deviations.
+        shares: Of the variance that are white, of errors of unknown size.
+        least: Smallest share of a declared white error: below it sums of squares lose
+            their digits.
+        num_compared: Draws at which the linear model is compared with the simulator.
+        linear: Deviation of the log density ratio up to which it will do, nats.
+        num_weighed: Draws that are weighed where it will not.
+        fewest: Effective draws below which a belief is not to be trusted.
+        fewest_kept: Those that weights leave at least: few would make for a narrow
+            interval.
+        fewest_parts: Parts of the trials at least, for which trials are divided in
+            time.
+        level: Tail probability below which they disagree.
+        wider: Deviations between parts by which all of them may be off: with four
+            parts Student's quantile is 3.2.
+        beyond: Multiple of the declared deviation from which errors are no longer the
+            sensor's.
+        half: Deviation of half a Gaussian: beside a bound draws that are narrower say
+            that trials ask for what is beyond it, and not how well they tell the
+            parameter.
+    """
+
+    num_screened: int = 16
+    screened_each: int = 5
+    fit: FitSettings = FitSettings(num_starts=3, num_kept=1, first=5)
+    starts_each: float = 1.0
+    kept_each: float = 0.3
+    sampler: SamplerSettings = SamplerSettings()
+    step: float = 1e-4
+    tried: float = 0.05
+    alias: float = 0.02
+    likely: float = 0.1
+    linearized: int = 6
+    moved: float = 0.3
+    rounds: int = 10
+    worth: float = 0.01
+    smallest: float = 1e-9
+    shares: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)
+    least: float = 1e-12
+    num_compared: int = 8
+    linear: float = 0.5
+    num_weighed: int = 400
+    fewest: int = 50
+    fewest_kept: int = 100
+    fewest_parts: int = 4
+    level: float = 0.01
+    wider: float = 3.0
+    beyond: float = 3.0
+    half: float = 0.6
+
+    def errors(self, m: Measurements, declared: float) -> Processes:
+        """Return hypotheses of errors of size one, white noise first.
+
+        Args:
+            m: Which say what time scales can be told.
+            declared: Share of the variance of residuals that a declared white error
+                has at least in all channels; shares go on by tens to a tenth of it.
+        """
+        tens = np.log10(self.shares[0] / max(declared / 10, self.least))
+        below = self.shares[0] * 10.0 ** -np.arange(max(np.ceil(tens), 0), 0, -1)
+        share = np.array([*below, *self.shares])
+        variances = np.stack([share, 1 - share], 1)
+        return Processes.grid(variances, time_scales(m, m.trial)).beside_white()
