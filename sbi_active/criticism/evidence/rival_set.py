@@ -69,7 +69,6 @@ class RivalSet:
         actions: The permitted ones, for the length scales of the residual process; None
             takes the range of the trials.
         seed: Of all draws.
-        reference: Log evidence of a model outside the set that these compete with.
 
     Attributes:
         effects: Effects of scope "campaign", by name.
@@ -99,9 +98,7 @@ class RivalSet:
         *,
         actions: ActionSpace | None = None,
         seed: int = 0,
-        reference: float = -np.inf,
     ) -> None:
-        self.reference = reference
         self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
         self.actions = actions
         self.effects = {e.name: e for e in effects if e.scope == "campaign"}
@@ -316,7 +313,7 @@ class RivalSet:
     def _best_evidence(self) -> float:
         """Return the largest log evidence so far."""
         known = [fit.evidence.log_evidence for fit in self.fits.values()]
-        return float(max([*known, self.reference]))
+        return float(max(known, default=-np.inf))
 
     def _record(
         self,

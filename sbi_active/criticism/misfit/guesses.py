@@ -2,32 +2,67 @@ r"""What the residual follows where every model misses.
 
 Each guess adds :math:`c\, g(v)` to a model's output, with g one elementary function of
 an entry of the action, an input, the output, its slope, or the time in the trial. Where
-no declared effect helps, it is printed if it removes a quarter of the excess error on
-left-out trials, and lowers the error on a new one with a probability of .9 beside all
-that were tried. Where one does, guesses in its place have evidence, against which that
-of the effect is held. No trial is simulated for either.
+no declared effect helps along trajectories, it is printed if it removes a quarter of
+the excess error on left-out trials, and lowers the error on a new one with a
+probability of .9 beside all that were tried; of numbers without a time axis if its
+evidence is above that of a smooth function of the action,
+
+.. math::
+    C = \sigma^2 (I + s^2 K), \qquad K = e^{-|\Delta\xi|^2 / (2 \ell^2)}
+
+in each channel, with s and :math:`\ell` summed out. Where an effect does help, guesses
+in its place have evidence, against which that of the effect is held. No trial is
+simulated for any of this.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from sbi_active.criticism.linear.errors import integrated
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.rule import predicts_better
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.formulas import MARGIN, SAME, TERMS
+from sbi_active.criticism.rivals.error_models import LOG_2PI
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
+#: Nats by which a formula must beat what it stands for to be printed, and those within
+#: which the simpler of two is taken.
+MARGIN, ALIKE = 2.0, 1.0
+#: Bound on exponents, so that a formula stays finite.
+LARGEST_EXPONENT = 20.0
+#: Cosine short of 1 at which two terms are one.
+SAME = 1e-9
+#: Lengths of a smooth function of the action, in deviations of the actions tried, from
+#: a local misfit to one of all: a factor apart, since its amplitude makes up for half.
+LENGTHS = (0.25, 0.5, 1.0, 2.0)
+#: The simplest first.
+TERMS: dict[str, Callable[[Tensor], Tensor]] = {
+    "1": torch.ones_like,
+    "{}": lambda v: v,
+    "{}^2": lambda v: v**2,
+    "{}^3": lambda v: v**3,
+    "|{}|": torch.abs,
+    "|{}|^1.5": lambda v: v.abs() ** 1.5,
+    "step({})": lambda v: (v > 0).to(v.dtype),
+    "sign({})": torch.sign,
+    "sin({})": torch.sin,
+    "cos({})": torch.cos,
+    "exp({})": lambda v: v.clamp(max=LARGEST_EXPONENT).exp(),
+    "relu({})": torch.relu,
+}
 #: Share of the excess error on left-out parts that a guess may leave.
 REMAINS = 0.75
 #: Probability that it predicts a new part better, before all that were tried count.
@@ -44,6 +79,8 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
         Formulas and their log evidence above that of the bare model with its process,
         nats; empty where there is none.
     """
+    if not search.rivals.measurements.is_sequence:
+        return _guess_of_numbers(search)
     bare = search.found[ModelKey()]
     terms = [*_terms(search)]
     least = 1 - (1 - BETTER) / max(len(terms), 1)
@@ -60,6 +97,48 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
         if remains <= REMAINS and gain > MARGIN:
             found.append((name, float(gain)))
     return (*sorted(found, key=lambda each: -each[1]),)
+
+
+def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
+    """Return formulas above a smooth function of the action, the best first."""
+    bare, errors, gains = search.found[ModelKey()].model, search.errors, {}
+    least = smooth_evidence(search)
+    for name, term in _terms(search, of_all=True):
+        model = _with_term(bare, term / search.unit)
+        gains[name] = errors.posterior(model, errors.grams(model.rows)).log_sensor
+    gains = {n: float(g - least) for n, g in gains.items() if g - least > MARGIN}
+    best = sorted(gains, key=gains.__getitem__)[::-1]
+    alike = [n for n in gains if gains[n] > gains[best[0]] - ALIKE]
+    return tuple((n, gains[n]) for n in dict.fromkeys([*alike[:1], *best]))
+
+
+def smooth_evidence(search: Search) -> float:
+    """Return the log evidence of the bare model and a smooth function of the action.
+
+    Args:
+        search: Search that has fitted the bare model.
+    """
+    m, bare = search.rivals.measurements, search.found[ModelKey()].model
+    shift = np.eye(1 + len(bare.u))
+    shift[1:, 0] = -bare.center
+    rows = bare.rows @ shift
+    action = search.rivals.trials.action.double().numpy()
+    action = (action - action.mean(0)) / np.maximum(action.std(0), 1e-300)
+    square = ((action[:, None] - action) ** 2).sum(2)
+    sizes, found = search.errors.sizes[:, None], []
+    for length in LENGTHS:
+        gram, log_det = 0.0, 0.0
+        for channel in np.unique(m.channel):
+            at = np.flatnonzero(m.channel == channel)
+            trial = m.trial[at]
+            values, vectors = eigh(np.exp(-0.5 * square / length**2)[trial][:, trial])
+            variance = 1 + sizes**2 * np.clip(values, 0, None)
+            own = vectors.T @ rows[at]
+            gram = gram + np.einsum("sm,mi,mj->sij", 1 / variance, own, own)
+            log_det = log_det + np.log(variance).sum(1)
+        log_z = integrated(np.asarray(gram), bare, 1.0)[0]
+        found.append(log_z - 0.5 * (log_det + len(m) * LOG_2PI))
+    return float(log_sum_exp(np.concatenate(found)) - np.log(len(found) * len(sizes)))
 
 
 def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
@@ -105,12 +184,19 @@ def _with_term(model: LinearModel, term: Array) -> LinearModel:
     )
 
 
-def _terms(search: Search) -> Iterator[tuple[str, Array]]:
-    """Yield formulas with their values, shape (N,), the simpler of two that are one."""
+def _terms(search: Search, *, of_all: bool = False) -> Iterator[tuple[str, Array]]:
+    """Yield formulas with their values, shape (N,), the simpler of two that are one.
+
+    Args:
+        search: Search that has fitted the bare model.
+        of_all: Whether formulas of all numbers come before those of one channel.
+    """
     m = search.rivals.measurements
     several = int(m.channel.max()) > 0
     labels = search.rivals.trials.channel_labels or ()
     seen: list[Array] = []
+    if of_all and several:
+        yield from _distinct(search, np.ones(len(m), dtype=bool), "", seen)
     for channel in range(int(m.channel.max()) + 1):
         own = m.channel == channel
         where = ""

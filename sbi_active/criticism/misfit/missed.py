@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.record import traced, with_intervals
 from sbi_active.criticism.misfit.refuted import widened
 from sbi_active.criticism.misfit.rule import PASSES
@@ -22,7 +23,6 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.steps.formulas import guess
 
 Array = NDArray[Any]
 
@@ -58,8 +58,8 @@ def beside_misfit(
         # It is no error of a sensor: a process that follows the action is.
         misfit = find_misfit(search, equivalent, is_known=True)
     is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
-    if is_bare and (misfit is None or not timed):
-        tracing = replace(tracing, guesses=guess(rivals))
+    if is_bare and search is not None and (misfit is None or not timed):
+        tracing = replace(tracing, guesses=guess_residual(search))
     if misfit is None:
         return widened(tracing, rivals.seed, _within(rivals)), None
     if not timed and not misfit.replaces(tracing.verdict):

@@ -1,10 +1,20 @@
 """What the residual follows where no declared effect helps."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import multivariate_normal
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism.linear.screening import linear_models
+from sbi_active.criticism.misfit.guesses import (
+    LENGTHS,
+    MARGIN,
+    guess_residual,
+    smooth_evidence,
+)
+from sbi_active.criticism.results import ModelKey
 from sbi_active.simulation import GaussianNoise
 from tests.criticism.misfit.oscillator import (
     EFFECTS,
@@ -14,6 +24,7 @@ from tests.criticism.misfit.oscillator import (
     TIMES,
     trials,
 )
+from tests.criticism.steps.linear_world import ACTION, measured, rivals
 
 FEW = [e for e in EFFECTS if e.name in ("friction", "bias")]
 
@@ -76,3 +87,45 @@ def test_a_guess_says_in_which_channel():
     found = Criticism(model, PRIOR, pair, seed=0)
     assert found.trace().misfit is not None
     assert found.trace().guesses[0][0] == "x^2 in force"
+
+
+def searched(further):
+    """A search of the bare model of trials without a time axis."""
+    some = rivals(measured(further=further))
+    search, _ = linear_models(some)
+    assert search is not None
+    return search
+
+
+def test_a_guess_is_the_term_that_is_missing_of_numbers():
+    found = guess_residual(searched(0.8 * ACTION**3))
+    assert found[0][0] == "xi^3"
+    assert min(gain for _, gain in found) > MARGIN
+
+
+def test_what_no_formula_is_of_numbers_has_no_guess():
+    assert guess_residual(searched(2 * torch.sin(9 * ACTION))) == ()
+    assert guess_residual(searched(0 * ACTION)) == ()
+
+
+def test_the_evidence_of_a_smooth_function_is_that_of_its_covariance():
+    """Against the multivariate normal density, amplitudes and lengths summed out."""
+    search = searched(0.8 * ACTION**3)
+    model = search.found[ModelKey()].model
+    z = search.rivals.trials.action.double().numpy()
+    z = (z - z.mean(0)) / z.std(0)
+    prior = model.jacobian @ np.diag(model.sd**2) @ model.jacobian.T
+    mean = model.residual + model.jacobian @ (model.center - model.u)
+    log_p = [
+        multivariate_normal(
+            np.zeros(len(mean)),
+            prior
+            + np.eye(len(mean))
+            + size**2 * np.exp(-0.5 * (z - z.T) ** 2 / length**2),
+        ).logpdf(mean)
+        for length in LENGTHS
+        for size in search.errors.sizes
+    ]
+    exact = np.logaddexp.reduce(log_p) - np.log(len(log_p))
+    assert not np.isfinite(model.low).any()
+    assert smooth_evidence(search) == pytest.approx(exact, abs=1e-6)
