@@ -164,12 +164,13 @@ class Search:
         """Return the coordinates of the best fits."""
         return {key: c.model.u for key, c in self.found.items()}
 
-    def worthy(self, behind: float) -> list[ModelKey]:
-        """Return the sets of several effects near the best, smaller ones first.
+    def worthy(self) -> list[ModelKey]:
+        """Return the sets of several effects worth a sample, smaller ones first.
 
-        With the sensor's error alone, by log posteriors that are at most so much
-        smaller, nats; among the parts of the best all count.
+        With the sensor's error alone, by log posteriors that are not far behind the
+        best; among the parts of the best all count.
         """
+        behind, most = self.settings.behind, self.settings.num_sampled
         log_p = {key: c.log_p_sensor for key, c in self.found.items()}
         best = max(log_p, key=log_p.__getitem__)
         some = {k for k, v in log_p.items() if v > log_p[best] - behind}
@@ -179,7 +180,7 @@ class Search:
             some |= {*parts}
             todo += parts
         several = [k for k in some if len(k.effects) > 1]
-        return sorted(several, key=lambda k: (len(k.effects), -log_p[k]))
+        return sorted(several, key=lambda k: (len(k.effects), -log_p[k]))[:most]
 
     @property
     def explains(self) -> bool:

@@ -25,10 +25,6 @@ from sbi_active.criticism.steps.influence import needed_trials
 
 Array = NDArray[Any]
 
-#: Nats by which linear evidence puts a set behind the best, so that it is not sampled,
-#: and sets that are sampled at most.
-BEHIND, MOST = 10.0, 8
-
 
 class LinearFits(Protocol):
     """Models linear at their best fits."""
@@ -45,8 +41,8 @@ class LinearFits(Protocol):
         """Return the coordinates of the best fits."""
         ...
 
-    def worthy(self, behind: float) -> list[ModelKey]:
-        """Return sets of several effects near the best, smaller ones first."""
+    def worthy(self) -> list[ModelKey]:
+        """Return sets of several effects worth a sample, smaller ones first."""
         ...
 
 
@@ -94,7 +90,7 @@ class Sampled:
         self.linear.fit_larger()
         self.rivals.best_fits |= self.linear.best_fits()
         found: dict[ModelKey, float] = {}
-        for key in [*self.linear.worthy(BEHIND)[:MOST], *self._noisy(singles)]:
+        for key in [*self.linear.worthy(), *self._noisy(singles)]:
             value = self.log_evidence(key)
             if value > max(map(self.log_evidence, key.parts)) + THRESHOLD:
                 found[key] = value + log_prior(key.effects, prior)
