@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from sbi_active.cli import main, watch
-from tests.page.browser import CHROMIUM, FLAGS, assert_reads_well
+from tests.display.browser import CHROMIUM, FLAGS, assert_reads_well
 
 ROOT = Path(__file__).parents[2]
 #: A campaign that goes on one step with each line that it reads.

@@ -57,7 +57,7 @@ def test_two_rounds_and_what_they_cost(method):
     belief = c.run(measured, num_rounds=2)
     assert float((belief.sample((2_000,)) - 0.7).abs().median()) < 0.25
     for trial in c.history:
-        refined = 300 * (trial.index + 1)
+        refined = REFINEMENT.num_histories * (trial.index + 1)
         parts = 600 + 200 + trial.design.num_simulations
         if method in ("asbi", "nsbi"):  # stops by itself
             assert parts < trial.num_simulations <= parts + 17 * refined
