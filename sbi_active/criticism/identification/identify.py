@@ -21,6 +21,7 @@ from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
+from sbi_active.inference.engine.importance import pareto_shape
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
@@ -134,7 +135,7 @@ def identify(
         *(model, prior, some, beside), known_sd=known_sd, seed=seed, settings=own
     )
     rng = np.random.default_rng(derive_seed(seed, "draws"))
-    u, effective, is_linear = _weighed(found, rng, own)
+    u, effective, shape = _weighed(found, rng, own)
     parts, c = spread(found, own.fewest_parts), found.rival.coordinates
     u = (found.origin + u)[:, : found.rival.theta_dim]
     low, high = c.low[: u.shape[1]], c.high[: u.shape[1]]
@@ -161,7 +162,9 @@ def identify(
             "the model lacks something, and intervals are as wide as they disagree; "
             "ask close_loop what it lacks"
         )
-    if effective < own.fewest:
+    dim = len(names)
+    fewest = max(own.fewest, own.fewest_each * dim * (dim + 3))
+    if shape is not None and (effective < fewest or shape > own.largest_shape):
         notes.append(
             f"{effective:.0f} effective draws: the posterior is not that of a nearly "
             "linear model; use Campaign, or a narrower prior"
@@ -180,7 +183,7 @@ def identify(
             aliases=found.aliases,
             errors=errors,
             disagreement=dict(zip(names, parts.p_value.tolist(), strict=True)),
-            is_linear=is_linear,
+            is_linear=shape is None,
         )
     )
     return belief
@@ -220,11 +223,11 @@ def _with_noise(
 
 def _weighed(
     found: Fitted, rng: np.random.Generator, settings: IdentifySettings
-) -> tuple[Array, float, bool]:
-    """Return draws of u - origin, how many they count for, and if it is linear.
+) -> tuple[Array, float, float | None]:
+    """Return draws of u - origin, how many they count for, and the weights' tail.
 
-    Of effects that were not fitted a chord is all that is known: draws that have one
-    are not compared with the simulator.
+    Its shape is None where the model is linear. Of effects that were not fitted a chord
+    is all that is known: draws that have one are not compared with the simulator.
     """
     own, draws = settings, found.draws
     faint = draws.present.mean(0) <= own.likely
@@ -232,7 +235,7 @@ def _weighed(
     order = rng.permutation(fit if len(fit) >= own.fewest_kept else len(draws.u))
     log_w = _log_ratio(found, order[: own.num_compared])
     if log_w.std() < own.linear:
-        return draws.u.copy(), float(len(draws.u)), True
+        return draws.u.copy(), float(len(draws.u)), None
     some = order[: own.num_weighed]
     log_w = _log_ratio(found, some)
     effective = effective_sample_size(log_w)
@@ -242,7 +245,7 @@ def _weighed(
         power *= 0.8
     u, p = draws.u.copy(), normalized(power * log_w)
     u[order] = u[rng.choice(some, size=len(order), p=p)]
-    return u, effective, False
+    return u, effective, pareto_shape(log_w)
 
 
 def _log_ratio(found: Fitted, at: Array) -> Array:

@@ -91,10 +91,8 @@ def widened(
         if not difference <= allowed:
             break
         found = expected_error(other, draws, rng)
-        # Without bias they differ by what the wider one errs less (Hausman).
-        own = max(difference - (error - found), 0.0)
-        if found + own < least:
-            best, least, bias = other, found + own, own
+        if found < least:
+            best, least, bias = other, found, max(difference - error, 0.0)
     return best, bias
 
 

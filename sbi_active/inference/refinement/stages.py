@@ -94,9 +94,8 @@ class Stages:
         self.least = max(self.own.fewest, 2 * fewest_rows(self.coordinates.dim))
 
     def run(self) -> LearnedBelief:
-        """Return the belief of the last stage."""
-        fitted: Surrogate | None = None
-        stage: Stage | None = None
+        """Return the belief of the last stage, or of one before that errs less."""
+        fitted: list[Surrogate] = []
         while True:
             self._simulate(self._size())
             next_size = self._size()
@@ -108,16 +107,16 @@ class Stages:
                 if not self.course.stages:
                     raise
                 break  # beyond what any parameters explain, closer is no better
-            fitted = surrogate
+            fitted.append(surrogate)
             if stage.error > self.own.small and self.course.stages:
                 stage = self._with_more(stage)
             self.course.append(stage)
             if is_last or self.course.is_settled:
                 break
             self._propose(stage, next_size)
-        assert stage is not None
-        assert fitted is not None
-        return self._learned(stage, fitted)
+        self.course.end_at_best()
+        last = len(self.course.stages) - 1
+        return self._learned(self.course.stages[last], fitted[last])
 
     def contradiction(self) -> Contradiction | None:
         """Return what contradicts at the draw that the last stage explains best."""

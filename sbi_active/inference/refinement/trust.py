@@ -105,17 +105,29 @@ class Course:
 
     small: float
     stages: list[Stage] = field(default_factory=list)
-    divergence: float = np.inf
+    divergences: list[float] = field(default_factory=list)
     shrinkage: float = np.inf
+
+    @property
+    def divergence(self) -> float:
+        """Nats by which the last stage changed the belief; inf of the first."""
+        return self.divergences[-1]
 
     def append(self, stage: Stage) -> None:
         """Record a stage; its particles and residuals replace the last stage's."""
+        self.divergences.append(np.inf)
         if self.stages:
             last = self.stages[-1]
             change = stage.log_prob(stage.draws) - last.log_prob(stage.draws)
-            self.divergence = float(change.mean())
+            self.divergences[-1] = float(change.mean())
             self.shrinkage = last.entropy - stage.entropy
         self.stages.append(stage)
+
+    def end_at_best(self) -> None:
+        """Leave out last stages that err more than one without misfit before them."""
+        errors = [s.error if s.excess <= MISFIT else np.inf for s in self.stages]
+        num = 1 + int(np.argmin(errors)) if np.isfinite(min(errors)) else len(errors)
+        del self.stages[num:], self.divergences[num:]
 
     @property
     def is_settled(self) -> bool:
