@@ -124,10 +124,16 @@ class Course:
         self.stages.append(stage)
 
     def end_at_best(self) -> None:
-        """Leave out last stages that err more than one without misfit before them."""
+        """Leave out last stages that err more than one without misfit before them.
+
+        That one is settled if the stage after it, or it, changed nothing.
+        """
         errors = [s.error if s.excess <= MISFIT else np.inf for s in self.stages]
-        num = 1 + int(np.argmin(errors)) if np.isfinite(min(errors)) else len(errors)
-        del self.stages[num:], self.divergences[num:]
+        best = 1 + int(np.argmin([*errors[1:], np.inf]))
+        if self.stages[-1].error <= self.small or best >= len(errors) - 1:
+            return
+        self.divergences[best] = min(self.divergences[best : best + 2])
+        del self.stages[best + 1 :], self.divergences[best + 1 :]
 
     @property
     def is_settled(self) -> bool:
