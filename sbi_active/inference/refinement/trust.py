@@ -126,11 +126,18 @@ class Course:
     def end_at_best(self) -> None:
         """Leave out last stages that err more than one without misfit before them.
 
-        That one is settled if the stage after it, or it, changed nothing.
+        Unless the stage after that one differs from it by more than its own error: what
+        is missed far off has no part in the expected error. It is settled if the stage
+        after it, or it, changed nothing.
         """
         errors = [s.error if s.excess <= MISFIT else np.inf for s in self.stages]
-        best = 1 + int(np.argmin([*errors[1:], np.inf]))
-        if self.stages[-1].error <= self.small or best >= len(errors) - 1:
+        best = len(errors) - 1
+        for k in range(1, len(errors) - 1):
+            best = k if errors[k] < errors[best] else best
+        if self.stages[-1].error <= self.small or best == len(errors) - 1:
+            return
+        allowed = UNSETTLED * self.stages[-1].draws.shape[1]
+        if self.divergences[best + 1] > allowed + self.stages[best + 1].error:
             return
         self.divergences[best] = min(self.divergences[best : best + 2])
         del self.stages[best + 1 :], self.divergences[best + 1 :]
