@@ -38,9 +38,9 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-#: Nats by which a formula must beat what it stands for to be printed, and those within
-#: which the simpler of two is taken.
-MARGIN, ALIKE = 2.0, 1.0
+#: Nats by which a formula must beat what it stands for to be printed, and a simpler one
+#: to be taken in its place.
+MARGIN = 2.0
 #: Bound on exponents, so that a formula stays finite.
 LARGEST_EXPONENT = 20.0
 #: Cosine short of 1 at which two terms are one.
@@ -108,7 +108,7 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
         gains[name] = errors.posterior(model, errors.grams(model.rows)).log_sensor
     gains = {n: float(g - least) for n, g in gains.items() if g - least > MARGIN}
     best = sorted(gains, key=gains.__getitem__)[::-1]
-    alike = [n for n in gains if gains[n] > gains[best[0]] - ALIKE]
+    alike = [n for n in gains if gains[n] > gains[best[0]] - MARGIN]
     return tuple((n, gains[n]) for n in dict.fromkeys([*alike[:1], *best]))
 
 
