@@ -22,6 +22,7 @@ from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
+from sbi_active.inference.sampling.bandwidth import scott
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
@@ -41,7 +42,7 @@ class IdentifiedBelief(KernelBelief):
     label = "identified"
 
     def __init__(self, prior: Distribution, draws: torch.Tensor) -> None:
-        width = len(draws) ** (-1 / (draws.shape[1] + 4))
+        width = scott(*draws.shape)
         mean = draws.mean(0)
         # Kernels widen what they stand on: draws move in by as much.
         super().__init__(prior, mean + (1 - width**2) ** 0.5 * (draws - mean))

@@ -5,14 +5,10 @@ an entry of the action, an input, the output, its slope, or the time in the tria
 no declared effect helps along trajectories, it is printed if it removes a quarter of
 the excess error on left-out trials, and lowers the error on a new one with a
 probability of .9 beside all that were tried; of numbers without a time axis if its
-evidence is above that of a smooth function of the action,
-
-.. math::
-    C = \sigma^2 (I + s^2 K), \qquad K = e^{-|\Delta\xi|^2 / (2 \ell^2)}
-
-in each channel, with s and :math:`\ell` summed out. Where an effect does help, guesses
-in its place have evidence, against which that of the effect is held. No trial is
-simulated for any of this.
+evidence is above that of a smooth function of the action, or of the order of the
+trials (:mod:`..rivals.residual_process`). Where an effect does help, guesses in its
+place have evidence, against which that of the effect is held. No trial is simulated for
+any of this.
 """
 
 from __future__ import annotations
@@ -32,8 +28,6 @@ from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.rule import predicts_better
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import LOG_2PI
-from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -45,9 +39,6 @@ MARGIN = 2.0
 LARGEST_EXPONENT = 20.0
 #: Cosine short of 1 at which two terms are one.
 SAME = 1e-9
-#: Lengths of a smooth function of the action, in deviations of the actions tried, from
-#: a local misfit to one of all: a factor apart, since its amplitude makes up for half.
-LENGTHS = (0.25, 0.5, 1.0, 2.0)
 #: The simplest first.
 TERMS: dict[str, Callable[[Tensor], Tensor]] = {
     "1": torch.ones_like,
@@ -100,7 +91,10 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
 
 
 def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
-    """Return formulas above a smooth function of the action, the best first."""
+    """Return formulas above the residual process, the best first.
+
+    The simplest of those that it does not beat by the margin comes before it.
+    """
     bare, errors, gains = search.found[ModelKey()].model, search.errors, {}
     least = smooth_evidence(search)
     for name, term in _terms(search, of_all=True):
@@ -113,32 +107,18 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
 
 
 def smooth_evidence(search: Search) -> float:
-    """Return the log evidence of the bare model and a smooth function of the action.
+    """Return the log evidence of the bare model and the residual process, nats.
 
     Args:
         search: Search that has fitted the bare model.
     """
-    m, bare = search.rivals.measurements, search.found[ModelKey()].model
+    bare = search.found[ModelKey()].model
     shift = np.eye(1 + len(bare.u))
     shift[1:, 0] = -bare.center
-    rows = bare.rows @ shift
-    action = search.rivals.trials.action.double().numpy()
-    action = (action - action.mean(0)) / np.maximum(action.std(0), 1e-300)
-    square = ((action[:, None] - action) ** 2).sum(2)
-    sizes, found = search.errors.sizes[:, None], []
-    for length in LENGTHS:
-        gram, log_det = 0.0, 0.0
-        for channel in np.unique(m.channel):
-            at = np.flatnonzero(m.channel == channel)
-            trial = m.trial[at]
-            values, vectors = eigh(np.exp(-0.5 * square / length**2)[trial][:, trial])
-            variance = 1 + sizes**2 * np.clip(values, 0, None)
-            own = vectors.T @ rows[at]
-            gram = gram + np.einsum("sm,mi,mj->sij", 1 / variance, own, own)
-            log_det = log_det + np.log(variance).sum(1)
-        log_z = integrated(np.asarray(gram), bare, 1.0)[0]
-        found.append(log_z - 0.5 * (log_det + len(m) * LOG_2PI))
-    return float(log_sum_exp(np.concatenate(found)) - np.log(len(found) * len(sizes)))
+    rows = search.unit[:, None] * (bare.rows @ shift)
+    grams, log_p = search.rivals.residual_process().grams(rows)
+    log_z = integrated(grams, bare, 1.0)[0] + log_p
+    return float(log_sum_exp(log_z) + np.log(search.unit).sum())  # of sensor deviations
 
 
 def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:

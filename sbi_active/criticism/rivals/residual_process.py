@@ -234,13 +234,41 @@ class ResidualProcess(ErrorModel):
         e = cell.whiten(residual)
         q = (e @ basis.directions) ** 2
         rest = np.maximum(np.einsum("ni,ni->n", e, e) - q.sum(1), 0.0)
-        total = 1 + self.amplitudes[:, None] ** 2 * basis.variances  # (amplitudes, m)
-        square = rest[:, None] + q @ (1 / total).T
-        scales = self.noise.scales
-        log_p = -0.5 * square[..., None] / scales**2 - num * np.log(scales)
-        log_p = log_p - 0.5 * np.log(total).sum(1)[:, None] - cell.log_scale
-        log_p = log_p - 0.5 * num * LOG_2PI + self.noise.log_scale_prior
-        return log_p + basis.log_weight + self._log_amplitude
+        square = rest[:, None] + q @ (1 / self._total(basis)).T
+        log_p = -0.5 * square[..., None] / self.noise.scales**2
+        return log_p + self._log_constant(basis, num)
+
+    def grams(self, rows: Array) -> tuple[Array, Array]:
+        """Return what rows whitened by each process come to, amplitude by amplitude.
+
+        Args:
+            rows: Residual and its derivatives, shape (N, k).
+
+        Returns:
+            Gram matrices, shape (h, k, k), and the log weights of all h with the
+            constants of their densities, shape (h,).
+        """
+        grams, log_p = [], []
+        for basis in self._bases:
+            e = self.noise.cells[basis.cell].whiten(rows.T).T
+            q = basis.directions.T @ e
+            less = 1 - 1 / self._total(basis)
+            gram = e.T @ e - np.einsum("am,mi,mj->aij", less, q, q)
+            gram = gram[:, None] / self.noise.scales[:, None, None] ** 2
+            grams.append(gram.reshape(-1, *gram.shape[2:]))
+            log_p.append(self._log_constant(basis, len(rows)).ravel())
+        return np.concatenate(grams), np.concatenate(log_p)
+
+    def _total(self, basis: _Basis) -> Array:
+        """Return the variance along each direction, shape (amplitudes, m)."""
+        return 1 + self.amplitudes[:, None] ** 2 * basis.variances
+
+    def _log_constant(self, basis: _Basis, num: int) -> Array:
+        """Return log weights and volumes of densities, shape (amplitudes, scales)."""
+        cell, scales = self.noise.cells[basis.cell], self.noise.scales
+        log_det = 0.5 * np.log(self._total(basis)).sum(1)[:, None] + cell.log_scale
+        log_p = self.noise.log_scale_prior - num * (np.log(scales) + 0.5 * LOG_2PI)
+        return log_p - log_det + basis.log_weight + self._log_amplitude
 
 
 def _coordinates(m: Measurements, place: Array, span: float) -> tuple[Array, Array]:

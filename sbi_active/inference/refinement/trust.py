@@ -114,7 +114,7 @@ class Course:
         return self.divergences[-1]
 
     def append(self, stage: Stage) -> None:
-        """Record a stage; its particles and residuals replace the last stage's."""
+        """Record a stage, and by how much it changed the belief."""
         self.divergences.append(np.inf)
         if self.stages:
             last = self.stages[-1]

@@ -9,7 +9,6 @@ from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.guesses import (
-    LENGTHS,
     MARGIN,
     guess_residual,
     smooth_evidence,
@@ -108,24 +107,24 @@ def test_what_no_formula_is_of_numbers_has_no_guess():
     assert guess_residual(searched(0 * ACTION)) == ()
 
 
-def test_the_evidence_of_a_smooth_function_is_that_of_its_covariance():
-    """Against the multivariate normal density, amplitudes and lengths summed out."""
+def test_the_evidence_of_the_residual_process_is_that_of_its_covariances():
+    """Against normal densities of what the linear model leaves, all summed out."""
     search = searched(0.8 * ACTION**3)
-    model = search.found[ModelKey()].model
-    z = search.rivals.trials.action.double().numpy()
-    z = (z - z.mean(0)) / z.std(0)
+    model, process = search.found[ModelKey()].model, search.rivals.residual_process()
     prior = model.jacobian @ np.diag(model.sd**2) @ model.jacobian.T
     mean = model.residual + model.jacobian @ (model.center - model.u)
+    num = len(mean)
+    whiteners, log_weight = process.grams(np.diag(search.unit))
     log_p = [
-        multivariate_normal(
-            np.zeros(len(mean)),
-            prior
-            + np.eye(len(mean))
-            + size**2 * np.exp(-0.5 * (z - z.T) ** 2 / length**2),
-        ).logpdf(mean)
-        for length in LENGTHS
-        for size in search.errors.sizes
+        multivariate_normal(np.zeros(num), prior + np.linalg.inv(precision)).logpdf(
+            mean
+        )
+        for precision in whiteners
     ]
-    exact = np.logaddexp.reduce(log_p) - np.log(len(log_p))
+    # The weights hold the constants of the densities in the process's metric.
+    volume = 0.5 * np.linalg.slogdet(whiteners)[1] - 0.5 * num * np.log(2 * np.pi)
+    log_weight = log_weight + np.log(search.unit).sum() - volume
+    assert np.logaddexp.reduce(log_weight) == pytest.approx(0, abs=1e-6)
+    exact = np.logaddexp.reduce(np.array(log_p) + log_weight)
     assert not np.isfinite(model.low).any()
     assert smooth_evidence(search) == pytest.approx(exact, abs=1e-6)
