@@ -39,6 +39,7 @@ def search(
     span: Array,
     *,
     floor: float = 0.0,
+    most_shifted: int = 66,
 ) -> list[tuple[Combination, float]]:
     r"""Return combinations that are known though their parameters are not.
 
@@ -54,6 +55,8 @@ def search(
         low: Smallest value of each parameter under the prior, shape (d,).
         span: Range of each under the prior, shape (d,).
         floor: Width below which combinations are as good as each other.
+        most_shifted: Pairs of which a shift is looked for at most, the narrowest first:
+            all of twelve parameters. Each takes some 50 ms.
 
     Returns:
         Each with its width; empty where there are none.
@@ -85,10 +88,11 @@ def search(
     sizes = (2, 3) if len(plain) <= MOST_TRIPLES else (2,)
     for size in sizes:
         ranked = _ranked(moments, open_parameters, size, low)
-        for best, subset in ranked:
+        for rank, (best, subset) in enumerate(ranked):
             if len(rows) >= len(plain) - 1:
                 return found
-            if best > (WORTH_A_SHIFT if size == 2 else KNOWN):
+            worth = WORTH_A_SHIFT if size == 2 and rank < most_shifted else KNOWN
+            if best > worth:
                 break
             known_pair = any({*c.index} <= {*subset} for c, _ in found)
             if not known_pair:

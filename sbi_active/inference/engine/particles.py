@@ -8,6 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.inference.engine.bounded import (
+    LinearResponse,
+    LineMoves,
+    led_between,
+)
 from sbi_active.inference.engine.fit import Fit
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.pool import Pool
@@ -80,14 +85,34 @@ def led_particles(
 
     fixed = _log_free(potential, free, rng) if free.any() else 0.0
     num = int(settings.per_parameter * len(axes) * settings.num_effective)
-    moved = bridge(
-        lambda u: potential.log_prior(whole(u)) - fixed,
-        lambda u: potential.log_likelihood(whole(u)),
-        own,
-        rng,
-        num_particles=max(num, settings.fewest_particles),
-        most=settings.budget(len(axes)) / potential.num_trials,
-    )
+    most = settings.budget(len(axes)) / potential.num_trials
+    num = max(int(min(num, most / settings.passes)), settings.fewest_particles)
+
+    def log_prior(u: Array) -> Array:
+        return potential.log_prior(whole(u)) - fixed
+
+    def log_likelihood(u: Array) -> Array:
+        return potential.log_likelihood(whole(u))
+
+    c = potential.coordinates
+    drawn = own.sample(num, rng)
+    cut = (drawn < c.low[axes]) | (drawn > c.high[axes])
+    if cut.any(1).mean() < settings.most_cut:
+        moved = bridge(
+            log_prior, log_likelihood, own, rng, num_particles=num, most=most
+        )
+    else:
+        low, high = c.low[axes], c.high[axes]
+        response = LinearResponse(potential, found, axes)
+        moved = led_between(
+            log_prior,
+            log_likelihood,
+            response,
+            LineMoves(response, low, high, c.precision[axes]),
+            np.clip(potential.sample_prior(num, rng)[:, axes], low, high),
+            rng,
+            most=most,
+        )
     if moved is None:
         return None
     u = moved.u

@@ -64,6 +64,12 @@ class Settings:
         per_parameter: Particles a parameter of sequential Monte Carlo, in effective
             draws.
         fewest_particles: Particles at least.
+        passes: Likelihoods a particle that the rows are to suffice for: there are no
+            more particles than that leaves. Half has twice as many, which may get
+            nowhere; twice as many steps are hardly ever taken.
+        most_cut: Share of the normal guess outside the bounds of the prior, beyond
+            which particles are led between them; with .5 more is computed, and with
+            .99 SMC begins at a handful.
         num_ridge: Places along a ridge, beside draws that are known. Half leaves gaps
             in one of two dimensions.
         num_ridged: Proposals along ridges before others are fitted.
@@ -107,6 +113,8 @@ class Settings:
     max_heavy: int = 3
     per_parameter: float = 0.8
     fewest_particles: int = 400
+    passes: float = 60.0
+    most_cut: float = 0.9
     num_ridge: int = 32
     num_ridged: int = 3
     reach: float = 4.0

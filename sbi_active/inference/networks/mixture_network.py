@@ -24,6 +24,8 @@ GLOBAL_LOGIT = -3.0
 #: From where on batched matrices are faster than products and sums, whose room grows
 #: with the square.
 FEW_DIMENSIONS = 12
+#: Numbers of the factors of draws in memory at once, 40 MB.
+MOST_FACTORS = 10_000_000
 ACTIVATIONS = {"silu": nn.SiLU, "relu": nn.ReLU}
 
 
@@ -202,16 +204,12 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         row = torch.arange(batch, device=logits.device).expand(component.shape)
         factor = upper + torch.diag_embed(log_diagonal.exp())
         noise = torch.randn(*component.shape, self._dim, 1, device=logits.device)
-        step = torch.linalg.solve_triangular(
-            factor[row, component], noise.to(logits.dtype), upper=True
-        ).squeeze(-1)
+        step = _solved(factor, row, component, noise.to(logits.dtype)[..., 0])
         v = mean[row, component] + step
         if self.conditioning is None or frames is None:
             return v * self.theta_scale + self.theta_mean
         frame = torch.tensor(self._frame_of, device=logits.device)[component]
-        factor = frames.factor[row, frame]
-        step = torch.linalg.solve_triangular(factor, v.double()[..., None], upper=True)
-        u = frames.mean[row, frame] + step.squeeze(-1)
+        u = frames.mean[row, frame] + _solved(frames.factor, row, frame, v.double())
         return self.conditioning.unwhiten(u).to(logits.dtype)
 
     def prepare(self, theta: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
@@ -324,3 +322,12 @@ def _location_and_scale(rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     # A constant column carries nothing: dividing by one keeps it at zero.
     scale = torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
     return mean.float(), scale.float()
+
+
+def _solved(factor: Tensor, row: Tensor, which: Tensor, right: Tensor) -> Tensor:
+    """Return solutions (..., d) of upper factors [row, which] for right sides."""
+    most = max(1, MOST_FACTORS // (row[0].numel() * right.shape[-1] ** 2))
+    parts = [part.split(most) for part in (row, which, right[..., None])]
+    solve = torch.linalg.solve_triangular
+    steps = [solve(factor[r, k], e, upper=True) for r, k, e in zip(*parts, strict=True)]
+    return torch.cat(steps)[..., 0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ SHARE = 0.5  # particles that a step leaves effective
 MAX_STEPS = 200
 ACCEPTED = 0.35  # share of moves that the step's length is adapted to
 FORGOTTEN = 0.05  # correlation with the start after the moves of a step
+SHARED = 0.1  # more of them after the last step, by what families share
 SHRUNK = 0.05  # share of the guess's covariance in that of the particles
 
 
@@ -38,7 +39,8 @@ class Bridged:
         standard_error: Of log_evidence.
         effective_sample_size: Of the particles, by families and what moves forgot.
         acceptance: Of the last moves.
-        memory: Correlation with where the last moves began.
+        memory: Largest correlation with where the moves of a step began; those of the
+            last may end sooner, where its particles share little.
         num_steps: Between the two densities.
     """
 
@@ -60,6 +62,7 @@ def bridge(
     *,
     num_particles: int,
     most: float = np.inf,
+    moves: Moves | None = None,
     max_moves: int = 100,
     forgotten: float = FORGOTTEN,
 ) -> Bridged | None:
@@ -72,14 +75,7 @@ def bridge(
         \log Z = \sum_k \log \frac1n \sum_i
         \Bigl(\frac{p L}{q}\Bigr)^{b_{k+1} - b_k}(u_i),
 
-    and are moved at each step by proposals that a normal :math:`N(m, C)` of their own
-    moments is invariant to,
-
-    .. math::
-        u' = m + \sqrt{1 - s^2}\,(u - m) + s\, C^{1/2} e,
-
-    so that on a normal density each is accepted and none costs more in more dimensions.
-    Where q is close, one step suffices.
+    and are moved at each step. Where q is close, one step suffices.
 
     Args:
         log_prior: Log p, (n, d) -> (n,).
@@ -88,6 +84,7 @@ def bridge(
         rng: Source of randomness.
         num_particles: n.
         most: Evaluations of the likelihood at most.
+        moves: Proposals; None takes :class:`NormalMoves`.
         max_moves: A step.
         forgotten: Correlation with where they were that ends the moves of a step. At
             half the evidence is not known better; at .5 particles lag behind, and in 20
@@ -110,10 +107,10 @@ def bridge(
     n = num_particles
     u = guess.sample(n, rng)
     target, start = densities(u)
-    guessed = np.atleast_2d(np.cov(u.T))
-    log_z = variance = b = spent = 0.0
-    spent += n
-    length, acceptance = 1.0, 1.0
+    moves = NormalMoves(u) if moves is None else moves
+    log_z = variance = b = memory = 0.0
+    spent = n
+    acceptance = 1.0
     step = 0
     while step < MAX_STEPS:
         step += 1
@@ -127,45 +124,111 @@ def bridge(
         log_z += float(log_sum_exp(log_w) - np.log(n))
         weight = normalized(log_w)
         variance += max(n * float((weight**2).sum()) - 1, 0.0) / n
-        mean = weight @ u
-        cov = (weight[:, None] * (u - mean)).T @ (u - mean)
-        cov = (1 - SHRUNK) * cov + SHRUNK * guessed * min(1.0, _size(cov, guessed))
+        moves.begin(u, weight, power)
         which = systematic(weight, n, rng.random())
         family = np.bincount(which, minlength=n)
+        shared = float((family.astype(float) ** 2).sum() / n - 1)
         u, target, start, b = u[which], target[which], start[which], power
-        factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
         kept = 1.0
         for _ in range(max_moves):
-            new = mean + np.sqrt(1 - length**2) * (u - mean)
-            new = new + length * rng.standard_normal(u.shape) @ factor.T
+            # Of the last step's particles all count, but for what they share.
+            if kept <= forgotten or (b == 1 and kept**2 * shared <= SHARED):
+                break
+            new, gain = moves.propose(u, rng)
             new_target, new_start = densities(new)
             spent += n
             with np.errstate(invalid="ignore"):
-                gain = b * (new_target - target) + (1 - b) * (new_start - start)
-            gain = gain + log_normal(u, mean, factor) - log_normal(new, mean, factor)
+                gain = gain + b * (new_target - target)
+                if b < 1:
+                    gain = gain + (1 - b) * (new_start - start)
             accept = np.log(rng.random(n)) < np.where(np.isnan(gain), -np.inf, gain)
-            u = np.where(accept[:, None], new, u)
+            before, u = u, np.where(accept[:, None], new, u)
             target = np.where(accept, new_target, target)
             start = np.where(accept, new_start, start)
             acceptance = float(accept.mean())
-            kept *= 1 - acceptance * (1 - np.sqrt(1 - length**2))
-            length = length * np.exp(acceptance - ACCEPTED)
-            length = float(np.clip(length, 0.02, 1.0))
-            if kept <= forgotten:
-                break
+            kept *= moves.remembered(before, u, acceptance)
             if spent > most:
                 break
         if spent > most and b < 1:
             return None
+        memory = max(memory, kept if b < 1 or kept**2 * shared > SHARED else 0.0)
         if b == 1:
             break
     else:
         return None
-    shared = float((family.astype(float) ** 2).sum() / n - 1)
     effective = n / (1 + kept**2 * shared)
     log_l = target - log_prior(u)
     error = float(np.sqrt(2 * variance + 1e-12))
-    return Bridged(u, log_l, log_z, error, effective, acceptance, kept, step)
+    return Bridged(u, log_l, log_z, error, effective, acceptance, memory, step)
+
+
+class Moves(Protocol):
+    """Proposals of sequential Monte Carlo, reversible under a density of their own."""
+
+    def begin(self, u: Array, weight: Array, power: float) -> None:
+        """Prepare the moves of a step.
+
+        Args:
+            u: Particles, shape (n, d).
+            weight: Their weights at this step, which sum to 1, shape (n,).
+            power: Of the target at this step.
+        """
+        ...
+
+    def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return where particles may go (n, d), and the log ratio of own densities.
+
+        That of where they are over that of where they go, shape (n,).
+        """
+        ...
+
+    def remembered(self, before: Array, after: Array, acceptance: float) -> float:
+        """Return the correlation across a move, and adapt to its acceptance.
+
+        Args:
+            before: Particles, shape (n, d).
+            after: Where they are after it, shape (n, d).
+            acceptance: Share of them that moved.
+        """
+        ...
+
+
+class NormalMoves:
+    r"""Moves that a normal N(m, C) of the particles' moments is invariant to.
+
+    .. math::
+        u' = m + \sqrt{1 - s^2}\,(u - m) + s\, C^{1/2} e,
+
+    so that on a normal density each is accepted and none costs more in more dimensions.
+
+    Args:
+        start: Particles of the first density, shape (n, d).
+    """
+
+    def __init__(self, start: Array) -> None:
+        self._guessed, self._length = np.atleast_2d(np.cov(start.T)), 1.0
+
+    def begin(self, u: Array, weight: Array, power: float) -> None:
+        """Take the moments of weighted particles."""
+        self._mean = weight @ u
+        off = u - self._mean
+        cov, guessed = (weight[:, None] * off).T @ off, self._guessed
+        cov = (1 - SHRUNK) * cov + SHRUNK * guessed * min(1.0, _size(cov, guessed))
+        self._factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
+
+    def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return where particles may go, and the log ratio of the normal densities."""
+        mean, factor, length = self._mean, self._factor, self._length
+        new = mean + np.sqrt(1 - length**2) * (u - mean)
+        new = new + length * rng.standard_normal(u.shape) @ factor.T
+        return new, log_normal(u, mean, factor) - log_normal(new, mean, factor)
+
+    def remembered(self, before: Array, after: Array, acceptance: float) -> float:
+        """Return the correlation across a move, and adapt its length."""
+        kept = 1 - acceptance * (1 - np.sqrt(1 - self._length**2))
+        length = self._length * np.exp(acceptance - ACCEPTED)
+        self._length = float(np.clip(length, 0.02, 1.0))
+        return float(kept)
 
 
 def _power(ratio: Array, b: float, num: int) -> float:

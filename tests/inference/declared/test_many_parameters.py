@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from scipy.stats import norm
 from torch.distributions import Independent, LogNormal, MultivariateNormal, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
@@ -176,3 +177,35 @@ def test_many_numbers_of_a_trial_are_not_regressed():
     theta = belief.sample((4_000,)).double()
     assert bool(((theta.mean(0) - exact.mean).abs() < 0.1 * sd).all())
     assert bool(((theta.std(0) / sd - 1).abs() < 0.1).all())
+
+
+def test_bounds_cut_a_posterior_along_thirty_axes():
+    # Sums of two uniform numbers are measured: pairs are independent.
+    pairs, sd = 15, 0.1
+    x = torch.linspace(0.05, 1.95, pairs)[None]
+
+    def sums(theta, action):
+        return theta[:, ::2] + theta[:, 1::2]
+
+    prior = BoxUniform(torch.zeros(2 * pairs), torch.ones(2 * pairs))
+    simulator = SimulatorModel(sums, noise=GaussianNoise(sd))
+    belief = refine(simulator, prior, torch.zeros(1, 1), x, seed=0)
+    with forked_generators(0):
+        theta = belief.sample((4_000,)).double().numpy()
+    one = (np.arange(400) + 0.5) / 400
+    a, b = np.meshgrid(one, one)
+    log_evidence = 0.0
+    for j, seen in enumerate(x[0].tolist()):
+        density = norm.pdf(seen, a + b, sd)
+        log_evidence += np.log(density.mean())
+        weight = density / density.sum()
+        mean = (weight * a).sum()
+        width = np.sqrt((weight * (a - mean) ** 2).sum())
+        correlation = (weight * (a - mean) * (b - mean)).sum() / width**2
+        own = theta[:, 2 * j : 2 * j + 2]
+        assert np.abs(own.mean(0) - mean).max() < 0.15 * width
+        assert own.std(0) == pytest.approx([width, width], rel=0.1)
+        assert np.corrcoef(own.T)[0, 1] == pytest.approx(correlation, abs=0.1)
+    assert isinstance(belief, SimulatedBelief)
+    assert belief.log_evidence == pytest.approx(log_evidence, abs=1.5)
+    assert len(np.unique(theta[:, 0])) > 500
