@@ -59,6 +59,11 @@ class GainEvaluator:
         return self._chosen
 
     @property
+    def is_summarized(self) -> bool:
+        """Whether summaries stand for outcomes."""
+        return getattr(self.sampler, "summaries", None) is not None
+
+    @property
     def bound(self) -> Bound:
         """Side of the information that the estimates lie on.
 
@@ -83,8 +88,18 @@ class GainEvaluator:
             if self.num_others and model is not None:
                 model = JointLikelihood(model, self.sampler.action.shape[1])
             self._chosen, self.notes = choose_estimator(model, first)
+            own = self.sampler
+            if (
+                isinstance(own, CandidateSampler)
+                and own.summaries is not None
+                and self._chosen.needs_model  # which was learned from whole outcomes
+            ):
+                own.summaries = None
+                own.rewind()
+                first = own.draw(num_samples, index, replicates=replicates)
         else:
             self.notes = self._chosen.problems(first)
+        self.notes += getattr(self.sampler, "notes", [])
         self.replicates = first.replicate is not None
         return first
 
@@ -108,6 +123,5 @@ class GainEvaluator:
         if self.num_others:
             return self.estimator.cautions(gain)
         with single_thread():
-            return disagreements(
-                self.estimator, self.model, simulations, self.belief, gain
-            )
+            model = None if self.is_summarized else self.model
+            return disagreements(self.estimator, model, simulations, self.belief, gain)

@@ -39,6 +39,8 @@ class Selection:
         early: Whether candidates begin with half of them.
         workers: Of the simulations.
         seed: Of everything random.
+        most_numbers: Number of an outcome's numbers beyond which summaries stand for
+            them.
     """
 
     target: Target
@@ -48,6 +50,7 @@ class Selection:
     early: bool
     workers: Workers
     seed: int
+    most_numbers: float
 
     def by_simulation(self, others: Tensor, budget: int | None) -> Design:
         """Return the design of one action, given others (p, action_dim) under way.
@@ -68,7 +71,9 @@ class Selection:
         probed = listed
         if probed is None:
             probed = actions.sample((16,), seed=derive_seed(self.seed, "probed"))
-        sampler, estimator = target.sampler(probed, others, self.seed, self.workers)
+        sampler, estimator = target.sampler(
+            probed, others, self.seed, self.workers, most_numbers=self.most_numbers
+        )
         evaluator = GainEvaluator(sampler, estimator, target.model, target.belief)
         num_samples = max(8, self.num_samples // SHARE // 4 * 4)
         action = self.search.finalists(

@@ -104,9 +104,17 @@ class Target:
         return estimator
 
     def sampler(
-        self, action: Tensor, others: Tensor, seed: int, workers: Workers
+        self,
+        action: Tensor,
+        others: Tensor,
+        seed: int,
+        workers: Workers,
+        *,
+        most_numbers: float,
     ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None]:
         """Return what draws outcomes of candidates (a, action_dim), and the estimator.
+
+        Outcomes with more than so many numbers are summarized where noise allows.
 
         Raises:
             ValueError: If other outcomes have no place in the target or the estimator.
@@ -133,7 +141,9 @@ class Target:
                 "time without pending ones"
             )
         sampler = CandidateSampler(
-            self.simulator, self.belief, action, seed, workers, others
+            *(self.simulator, self.belief, action, seed, workers, others),
+            # A model was learned from whole outcomes.
+            most_numbers=float("inf") if learns else most_numbers,
         )
         return sampler, estimator
 

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 
 from sbi_active.information_gain.base import CandidateSimulations
 from sbi_active.information_gain.joint import join_outcomes
+from sbi_active.information_gain.summaries import LinearSummaries
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation import (
     MissingRowsWarning,
@@ -21,6 +22,7 @@ from sbi_active.simulation import (
     SimulatorModel,
     simulate,
 )
+from sbi_active.simulation.noise.whitening import is_known_gaussian
 from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
@@ -40,6 +42,9 @@ class CandidateSampler:
         others: Actions whose outcomes will be known as well, shape (p, action_dim);
             every draw then holds joint outcomes
             (:func:`.join_outcomes`). None for none.
+        most_numbers: Number of an outcome's numbers beyond which
+            :class:`.LinearSummaries` stand for them, where noise is declared that
+            allows for it; infinite keeps all.
 
     Attributes:
         action: Candidates, to which more may be added between draws.
@@ -47,6 +52,7 @@ class CandidateSampler:
             not change from run to run.
         num_drawn: Simulations so far.
         num_missing: Those of them lost to faults of the simulator.
+        summaries: What stands for the numbers of an outcome; None keeps all.
     """
 
     def __init__(
@@ -57,6 +63,8 @@ class CandidateSampler:
         seed: int,
         workers: Workers = IN_PROCESS,
         others: Tensor | None = None,
+        *,
+        most_numbers: float = float("inf"),
     ) -> None:
         self.simulator, self.belief = simulator, belief
         self.action, self.seed = action, seed
@@ -65,6 +73,11 @@ class CandidateSampler:
         self.num_drawn = self.num_missing = 0
         self._num_waves = 0
         self.declared = self._probe()
+        self.summaries: LinearSummaries | None = None
+        noise = getattr(simulator, "noise", None)
+        many = self.declared and self._num_numbers > most_numbers
+        if many and noise is not None and is_known_gaussian(noise):
+            self.summaries = LinearSummaries(noise)
 
     def draw(
         self, num_samples: int, candidates: Tensor, *, replicates: bool
@@ -88,6 +101,13 @@ class CandidateSampler:
             return self.draw(num_samples, candidates, replicates=replicates)
         return drawn
 
+    @property
+    def notes(self) -> list[str]:
+        """What stands for an outcome, where not all of its numbers do."""
+        if self.summaries is None:
+            return []
+        return [self.summaries.note(self._num_numbers)]
+
     def rewind(self) -> None:
         """Repeat the parameters and the noise of the first draw in the next."""
         self._num_waves = 0
@@ -101,24 +121,35 @@ class CandidateSampler:
         run. The label is the seeds': outcomes that are joined have noise of their own.
         """
         num = len(theta)
-        rows = theta.repeat(len(action), 1), action.repeat_interleave(num, 0)
-        shape = (len(action), num)
 
-        def run(simulator: Callable[..., Any], key: str) -> tuple[Tensor, Tensor]:
+        def run(
+            simulator: Callable[..., Any], action: Tensor, key: str
+        ) -> tuple[Tensor, Tensor]:
             seed = derive_seed(self.seed, label + key, self._num_waves)
-            drawn = self._simulate(simulator, rows, seed)
+            drawn = self._simulate(simulator, _rows(theta, action), seed)
             self.num_drawn += len(drawn)
             self.num_missing += drawn.counts["missing"]
+            shape = (len(action), num)
             x = drawn.x.reshape(*shape, *drawn.x.shape[1:])
             return x, (drawn.status == Outcome.MISSING).reshape(shape)
 
         if self.declared:
             assert isinstance(self.simulator, SimulatorModel)
-            noise = self.simulator.noise
+            noise, short = self.simulator.noise, self.summaries
             assert noise is not None
-            mean, missing = run(self.simulator.mean, "x")
-            if self._num_waves == 1 and self._lost_by_luck(rows, mean.flatten(0, 1)):
-                return None
+            means, lost = [], []
+            # Of many numbers, those of one action at a time are in memory.
+            for some in action.split(len(action) if short is None else 1):
+                mean, missing = run(self.simulator.mean, some, "x")
+                rows = _rows(theta, some)
+                outcomes = mean.flatten(0, 1)
+                if self._num_waves == 1 and self._lost_by_luck(rows, outcomes):
+                    return None
+                if short is not None:
+                    mean, noise = short(some[0], mean[0])[None], short.noise
+                means.append(mean)
+                lost.append(missing)
+            mean, missing = torch.cat(means), torch.cat(lost)
             noise_seed = derive_seed(self.seed, label + "noise", self._num_waves)
             if label:  # they are not compared but measured together
                 seeds = row_seeds(noise_seed, len(action) * num)
@@ -128,10 +159,10 @@ class CandidateSampler:
             return CandidateSimulations(
                 theta, action, x, mean, noise, missing=_if_any(missing)
             )
-        x, missing = run(self.simulator, "x")
+        x, missing = run(self.simulator, action, "x")
         again = None
         if paired:
-            again, lost = run(self.simulator, "again")
+            again, lost = run(self.simulator, action, "again")
             missing |= lost
         return CandidateSimulations(
             theta, action, x, replicate=again, missing=_if_any(missing)
@@ -168,6 +199,7 @@ class CandidateSampler:
             return self._simulate(simulator, (theta, action), seed).x
 
         x = run(self.simulator, "first")
+        self._num_numbers = x[0].numel()
         require_noise(x, run(self.simulator, "second"))
         model = self.simulator
         if not isinstance(model, SimulatorModel) or model.noise is None:
@@ -192,6 +224,11 @@ class _Reproducible:
     def __call__(self, theta: Tensor, action: Tensor) -> Tensor:
         same = self.model.is_deterministic(theta, action)
         return torch.full((len(theta), 1), float(same))
+
+
+def _rows(theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Return parameters and actions of every row, action by action."""
+    return theta.repeat(len(action), 1), action.repeat_interleave(len(theta), 0)
 
 
 def _if_any(missing: Tensor) -> Tensor | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -57,8 +58,33 @@ class Spread:
     def root(self) -> Tensor:
         """Return the lower Cholesky factor of C, shape (q, q)."""
         covariance = (1 - self.share) * self.z.T @ self.z / len(self.z)
-        diagonal = torch.full_like(self.scale, self.share).clamp_min(FLOOR).diag()
+        diagonal = torch.full_like(self.scale, self._least).diag()
         return self.scale[:, None] * torch.linalg.cholesky(covariance + diagonal)
+
+    def log_normal(self, x: Tensor) -> float:
+        r"""Return the log density of N(mean, C) at x (q,), without its constant.
+
+        With more numbers than rows from their products,
+        :math:`(\lambda I + Z^\top Z)^{-1} = \lambda^{-1}
+        (I - Z^\top (\lambda I + Z Z^\top)^{-1} Z)`.
+        """
+        n, q = self.z.shape
+        off, scale = x - self.mean, self.scale.log().sum()
+        if q <= n:
+            root = self.root()
+            z = torch.linalg.solve_triangular(root, off[:, None], upper=False)
+            return float(-0.5 * z.square().sum() - root.diagonal().log().sum())
+        rows, off = self.z * ((1 - self.share) / n) ** 0.5, off / self.scale
+        inner = rows @ rows.T + self._least * torch.eye(n, dtype=rows.dtype)
+        root, along = torch.linalg.cholesky(inner), rows @ off
+        part = torch.linalg.solve_triangular(root, along[:, None], upper=False)
+        square = (off.square().sum() - part.square().sum()) / self._least
+        volume = root.diagonal().log().sum() + 0.5 * (q - n) * math.log(self._least)
+        return float(-0.5 * square - volume - scale)
+
+    @property
+    def _least(self) -> float:
+        return max(self.share, FLOOR)
 
 
 def _shrunk(z: Tensor) -> tuple[float, Tensor]:

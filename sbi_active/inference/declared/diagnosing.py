@@ -13,6 +13,7 @@ from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
 from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation.noise.whitening import is_known_gaussian
 
 Array = NDArray[Any]
 
@@ -138,23 +139,35 @@ def _tail_probability(
     References:
         Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
     """
-    noise, size = likelihood.noise, len(theta) * NUM_REPEATS
+    size, tail = len(theta) * NUM_REPEATS, []
     total_observed, total_simulated = np.zeros(size), np.zeros(size)
-    tail = []
-    for k, (action, x) in enumerate(zip(likelihood.action, likelihood.x, strict=True)):
+    for k, x in enumerate(likelihood.x):
         observed = np.repeat(likelihood.terms(theta, k), NUM_REPEATS)
         simulated = np.zeros(size)
         if bool(x.isfinite().any()):
-            mean = torch.from_numpy(likelihood.table.mean(theta, action)[0])
-            mean = mean.repeat_interleave(NUM_REPEATS, 0)
             with forked_generators(derive_seed(seed, "tail", k)):
-                draws = noise.sample(mean).double()
-            draws = torch.where(x.isfinite(), draws, torch.nan)
-            simulated = noise.log_prob(draws, mean).double().numpy()
+                simulated = _noise_terms(likelihood, theta, k)
         tail.append(_share(simulated <= observed))
         total_observed += observed
         total_simulated += simulated
     return [*tail, _share(total_simulated <= total_observed)]
+
+
+def _noise_terms(likelihood: SimulatedLikelihood, theta: Tensor, trial: int) -> Array:
+    """Return log densities of draws of a trial's noise where it is seen, shape (n r,).
+
+    Those of Gaussian noise are its peak less half a chi-square.
+    """
+    noise, x = likelihood.noise, likelihood.x[trial]
+    if is_known_gaussian(noise):
+        freedom = torch.tensor(0.5 * float(x.isfinite().sum()))
+        half = torch.distributions.Gamma(freedom.double(), 1.0)
+        drawn = half.sample(torch.Size([len(theta) * NUM_REPEATS]))
+        return likelihood.peak[trial] - drawn.numpy()
+    mean = torch.from_numpy(likelihood.table.mean(theta, likelihood.action[trial])[0])
+    mean = mean.repeat_interleave(NUM_REPEATS, 0)
+    draws = torch.where(x.isfinite(), noise.sample(mean).double(), torch.nan)
+    return noise.log_prob(draws, mean).double().numpy()
 
 
 def _share(exceeds: NDArray[np.bool_]) -> float:

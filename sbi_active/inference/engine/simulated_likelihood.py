@@ -68,7 +68,8 @@ class MeanTable:
         lost = np.array([x is None for x in found])
         shape = next((x.shape for x in found if x is not None), (1,))
         gap = np.full(shape, np.nan)
-        return np.stack([gap if x is None else x for x in found]), lost
+        mean = np.stack([gap if x is None else x for x in found])
+        return mean.astype(np.float64), lost
 
     def _simulate(self, theta: Tensor, action: Tensor) -> list[Array | None]:
         self.num_simulations += len(theta)
@@ -89,7 +90,7 @@ class MeanTable:
                 return [None] * len(theta)
         missing = (rows.status == Outcome.MISSING).tolist()
         self.num_missing += sum(missing)
-        x = rows.x.double().numpy()
+        x = rows.x.numpy()  # kept as it was simulated, in single precision
         return [None if gone else row for gone, row in zip(missing, x, strict=True)]
 
 

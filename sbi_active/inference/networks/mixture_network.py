@@ -105,6 +105,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
                 scaling=scaling,
                 whiten=whiten,
                 baseline=baseline,
+                most_numbers=200 if embedding_net is None else math.inf,
             )
         embedding = embedding_net or nn.Identity()
         with torch.no_grad():
@@ -136,7 +137,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         if self.num_frames > 1 and num > 1:
             with torch.no_grad():
                 last.bias[num - 1] = GLOBAL_LOGIT
-        mean, scale = _location_and_scale(condition, ~missing)
+        some = slice(0 if conditioning is not None else None)  # else not used
+        mean, scale = _location_and_scale(condition[some], ~missing[some])
         self.register_buffer("condition_mean", mean)
         self.register_buffer("condition_scale", scale)
         mean, scale = _location_and_scale(theta, torch.ones_like(theta).bool())

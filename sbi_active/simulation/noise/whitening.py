@@ -6,6 +6,13 @@ from torch import Tensor
 
 from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise, chained
 from sbi_active.simulation.noise.base import NoiseModel, declared_sds
+from sbi_active.simulation.noise.gaussian import GaussianNoise
+
+
+def is_known_gaussian(noise: NoiseModel | None) -> bool:
+    """Return whether noise is Gaussian and nothing of it is unknown."""
+    gaussian = isinstance(noise, GaussianNoise | AutocorrelatedNoise)
+    return gaussian and noise.posterior is None
 
 
 def whitened(noise: NoiseModel, value: Tensor) -> Tensor:

@@ -1,0 +1,80 @@
+"""Outcomes with many numbers, of which a network sees a few directions."""
+
+import torch
+from torch.distributions import MultivariateNormal
+
+from sbi_active.inference.networks.conditioning import Conditioning
+from sbi_active.inference.networks.directions import Directions
+from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.inference.networks.training import (
+    TrainingBudget,
+    train_mixture_density,
+)
+from sbi_active.seeding import forked_generators
+
+NUM, SD = 300, 2.0
+TIMES = torch.linspace(0.1, 1.0, NUM)
+BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
+ALL_ROWS = {"scaling": "action", "whiten": True, "baseline": "best"}
+
+
+def rows(num: int, seed: int):
+    with forked_generators(seed):
+        theta, action = torch.randn(num, 2), 0.5 + torch.rand(num, 1)
+        x = action * (theta @ BASIS) + SD * torch.randn(num, NUM)
+    return theta, torch.cat([x, action], 1)
+
+
+def exact(theta, condition):
+    x, action = condition.double().split([NUM, 1], 1)
+    slope = action[:, :, None] * BASIS.double().T / SD
+    precision = torch.eye(2).double() + slope.mT @ slope
+    pull = slope.mT @ (x / SD)[..., None]
+    mean = torch.linalg.solve(precision, pull)[..., 0]
+    own = MultivariateNormal(mean, precision_matrix=precision)
+    return own.log_prob(theta.double()).mean()
+
+
+def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
+    theta, condition = rows(4_000, 0)
+    with forked_generators(1):
+        network = MixtureDensity().build(theta, condition, 1)
+        train_mixture_density(
+            network,
+            torch.optim.Adam(network.parameters(), lr=1.5e-2),
+            theta,
+            condition,
+            train_rows=torch.arange(3_600),
+            held_out_rows=torch.arange(3_600, 4_000),
+            budget=TrainingBudget(num_iterations=160, batch_size=200, anneal=True),
+        )
+    assert network.baseline_kind == "linear"
+    theta, condition = rows(2_000, 2)
+    with torch.no_grad():
+        score = network.log_prob(theta[None], condition).mean()
+    assert exact(theta, condition) - score < 0.15
+
+
+def test_few_numbers_stay_as_they_are():
+    theta, condition = rows(200, 0)
+    few = condition[:, -6:]
+    assert Conditioning(theta, few, 1, **ALL_ROWS).directions is None
+
+
+def test_missing_outcomes_have_no_summary():
+    theta, condition = rows(300, 0)
+    condition[5, :NUM], condition[9, 4] = torch.nan, torch.nan
+    seen, _ = Conditioning(theta, condition, 1, **ALL_ROWS)(condition)
+    assert seen.shape[1] < 50
+    assert bool(seen.isfinite().all())
+    assert bool((seen[5, :-1] == seen[9, :-1])[:20].all())
+
+
+def test_directions_are_orthonormal_and_hold_what_parameters_move():
+    theta, condition = rows(1_000, 0)
+    x, action = condition.split([NUM, 1], 1)
+    own = Directions(theta.double(), x, action, num=8)
+    torch.testing.assert_close(own.rows @ own.rows.T, torch.eye(8).double())
+    signal = BASIS.double() / own.scale
+    kept = signal @ own.rows.T
+    assert float(kept.square().sum() / signal.square().sum()) > 0.95
