@@ -32,8 +32,8 @@ def former_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home, _, new = names[name].partition(":")
         warn(
+            "SA701",
             f"{package}.{name} goes in the next version: use {home}.{new}",
-            DeprecationWarning,
             stacklevel=stacklevel,
         )
         return pkgutil.resolve_name(names[name])

@@ -62,6 +62,7 @@ def told_trial(
     )
     if not bool(actions.contains(executed)):
         warn(
+            "SA202",
             f"the executed action {executed.tolist()} is not in {actions}; it is "
             "simulated where it was executed",
             stacklevel=5,
@@ -157,6 +158,7 @@ def _measured(x: Tensor) -> Tensor:
     if not bool(infinite.any()):
         return x
     warn(
+        "SA201",
         f"{int(infinite.sum())} of {x.numel()} told numbers are infinite and count as "
         "not measured; pass NaN where a sensor gave nothing",
         stacklevel=7,

@@ -28,6 +28,7 @@ from sbi_active.campaign.storage.damage import (
 )
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.telling import LOST, recorded
+from sbi_active.messages import Message, message
 from sbi_active.simulation.bank.damage import CorruptSegmentError, parsed, require
 from sbi_active.simulation.bank.sqlite import EVENTS, OBJECTS
 from sbi_active.simulation.bank.store import Store
@@ -57,7 +58,8 @@ class CampaignDirectory:
     """
 
     def __init__(self, path: Path, *, repair: bool = False) -> None:
-        self.path, self.notes = path, []
+        self.path = path
+        self.notes: list[Message] = []
         with naming():
             self.store = Store(path, "campaign")
             if repair and self.store.problems():
@@ -239,7 +241,8 @@ class CampaignDirectory:
             except CorruptSegmentError as error:
                 left = self.store.remains(EVENTS, LOG, number)
                 lost.append(error.reason)
-                self.notes.append(f"given up, tell it again: {left or error.reason}")
+                text = f"given up, tell it again: {left or error.reason}"
+                self.notes.append(message("SA603", text))
         return whole, lost
 
     def _mend(self) -> None:
@@ -260,7 +263,7 @@ class CampaignDirectory:
             content = self.store.get(OBJECTS, STATE)
             return None if content is None else decode(content, known={})
         except (CorruptSegmentError, ValueError) as error:
-            self.notes.append(f"{STATE} is computed again: {error}")
+            self.notes.append(message("SA601", f"{STATE} is computed again: {error}"))
             return None
 
     def _require_whole(self, *, repair: bool) -> None:
@@ -288,9 +291,8 @@ class CampaignDirectory:
             self.store.delete(OBJECTS, STATE)
         for trial in [t for t in told if not _has(state, t)]:
             self.write("restored", trial)
-            self.notes.append(
-                f"restored from {STATE}: trial {trial.index}, x = {trial.x}"
-            )
+            text = f"restored from {STATE}: trial {trial.index}, x = {trial.x}"
+            self.notes.append(message("SA603", text))
         self.close()
 
 

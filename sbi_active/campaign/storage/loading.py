@@ -29,7 +29,7 @@ from sbi_active.campaign.storage.described import (
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.drawn import drawn_from, stood_for
 from sbi_active.campaign.storage.manifest import require_same_simulator
-from sbi_active.messages import warn
+from sbi_active.messages import message, warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
 if TYPE_CHECKING:
@@ -89,7 +89,11 @@ class StoredLearner:
             try:
                 self._belief = stood_for(saved(), self.first_prior, self._state)
             except ValueError as error:
-                warn(f"the belief has to be computed again: {error}", stacklevel=3)
+                warn(
+                    "SA601",
+                    f"the belief has to be computed again: {error}",
+                    stacklevel=3,
+                )
                 self._state.is_stale = True
         return self._belief
 
@@ -98,9 +102,8 @@ class StoredLearner:
         """That, marked untrustworthy where trials are not in it."""
         texts = doubts(self._state.measured)
         if self._state.is_stale:
-            texts.append(
-                "trials were told or corrected since: update() computes it again"
-            )
+            text = "trials were told or corrected since: update() computes it again"
+            texts.append(message("SA601", text))
         return in_doubt(self.belief, self.prior, texts)
 
     def __getattr__(self, name: str) -> NoReturn:
@@ -131,6 +134,7 @@ def load(
     settings: CampaignOptions = _given("options", options, disk, options_from)
     if options is not None and describe_options(options) != manifest.get("options"):
         warn(
+            "SA604",
             f"options= hold for this process: the campaign in {directory} keeps "
             f"{manifest.get('options_text')}; pass them at each load",
             stacklevel=4,
@@ -148,7 +152,7 @@ def load(
         shape = torch.Size(manifest["x_shape"])
     name = disk.restore(state)
     for note in disk.notes:
-        warn(note, stacklevel=3)
+        warn(note.code, note, stacklevel=3)
     if simulator is None:
         without = {"simulator": Absent(), "prior": first_prior}
         saved = None if name is None else lambda: disk.belief(name, without)
@@ -188,7 +192,7 @@ def _belief(
     try:
         return disk.belief(name, known)
     except ValueError as error:
-        warn(f"the belief is computed again: {error}", stacklevel=4)
+        warn("SA601", f"the belief is computed again: {error}", stacklevel=4)
         learner.forget()
         return learner.prior
 

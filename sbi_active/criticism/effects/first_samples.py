@@ -114,6 +114,7 @@ def start_from_first_samples(
             errors[key].append(factorial(order) * own * error[order])
     if bent:
         warn(
+            "SA211",
             f"the first samples of {trials.called(sorted(bent))} leave a polynomial of "
             f"order {degree} by more than the sensor's error, so that their start is "
             "wrong and hides what bends them, such as gravity: name a derivative of "

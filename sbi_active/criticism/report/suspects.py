@@ -9,6 +9,7 @@ from sbi_active.criticism.contradictions import BoundParameter, Bounds
 from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.results import NONE, OUTLIER, Detection, Evaluation, Tracing
 from sbi_active.criticism.steps.detection import LEVEL, TOO_SMALL
+from sbi_active.messages import message
 
 #: Share of the probability that the suspects hold together.
 MASS = 0.9
@@ -58,33 +59,35 @@ def of_trials(tracing: Tracing) -> Iterator[str]:
     """Yield what limits a verdict that rests on one trial, a sentence each."""
     if tracing.verdict == OUTLIER:
         which = in_words(tracing)
-        yield (
+        yield message(
+            "SA521",
             f"{which} does not agree with the others: check its record, its unit and "
-            "its set-up, then correct, withdraw or repeat it; nothing is added for it"
+            "its set-up, then correct, withdraw or repeat it; nothing is added for it",
         )
     if tracing.instead_of:
         p = tracing.probabilities.get(tracing.instead_of)
         stated = "" if p is None else f" (probability {p:.2g})"
-        why = _why_withdrawn(tracing)
-        yield f"{tracing.instead_of}{stated} is not named, since {why}"
+        code, why = _why_withdrawn(tracing)
+        yield message(code, f"{tracing.instead_of}{stated} is not named, since {why}")
     elif len(tracing.needed) == 1:
-        yield (
+        yield message(
+            "SA522",
             f"{tracing.verdict} {_rests(tracing)}: without it the Bayes factor "
-            "against the bare model is below 20; repeat its action"
+            "against the bare model is below 20; repeat its action",
         )
 
 
-def _why_withdrawn(tracing: Tracing) -> str:
+def _why_withdrawn(tracing: Tracing) -> tuple[str, str]:
     if tracing.bounds.replaces:
-        return narrow_prior(tracing)
+        return "SA103", narrow_prior(tracing)
     if tracing.refuted:
         before, after = tracing.refuted
         where = tracing.refuted_on or NO_PART
-        return (
+        return "SA512", (
             f"it does not lower the error on {where}: RMSE {before:.3g} before and "
             f"{after:.3g} after"
         )
-    return (
+    return "SA521", (
         f"it {_rests(tracing)}, and {in_words(tracing)} may as well have a "
         "gross error: repeat its action before adding it"
     )
@@ -118,20 +121,22 @@ def of_bounds(bounds: Bounds) -> Iterator[str]:
         beyond = ""
         if not math.isnan(p.beyond):
             beyond = f" with the bound moved the best fit has {p.beyond:.3g};"
-        yield (
+        yield message(
+            "SA103",
             f"{p.name} is at a bound of its prior {where}, the {p.side} one "
-            f"({p.bound:.6g});{beyond} move the bound, or say why"
+            f"({p.bound:.6g});{beyond} move the bound, or say why",
         )
 
 
 def of_outlying(tracing: Tracing) -> Iterator[str]:
     """Yield a sentence on each trial that was set aside where every model misses."""
     for trial in tracing.set_aside:
-        yield (
+        yield message(
+            "SA513",
             f"trial {trial.name} is far outside what the other trials show: its error "
             f"on the fit to them is {trial.times:.3g} times theirs; it is set aside, "
             "and had no part in the verdict: check its record, its unit and its "
-            "set-up, then correct, withdraw or repeat it"
+            "set-up, then correct, withdraw or repeat it",
         )
 
 
@@ -153,10 +158,11 @@ def of_missed(evaluation: Evaluation | None) -> Iterator[str]:
         how = f"missed by {number(trial.size)} {trial.unit}"
         if math.isinf(trial.size):
             how = "measured where the model is sure of no measurement"
-        yield (
+        yield message(
+            "SA514",
             f"held-out trial {trial.name} is far outside what the verdict's model "
             f"predicts, {how}: check its record and its unit, or the model is wrong "
-            "there"
+            "there",
         )
 
 
@@ -179,12 +185,13 @@ def of_noise(detection: Detection | None) -> Iterator[str]:
         return
     least, num = detection.least_chi_square, detection.degrees_of_freedom
     ratio = (least / num) ** 0.5
-    yield (
+    yield message(
+        "SA523",
         "residuals are far smaller than the declared noise allows: their root mean "
         f"square is {ratio:.2g} of its standard deviation (chi-square {least:.2g} "
         f"on {num:.1f} degrees of freedom); declare the error of the measurement in "
         "the unit of x, since noise that is too large hides effects and widens the "
-        "parameters"
+        "parameters",
     )
 
 

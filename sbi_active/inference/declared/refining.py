@@ -128,6 +128,7 @@ def refine_declared(
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
     if num_missing:
         warn(
+            "SA301",
             f"{num_missing} of {num_simulations} simulations of the refinement are "
             "missing, by faults of the simulator; their draws were left out",
             MissingRowsWarning,

@@ -37,6 +37,7 @@ from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.student_mixture import Defended
+from sbi_active.messages import message
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -300,11 +301,16 @@ class PooledPosterior:
         )
         if error > LARGE:
             found = found.warned(
-                f"the belief is off by about {error:.2g} nats for want of simulations; "
-                "allow more of them"
+                message(
+                    "SA105",
+                    f"the belief is off by about {error:.2g} nats for want of "
+                    "simulations; allow more of them",
+                )
             )
         if effective < 100:
-            found = found.warned("few effective draws; allow more simulations")
+            found = found.warned(
+                message("SA114", "few effective draws; allow more simulations")
+            )
         belief.diagnostics = found
         return belief
 

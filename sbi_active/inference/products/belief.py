@@ -11,6 +11,7 @@ from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.products.product import Product
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.messages import message
 
 #: Effective draws below which the normalizer is off by more than a tenth of a nat.
 ENOUGH = 100.0
@@ -57,6 +58,10 @@ def sample_product(
     )
     if effective < ENOUGH:
         belief.diagnostics = belief.diagnostics.warned(
-            f"the belief rests on {effective:.0f} effective draws; raise num_particles"
+            message(
+                "SA114",
+                f"the belief rests on {effective:.0f} effective draws; raise "
+                "num_particles",
+            )
         )
     return belief

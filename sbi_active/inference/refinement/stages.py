@@ -263,6 +263,7 @@ class Stages:
         belief.histories = histories.record()
         if histories.num_missing:
             warn(
+                "SA301",
                 f"{histories.num_missing} of {histories.num_simulations} simulations "
                 "of the refinement are missing, by faults of the simulator; the "
                 "histories they belong to were left out",

@@ -30,6 +30,7 @@ from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
 from sbi_active.inference.trainers.base import Told
+from sbi_active.messages import message
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 
@@ -274,8 +275,12 @@ class ProductRounds(ActionRounds):
         num_lost = len(used) - len(counted)
         if num_lost:
             sampled.diagnostics = sampled.diagnostics.warned(
-                f"{num_lost} trials are left out, at which the network's density is "
-                "finite nowhere: a measurement is wrong, or the simulator lacks much"
+                message(
+                    "SA113",
+                    f"{num_lost} trials are left out, at which the network's density "
+                    "is finite nowhere: a measurement is wrong, or the simulator lacks "
+                    "much",
+                )
             )
         return sampled
 

@@ -58,6 +58,7 @@ class LabeledStore:
             log_proposal = log_density(self._proposal, theta)
             if bool((log_proposal == -torch.inf).any()):
                 warn(
+                    "SA305",
                     f"{int((log_proposal == -torch.inf).sum())} of {len(theta)} rows "
                     f"have density 0 under the proposal {self._label!r}: they were not "
                     "drawn from it",
