@@ -16,6 +16,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.messages import message
+from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.identifiability import (
     MAX_ACTIONS,
@@ -27,6 +28,7 @@ from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, Simulati
 from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.simulator import outcome_tensor, require_noise
 from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.settings import Workers
 
 MIN_ROWS = 16  # a choice: of the first runs, which are timed
 RUNS = 6  # of all rows, beside one a parameter and one an entry of the action
@@ -34,6 +36,7 @@ ROUNDING = 1e-5  # relative difference between batches that mixes no rows
 MANY = 0.5  # share of rows without a measurement that is worth a word
 
 
+@takes_loose(workers=Workers)
 def check_simulator(
     simulator: Callable[..., Any],
     prior: Distribution,
@@ -42,7 +45,7 @@ def check_simulator(
     num_rows: int = 256,
     max_seconds: float = 60.0,
     num_simulations: int | None = None,
-    num_workers: int = 1,
+    workers: Workers | int | None = None,
     seed: int = 0,
 ) -> SimulatorReport:
     """Run a simulator over draws of the prior and say what a campaign would meet.
@@ -60,7 +63,7 @@ def check_simulator(
         num_rows: Rows a check, at least 16.
         max_seconds: Of simulation time; a slow simulator gets fewer rows, 16 at least.
         num_simulations: That the campaign needs, for :attr:`SimulatorReport.minutes`.
-        num_workers: That share them.
+        workers: Where they will run, or the number of calls at a time.
         seed: Of the draws.
 
     Example:
@@ -78,7 +81,7 @@ def check_simulator(
     report = SimulatorReport(
         takes_seeds=takes_seeds(simulator),
         num_simulations=num_simulations,
-        num_workers=num_workers,
+        num_workers=Workers.of(workers).num_workers,
     )
     try:
         report = _look(run, theta, action, report)
@@ -127,13 +130,11 @@ class _Runs:
 
     def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Any:
         """Call the simulator as it is, whatever it returns."""
-        taken = takes_seeds(self.simulator)
-        theta, action, seeds = theta.clone(), action.clone(), seeds.clone()
-        if isinstance(self.simulator, SimulatorModel) or taken:
-            with forked_generators(self.seed, "call"):
-                return self.simulator(theta, action, seeds=seeds)
+        is_model = isinstance(self.simulator, SimulatorModel)
+        takes = is_model or takes_seeds(self.simulator)
+        given = {"seeds": seeds.clone()} if takes else {}
         with forked_generators(self.seed, "call"):
-            return self.simulator(theta, action)
+            return self.simulator(theta.clone(), action.clone(), **given)
 
     def simulate(self, theta: Tensor, action: Tensor, key: str = "x") -> Any:
         """Return simulations, what raises being missing."""

@@ -174,7 +174,7 @@ class Learner:
                 trial.action,
                 self.at(trial.index),
                 self.belief,
-                num_samples=state.options.num_scored,
+                num_samples=state.options.details.num_scored,
                 seed=derive_seed(state.seed, "score", trial.index),
                 workers=state.options.workers,
             )
@@ -200,7 +200,7 @@ class Learner:
                 trial,
                 self.at(trial.index),
                 self.prior,
-                num_samples=state.options.num_scored,
+                num_samples=state.options.details.num_scored,
                 seed=derive_seed(state.seed, "prior", trial.index),
                 workers=state.options.workers,
             )
@@ -312,7 +312,7 @@ class Learner:
         if Enumeration.of(self.prior) is not None:
             return RoundModel(None)
         options = self._state.options
-        can_wait = self._inference.amortized and options.design_on == "fresh"
+        can_wait = self._inference.amortized and options.details.design_on == "fresh"
         is_due = self._trains_each_round or not can_wait
         return RoundModel(
             lambda: self.trained(index), self.trained(index) if is_due else None
@@ -373,7 +373,7 @@ class Learner:
                     )
                     known = rows.without_missing()
                     num, num_missing = len(rows), rows.counts["missing"]
-                if options.design_on == "training":
+                if options.details.design_on == "training":
                     self.simulations = known
             with state.stage(index, "training"):
                 self._inference.append_simulations(

@@ -132,7 +132,9 @@ def load(
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest = disk.manifest
     settings: CampaignOptions = _given("options", options, disk, options_from)
-    if options is not None and describe_options(options) != manifest.get("options"):
+    kept = manifest.get("options")
+    known = None if kept is None else describe_options(options_from(kept))
+    if options is not None and describe_options(options) != known:
         warn(
             "SA604",
             f"options= hold for this process: the campaign in {directory} keeps "
