@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 PAGE = "warnings.html"
-_ENTRY = re.compile(r"^### (SA\d+) (.+)\n\n((?:.+\n)+)", re.MULTILINE)
+_ENTRY = re.compile(r"^### (SA\d+) (.+)\n((?:.+\n)+)", re.MULTILINE)
 _PLACE = re.compile(rf"\(see {PAGE}#(?:sa(\d+)-)?([\w-]+)\)$")
 
 
@@ -74,16 +74,26 @@ CATEGORIES = {
 class Message(str):
     """A sentence that knows its code.
 
+    Where it is said the code comes first: "SA301 3 of 9 rows are missing".
+
     Example:
-        >>> said = message("SA301", "3 of 9 rows are missing: 3 raised")
+        >>> said = Message("SA301 3 of 9 rows are missing: 3 raised")
         >>> said, said.code, said.category.__name__
         ('3 of 9 rows are missing: 3 raised (see warnings.html#sa301-rows-missing)',
          'SA301', 'SimulationWarning')
+        >>> Message(said) == said
+        True
         >>> Message("few draws (see warnings.html#few-draws)").code  # as it was
         'SA114'
     """
 
     __slots__ = ()
+
+    def __new__(cls, text: object = "") -> Message:
+        """Put the place of a code that comes first to the end of a text."""
+        code, _, rest = str(text).partition(" ")
+        is_coded = code in explanations()
+        return super().__new__(cls, rest + place(code) if is_coded else str(text))
 
     @property
     def code(self) -> str:
@@ -127,13 +137,7 @@ def place(code: str) -> str:
     return f" (see {PAGE}#{code.lower()}-{_slug(explanations()[code][0])})"
 
 
-def message(code: str, text: str) -> Message:
-    """Return a text that ends, once, in the place of its code."""
-    return Message(text.removesuffix(place(code)) + place(code))
-
-
 def warn(
-    code: str,
     text: str,
     category: type[SBIActiveWarning] | None = None,
     *,
@@ -142,12 +146,11 @@ def warn(
     """Warn as :func:`warnings.warn` does, and say where the message is explained.
 
     Args:
-        code: Code of the message.
-        text: What is wrong and what to do.
+        text: Code, what is wrong and what to do.
         category: Class of the warning; None takes that of the code.
         stacklevel: 1 for the line that calls this, 2 for who called its function.
     """
-    said = message(code, text)
+    said = Message(text)
     warnings.warn(said, category or said.category, stacklevel=stacklevel + 1)
 
 

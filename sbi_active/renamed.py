@@ -37,8 +37,7 @@ def former_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home, _, new = names[name].partition(":")
         warn(
-            "SA701",
-            f"{package}.{name} goes in the next version: use {home}.{new}",
+            f"SA701 {package}.{name} goes in the next version: use {home}.{new}",
             stacklevel=stacklevel,
         )
         return pkgutil.resolve_name(names[name])
@@ -105,8 +104,8 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
 
     def warned(what: str, name: str) -> None:
         place = f"{home[name]}={groups[home[name]].__name__}({name}=)"
-        text = f"{what}({name}=) goes in the next version: use {place}"
-        warn("SA701", text, stacklevel=stack_level())
+        text = f"SA701 {what}({name}=) goes in the next version: use {place}"
+        warn(text, stacklevel=stack_level())
 
     def decorate(taking: Any) -> Any:
         function = taking.__init__ if isinstance(taking, type) else taking
@@ -146,8 +145,10 @@ def set_later(*names: str) -> Callable[[Taking], Taking]:
             later = {name: kwargs.pop(name) for name in names if name in kwargs}
             made = make(self, *args, **kwargs)
             for name, value in later.items():
-                text = f"the keyword {name}= goes in the next version: set .{name}"
-                warn("SA701", text, stacklevel=stack_level())
+                text = (
+                    f"SA701 the keyword {name}= goes in the next version: set .{name}"
+                )
+                warn(text, stacklevel=stack_level())
                 setattr(self if made is None else made, name, value)
             return made
 

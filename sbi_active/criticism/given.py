@@ -8,7 +8,6 @@ from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.screening import Screening
 from sbi_active.criticism.thinning import in_words
-from sbi_active.messages import message
 
 
 def made_given(
@@ -33,32 +32,28 @@ def made_given(
         warm_up: In which trials that were not fitted tell of theirs.
     """
     if num_summaries:
-        yield message(
-            "SA524",
-            f"given {num_summaries} summaries of the {trials.x[0].numel()} numbers of "
-            "a trial: what they leave out was not looked at",
+        yield (
+            f"SA524 given {num_summaries} summaries of the {trials.x[0].numel()} "
+            "numbers of a trial: what they leave out was not looked at"
         )
     if sampling is not None and sampling.every > 1:
         yield in_words(sampling)
     if left_out:
-        yield message(
-            "SA526",
-            "the order of the trials is unknown: what grows from trial to trial was "
-            f"not looked for ({', '.join(left_out)})",
+        yield (
+            "SA526 the order of the trials is unknown: what grows from trial to trial "
+            f"was not looked for ({', '.join(left_out)})"
         )
     if screening is not None:
         nearest, behind = next(iter(screening.behind.items()))
         num = len(screening.behind)
-        yield message(
-            "SA527",
-            f"of {num + len(screening.kept)} effects {len(screening.kept)} were "
+        yield (
+            f"SA527 of {num + len(screening.kept)} effects {len(screening.kept)} were "
             f"fitted: linear evidence puts the others behind, the nearest ({nearest}) "
-            f"by {behind:.1f} nats",
+            f"by {behind:.1f} nats"
         )
     if nuisances and warm_up == 0:
-        yield message(
-            "SA528",
-            f"trials that were not fitted draw {', '.join(nuisances)} from the prior, "
-            "which is part of their error; pass warm_up, the time in which their first "
-            "samples tell of it",
+        yield (
+            f"SA528 trials that were not fitted draw {', '.join(nuisances)} from the "
+            "prior, which is part of their error; pass warm_up, the time in which "
+            "their first samples tell of it"
         )

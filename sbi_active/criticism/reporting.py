@@ -27,7 +27,6 @@ from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.leave_one_out import leave_one_out
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.residuals import find_residuals
-from sbi_active.messages import message
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
 
@@ -130,11 +129,10 @@ def _outlying(loop: Steps, tracing: Tracing) -> list[str]:
     if len(squares) != len(measured):  # a trial that no other tells about
         return []
     return [
-        message(
-            "SA513",
-            f"trial {trials.names[measured[k]]} is far outside what the other trials "
-            f"show: its error on the fit to them is {times:.3g} times theirs; check "
-            "its record and its unit, and see what the verdict is without it",
+        (
+            f"SA513 trial {trials.names[measured[k]]} is far outside what the other "
+            f"trials show: its error on the fit to them is {times:.3g} times theirs; "
+            "check its record and its unit, and see what the verdict is without it"
         )
         for k, times in outlying_trials(squares)
     ]

@@ -15,7 +15,6 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.messages import message
 from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.identifiability import (
@@ -299,19 +298,15 @@ def _judge(
     notes: list[str] = []
     lost = len(theta) - report.counts["ok"]
     if lost == len(theta):
-        defects.append(message("SA401", "no row has a measurement"))
+        defects.append("SA401 no row has a measurement")
     elif lost > MANY * len(theta):
-        text = f"{lost / len(theta):.0%} of the rows have no measurement"
-        notes.append(message("SA401", text))
+        notes.append(f"SA401 {lost / len(theta):.0%} of the rows have no measurement")
     if report.counts["missing"]:
         text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
         notes.append(
-            message(
-                "SA301",
-                f"{report.counts['missing']} rows raise, the first "
-                f"{text[-1] if text else 'without a word'}; their outcome is missing; "
-                "return NaN where the system gave no measurement",
-            )
+            f"SA301 {report.counts['missing']} rows raise, the first "
+            f"{text[-1] if text else 'without a word'}; their outcome is missing; "
+            "return NaN where the system gave no measurement"
         )
     if report.is_deterministic:
         try:
@@ -323,43 +318,31 @@ def _judge(
     sound = report.counts["missing"] == 0
     if declared and sound and not model.is_deterministic(theta, action):
         notes.append(
-            message(
-                "SA402",
-                "fn is random beside declared noise, which so counts twice; declare "
-                "noise=None, or remove the random numbers from fn",
-            )
+            "SA402 fn is random beside declared noise, which so counts twice; declare "
+            "noise=None, or remove the random numbers from fn"
         )
     if report.noiseless:
         notes.append(
-            message(
-                "SA403",
-                f"numbers {', '.join(map(str, report.noiseless))} of x have no noise, "
-                "and so no density; declare the noise of every channel",
-            )
+            f"SA403 numbers {', '.join(map(str, report.noiseless))} of x have no "
+            "noise, and so no density; declare the noise of every channel"
         )
     if report.rows_are_independent is False:
         defects.append(
-            message(
-                "SA404",
-                "rows permuted with their seeds do not give permuted x; let row i "
-                "depend on theta[i], action[i] and seeds[i] alone",
-            )
+            "SA404 rows permuted with their seeds do not give permuted x; let row i "
+            "depend on theta[i], action[i] and seeds[i] alone"
         )
     if not report.is_reproducible:
         notes.append(
-            message(
-                "SA405",
-                "one seed gives two different x, so that no run can be repeated; take "
-                "seeds, or draw from torch's or NumPy's global generator",
-            )
+            "SA405 one seed gives two different x, so that no run can be repeated; "
+            "take seeds, or draw from torch's or NumPy's global generator"
         )
     if len(report.idle_parameters) == theta.shape[1]:
-        defects.append(message("SA303", "no parameter changes x"))
+        defects.append("SA303 no parameter changes x")
     elif idle := ", ".join(report.idle_parameters):
-        notes.append(message("SA303", f"changing {idle} leaves x as it is"))
+        notes.append(f"SA303 changing {idle} leaves x as it is")
     if idle := ", ".join(report.idle_actions):
-        notes.append(message("SA303", f"changing {idle} leaves x as it is"))
-    notes += [message("SA406", str(group)) for group in report.undetermined]
+        notes.append(f"SA303 changing {idle} leaves x as it is")
+    notes += [f"SA406 {group}" for group in report.undetermined]
     return replace(report, defects=(*defects,), warnings=(*notes,))
 
 

@@ -13,7 +13,6 @@ from torch.distributions import Distribution
 
 from sbi_active.campaign.state import FAR, Trial
 from sbi_active.inference.beliefs.belief import Belief, UnchangedBelief
-from sbi_active.messages import Message, message
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 from sbi_active.simulation.workers.settings import Workers
@@ -92,7 +91,7 @@ def outlyingness(x: Tensor, drawn: Tensor) -> float:
     return float((beyond / width).max())
 
 
-def doubts(trials: Sequence[Trial]) -> list[Message]:
+def doubts(trials: Sequence[Trial]) -> list[str]:
     """Return what is wrong with trials beyond all simulations, and what to do."""
     return [
         _doubt(t) for t in trials if t.is_measured and (t.outlyingness or 0.0) > NOTABLE
@@ -120,7 +119,7 @@ def in_doubt(
     return marked
 
 
-def _doubt(trial: Trial) -> Message:
+def _doubt(trial: Trial) -> str:
     far, index = trial.outlyingness or 0.0, trial.index
     where = f"trial {index} at action {_shown(trial.action)}: x = {_shown(trial.x)} "
     if math.isinf(far):
@@ -131,10 +130,9 @@ def _doubt(trial: Trial) -> Message:
             "anything simulated"
         )
     so = ", so that the belief leaves it out" if far > FAR else ""
-    return message(
-        "SA102",
-        f"{where}{what}{so}; correct it with tell(x, trial={index}) or take it out "
-        f"with withdraw({index}), and criticize() where it is right",
+    return (
+        f"SA102 {where}{what}{so}; correct it with tell(x, trial={index}) or take it "
+        f"out with withdraw({index}), and criticize() where it is right"
     )
 
 

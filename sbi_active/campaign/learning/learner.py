@@ -39,7 +39,7 @@ from sbi_active.inference.beliefs.priors import require_support, require_width
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.trainers.base import ActiveInference
-from sbi_active.messages import Message, message, warn
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Simulations, simulate
 from sbi_active.simulation.simulator import square_of
@@ -93,7 +93,7 @@ class Learner:
         self._trainer.starts_at_network = self._trains_each_round
         self._saved: Callable[[], Distribution] | None = None
         self._end_round()
-        self._stated: tuple[Distribution, list[Message], Distribution] | None = None
+        self._stated: tuple[Distribution, list[str], Distribution] | None = None
         self.simulations: Simulations | None = None
 
     @property
@@ -151,9 +151,7 @@ class Learner:
         belief, texts = self.belief, doubts(self._state.measured)
         if self._state.is_stale:
             texts.append(
-                message(
-                    "SA601", "a trial was corrected since: update() computes it again"
-                )
+                "SA601 a trial was corrected since: update() computes it again"
             )
         if self._stated is None or self._stated[:2] != (belief, texts):
             marked = named(in_doubt(belief, self.prior, texts), self.simulator)
@@ -212,7 +210,7 @@ class Learner:
     def _warned(self, index: int) -> Trial:
         trial = self._state.trials[index]
         for text in doubts([trial]):
-            warn(text.code, text, stacklevel=2)
+            warn(text, stacklevel=2)
         return trial
 
     def learn(self, trial: Trial) -> None:

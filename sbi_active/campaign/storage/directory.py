@@ -28,7 +28,6 @@ from sbi_active.campaign.storage.damage import (
 )
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.telling import LOST, recorded
-from sbi_active.messages import Message, message
 from sbi_active.simulation.bank.damage import CorruptSegmentError, parsed, require
 from sbi_active.simulation.bank.sqlite import EVENTS, OBJECTS
 from sbi_active.simulation.bank.store import Store
@@ -59,7 +58,7 @@ class CampaignDirectory:
 
     def __init__(self, path: Path, *, repair: bool = False) -> None:
         self.path = path
-        self.notes: list[Message] = []
+        self.notes: list[str] = []
         with naming():
             self.store = Store(path, "campaign")
             if repair and self.store.problems():
@@ -241,8 +240,9 @@ class CampaignDirectory:
             except CorruptSegmentError as error:
                 left = self.store.remains(EVENTS, LOG, number)
                 lost.append(error.reason)
-                text = f"given up, tell it again: {left or error.reason}"
-                self.notes.append(message("SA603", text))
+                self.notes.append(
+                    f"SA603 given up, tell it again: {left or error.reason}"
+                )
         return whole, lost
 
     def _mend(self) -> None:
@@ -263,7 +263,7 @@ class CampaignDirectory:
             content = self.store.get(OBJECTS, STATE)
             return None if content is None else decode(content, known={})
         except (CorruptSegmentError, ValueError) as error:
-            self.notes.append(message("SA601", f"{STATE} is computed again: {error}"))
+            self.notes.append(f"SA601 {STATE} is computed again: {error}")
             return None
 
     def _require_whole(self, *, repair: bool) -> None:
@@ -272,7 +272,7 @@ class CampaignDirectory:
         A repair takes their trials from the state, and has all else computed again.
         """
         saved = self._saved
-        mended = any(note.startswith("given up") for note in self.notes)
+        mended = any(note.startswith("SA603") for note in self.notes)
         if saved is None or saved["lines"] <= len(self._entries) and not mended:
             return
         told = [t for t in saved["trials"] if t.status != "pending"]
@@ -291,8 +291,9 @@ class CampaignDirectory:
             self.store.delete(OBJECTS, STATE)
         for trial in [t for t in told if not _has(state, t)]:
             self.write("restored", trial)
-            text = f"restored from {STATE}: trial {trial.index}, x = {trial.x}"
-            self.notes.append(message("SA603", text))
+            self.notes.append(
+                f"SA603 restored from {STATE}: trial {trial.index}, x = {trial.x}"
+            )
         self.close()
 
 

@@ -29,7 +29,7 @@ from sbi_active.campaign.storage.described import (
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.drawn import drawn_from, stood_for
 from sbi_active.campaign.storage.manifest import require_same_simulator
-from sbi_active.messages import message, warn
+from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint
 
 if TYPE_CHECKING:
@@ -90,8 +90,7 @@ class StoredLearner:
                 self._belief = stood_for(saved(), self.first_prior, self._state)
             except ValueError as error:
                 warn(
-                    "SA601",
-                    f"the belief has to be computed again: {error}",
+                    f"SA601 the belief has to be computed again: {error}",
                     stacklevel=3,
                 )
                 self._state.is_stale = True
@@ -102,8 +101,9 @@ class StoredLearner:
         """That, marked untrustworthy where trials are not in it."""
         texts = doubts(self._state.measured)
         if self._state.is_stale:
-            text = "trials were told or corrected since: update() computes it again"
-            texts.append(message("SA601", text))
+            texts.append(
+                "SA601 trials were told or corrected since: update() computes it again"
+            )
         return in_doubt(self.belief, self.prior, texts)
 
     def __getattr__(self, name: str) -> NoReturn:
@@ -136,8 +136,7 @@ def load(
     known = None if kept is None else describe_options(options_from(kept))
     if options is not None and describe_options(options) != known:
         warn(
-            "SA604",
-            f"options= hold for this process: the campaign in {directory} keeps "
+            f"SA604 options= hold for this process: the campaign in {directory} keeps "
             f"{manifest.get('options_text')}; pass them at each load",
             stacklevel=4,
         )
@@ -154,7 +153,7 @@ def load(
         shape = torch.Size(manifest["x_shape"])
     name = disk.restore(state)
     for note in disk.notes:
-        warn(note.code, note, stacklevel=3)
+        warn(note, stacklevel=3)
     if simulator is None:
         without = {"simulator": Absent(), "prior": first_prior}
         saved = None if name is None else lambda: disk.belief(name, without)
@@ -194,7 +193,7 @@ def _belief(
     try:
         return disk.belief(name, known)
     except ValueError as error:
-        warn("SA601", f"the belief is computed again: {error}", stacklevel=4)
+        warn(f"SA601 the belief is computed again: {error}", stacklevel=4)
         learner.forget()
         return learner.prior
 

@@ -24,7 +24,6 @@ from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
 from sbi_active.inference.sampling.bandwidth import scott
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
-from sbi_active.messages import message
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 
@@ -160,22 +159,16 @@ def identify(
     if disagree:
         worst = names[int(np.argmin(parts.p_value))]
         notes.append(
-            message(
-                "SA123",
-                f"single trials disagree about {worst} (p = {least:.1g}): the model "
-                "lacks something, and intervals are as wide as they disagree; ask "
-                "close_loop what it lacks",
-            )
+            f"SA123 single trials disagree about {worst} (p = {least:.1g}): the model "
+            "lacks something, and intervals are as wide as they disagree; ask "
+            "close_loop what it lacks"
         )
     dim = len(names)
     fewest = max(own.fewest, own.fewest_each * dim * (dim + 3))
     if shape is not None and (effective < fewest or shape > own.largest_shape):
         notes.append(
-            message(
-                "SA115",
-                f"{effective:.0f} effective draws: the posterior is not that of a "
-                "nearly linear model; use Campaign, or a narrower prior",
-            )
+            f"SA115 {effective:.0f} effective draws: the posterior is not that of a "
+            "nearly linear model; use Campaign, or a narrower prior"
         )
     notes += _at_bounds(belief)
     errors = _errors(found, model)
@@ -309,12 +302,9 @@ def _beyond(
         # What is left, since shapes of the error only have sizes some steps apart.
         ratio = found.sizes[c] / declared[c]
         notes.append(
-            message(
-                "SA124",
-                f"residuals of {name} are {ratio:.2g} times the declared error: the "
-                "model lacks something, or the error is declared too small; ask "
-                "close_loop what it lacks",
-            )
+            f"SA124 residuals of {name} are {ratio:.2g} times the declared error: the "
+            "model lacks something, or the error is declared too small; ask "
+            "close_loop what it lacks"
         )
     return notes
 
@@ -345,10 +335,7 @@ def _at_bounds(belief: IdentifiedBelief) -> list[str]:
             if side < 0:
                 limit = f"lower one: at most {high:.3g}"
             notes.append(
-                message(
-                    "SA103",
-                    f"{name} is at a bound of its prior, the {limit}, and nothing "
-                    "says how far beyond; move the bound, or say why",
-                )
+                f"SA103 {name} is at a bound of its prior, the {limit}, and nothing "
+                "says how far beyond; move the bound, or say why"
             )
     return notes

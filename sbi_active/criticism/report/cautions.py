@@ -33,7 +33,7 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.rivals.validity import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED
-from sbi_active.messages import message
+from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
@@ -64,7 +64,7 @@ def find_warnings(
     effects: Sequence[Effect] = (),
     exploratory: bool = False,
     designed: bool = False,
-) -> tuple[str, ...]:
+) -> tuple[Message, ...]:
     """Return what limits the conclusions, a sentence each.
 
     Args:
@@ -78,7 +78,7 @@ def find_warnings(
         exploratory: What was frozen was changed after the data were seen.
         designed: Actions were chosen for their information.
     """
-    return (
+    found = (
         *_of_trials(
             trials.fit,
             residuals,
@@ -94,36 +94,34 @@ def find_warnings(
         *of_trials(tracing),
         *_of_verdict(tracing, effects, evaluation, exploratory=exploratory),
     )
+    return (*map(Message, found),)
 
 
 def _of_trials(
     trials: Trials, residuals: Residuals, *, designed: bool, has_sensor: bool
 ) -> Iterator[str]:
     if residuals.noise == "estimated" and not has_sensor:
-        yield message(
-            "SA501",
-            "noise undeclared: its size has a prior or is estimated from repeated "
-            "trials, which show scatter and no bias, and what differs from repeat to "
-            "repeat passes for noise",
+        yield (
+            "SA501 noise undeclared: its size has a prior or is estimated from "
+            "repeated trials, which show scatter and no bias, and what differs from "
+            "repeat to repeat passes for noise"
         )
     num = int(trials.valid.sum())
     if num < FEW_TRIALS:
-        yield message(
-            "SA502",
-            f"fewer than {FEW_TRIALS} trials ({num}): several effects may explain as "
-            "few",
+        yield (
+            f"SA502 fewer than {FEW_TRIALS} trials ({num}): several effects may "
+            "explain as few"
         )
     if not trials.action_is_label and _aliased(trials):
-        yield message(
-            "SA503",
-            "drift aliased with the order of actions: they were executed in sorted "
-            "order, so that what grows with time looks like what grows with the action",
+        yield (
+            "SA503 drift aliased with the order of actions: they were executed in "
+            "sorted order, so that what grows with time looks like what grows with "
+            "the action"
         )
     if designed:
-        yield message(
-            "SA504",
-            "actions chosen for information and not for deployment: the error before "
-            "and after is that of such actions",
+        yield (
+            "SA504 actions chosen for information and not for deployment: the error "
+            "before and after is that of such actions"
         )
 
 
@@ -133,9 +131,8 @@ def _of_errors(
     own = before if after is None or not tracing.chosen else after
     lost, kept = surprising_outcomes(own)
     if lost or kept:
-        yield message(
-            "SA505",
-            "outcomes that disagree: "
+        yield (
+            "SA505 outcomes that disagree: "
             + " and ".join(
                 f"trial{'s' * (len(which) > 1)} "
                 f"{', '.join(called(own.names, i) for i in which)} {what}"
@@ -144,16 +141,15 @@ def _of_errors(
                     (kept, "gave a measurement where the model is sure of none"),
                 )
                 if which
-            ),
+            )
         )
     if own.roughness is not None:
         rough = own.roughness[own.roughness > 0]
-        yield message(
-            "SA506",
-            "the simulator jumps: where parameters change within their posterior, x "
-            f"strays by {rough.min():.2g} to {rough.max():.2g} from a smooth function "
-            "of them, which counts as an error of its own beside the noise, so that "
-            "less is concluded than the trials may hold",
+        yield (
+            "SA506 the simulator jumps: where parameters change within their "
+            f"posterior, x strays by {rough.min():.2g} to {rough.max():.2g} from a "
+            "smooth function of them, which counts as an error of its own beside the "
+            "noise, so that less is concluded than the trials may hold"
         )
     assumed_independent = own.times is None or own.correlation == 0.0
     if assumed_independent and own.x.shape[1] >= LONG:
@@ -164,11 +160,10 @@ def _of_errors(
                 if own.times is None
                 else "declare GaussianNoise or AutocorrelatedNoise"
             )
-            yield message(
-                "SA507",
-                "independent errors forced on a trajectory: neighboring residuals have "
-                f"a correlation of {correlation:.2f}, which makes false alarms and "
-                f"intervals that are too narrow; {advice}",
+            yield (
+                "SA507 independent errors forced on a trajectory: neighboring "
+                f"residuals have a correlation of {correlation:.2f}, which makes "
+                f"false alarms and intervals that are too narrow; {advice}"
             )
 
 
@@ -183,16 +178,14 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
         and (e.effective_sample_size < FEW_SAMPLES or e.standard_error > UNCERTAIN)
     ]
     if weak:
-        yield message(
-            "SA508",
-            f"evidence uncertain of {', '.join(weak)}: so are the probabilities that "
-            "rest on it",
+        yield (
+            f"SA508 evidence uncertain of {', '.join(weak)}: so are the probabilities "
+            "that rest on it"
         )
     if detection is not None and detection.alarm and not detection.by_evidence:
-        yield message(
-            "SA509",
-            "the alarm rests on the chi-square alone: no alternative has a Bayes "
-            "factor of 20, so that what is lacking is a suggestion",
+        yield (
+            "SA509 the alarm rests on the chi-square alone: no alternative has a "
+            "Bayes factor of 20, so that what is lacking is a suggestion"
         )
     if (
         detection is not None
@@ -200,21 +193,19 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
         and tracing.misfit is None
         and detection.refutes(tracing.evidences[tracing.verdict], REFUTED)
     ):
-        yield message(
-            "SA510",
-            f"{tracing.verdict} explains the most, and not all: the chi-square of the "
-            f"trials with it has p < {REFUTED:g}, so that something else is missing "
-            "too",
+        yield (
+            f"SA510 {tracing.verdict} explains the most, and not all: the chi-square "
+            f"of the trials with it has p < {REFUTED:g}, so that something else is "
+            "missing too"
         )
     check = None if detection is None else detection.null_cross_check
     if detection is not None and check is not None:
         difference = check - detection.null_log_evidence
         if abs(difference) > DISAGREEMENT:
-            yield message(
-                "SA511",
-                "two estimates of the bare model's evidence differ by "
-                f"{abs(difference):.1f} nats: its posterior has parts that one of them "
-                "missed",
+            yield (
+                "SA511 two estimates of the bare model's evidence differ by "
+                f"{abs(difference):.1f} nats: its posterior has parts that one of "
+                "them missed"
             )
 
 
@@ -228,52 +219,44 @@ def _of_verdict(
     if tracing.chosen and evaluation is not None:
         rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
         if rmse["after"] >= rmse["before"]:
-            yield message(
-                "SA512",
-                f"{ModelKey(tracing.chosen)} does not lower the error on trials that "
-                f"had no part in it: RMSE {rmse['before']:.3g} before and "
-                f"{rmse['after']:.3g} after",
+            yield (
+                f"SA512 {ModelKey(tracing.chosen)} does not lower the error on trials "
+                f"that had no part in it: RMSE {rmse['before']:.3g} before and "
+                f"{rmse['after']:.3g} after"
             )
     edge = _at_edge(tracing, effects)
     if edge:
-        yield message(
-            "SA515",
-            f"phi at its prior's edge ({', '.join(e.name for e, _ in edge)}): the "
-            "effect is stronger than declared, or stands in for another",
+        yield (
+            f"SA515 phi at its prior's edge ({', '.join(e.name for e, _ in edge)}): "
+            "the effect is stronger than declared, or stands in for another"
         )
     for effect, phi in edge:
         if effect.hook == "observation" or effect.family in INSTRUMENTS:
             size = f"{number(float(phi[np.argmax(np.abs(phi))]))} {effect.units}"
-            yield message(
-                "SA516",
-                f"{effect.name} of {size.strip()} is more than an instrument gets "
-                "wrong: it stands in for something else, however well it predicts",
+            yield (
+                f"SA516 {effect.name} of {size.strip()} is more than an instrument "
+                "gets wrong: it stands in for something else, however well it predicts"
             )
     if not tracing.robust:
-        yield message(
-            "SA517",
-            "not robust to its prior: effect priors a third or three times as wide "
-            "give another verdict",
+        yield (
+            "SA517 not robust to its prior: effect priors a third or three times as "
+            "wide give another verdict"
         )
     is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
     if is_bare and not tracing.bounds.replaces:
         place = (
             f"beside {ModelKey(tracing.beside)}" if tracing.beside else "in its place"
         )
-        yield message(
-            "SA518",
-            f"no declared effect explains the data: the residual process {place} does "
-            "not extrapolate",
+        yield (
+            "SA518 no declared effect explains the data: the residual process "
+            f"{place} does not extrapolate"
         )
     if tracing.verdict == SCATTER:
-        yield message(
-            "SA519", "scatter is larger than the declared noise, which is no cause"
-        )
+        yield "SA519 scatter is larger than the declared noise, which is no cause"
     if exploratory:
-        yield message(
-            "SA520",
-            "exploratory: library or priors were changed after the data were seen, so "
-            "the false-alarm rate is not what is stated",
+        yield (
+            "SA520 exploratory: library or priors were changed after the data were "
+            "seen, so the false-alarm rate is not what is stated"
         )
 
 

@@ -9,7 +9,6 @@ from sbi_active.criticism.contradictions import BoundParameter, Bounds
 from sbi_active.criticism.report.numbers import number
 from sbi_active.criticism.results import NONE, OUTLIER, Detection, Evaluation, Tracing
 from sbi_active.criticism.steps.detection import LEVEL, TOO_SMALL
-from sbi_active.messages import message
 
 #: Share of the probability that the suspects hold together.
 MASS = 0.9
@@ -59,21 +58,20 @@ def of_trials(tracing: Tracing) -> Iterator[str]:
     """Yield what limits a verdict that rests on one trial, a sentence each."""
     if tracing.verdict == OUTLIER:
         which = in_words(tracing)
-        yield message(
-            "SA521",
-            f"{which} does not agree with the others: check its record, its unit and "
-            "its set-up, then correct, withdraw or repeat it; nothing is added for it",
+        yield (
+            f"SA521 {which} does not agree with the others: check its record, its "
+            "unit and its set-up, then correct, withdraw or repeat it; nothing is "
+            "added for it"
         )
     if tracing.instead_of:
         p = tracing.probabilities.get(tracing.instead_of)
         stated = "" if p is None else f" (probability {p:.2g})"
         code, why = _why_withdrawn(tracing)
-        yield message(code, f"{tracing.instead_of}{stated} is not named, since {why}")
+        yield f"{code} {tracing.instead_of}{stated} is not named, since {why}"
     elif len(tracing.needed) == 1:
-        yield message(
-            "SA522",
-            f"{tracing.verdict} {_rests(tracing)}: without it the Bayes factor "
-            "against the bare model is below 20; repeat its action",
+        yield (
+            f"SA522 {tracing.verdict} {_rests(tracing)}: without it the Bayes factor "
+            "against the bare model is below 20; repeat its action"
         )
 
 
@@ -121,22 +119,20 @@ def of_bounds(bounds: Bounds) -> Iterator[str]:
         beyond = ""
         if not math.isnan(p.beyond):
             beyond = f" with the bound moved the best fit has {p.beyond:.3g};"
-        yield message(
-            "SA103",
-            f"{p.name} is at a bound of its prior {where}, the {p.side} one "
-            f"({p.bound:.6g});{beyond} move the bound, or say why",
+        yield (
+            f"SA103 {p.name} is at a bound of its prior {where}, the {p.side} one "
+            f"({p.bound:.6g});{beyond} move the bound, or say why"
         )
 
 
 def of_outlying(tracing: Tracing) -> Iterator[str]:
     """Yield a sentence on each trial that was set aside where every model misses."""
     for trial in tracing.set_aside:
-        yield message(
-            "SA513",
-            f"trial {trial.name} is far outside what the other trials show: its error "
-            f"on the fit to them is {trial.times:.3g} times theirs; it is set aside, "
-            "and had no part in the verdict: check its record, its unit and its "
-            "set-up, then correct, withdraw or repeat it",
+        yield (
+            f"SA513 trial {trial.name} is far outside what the other trials show: its "
+            f"error on the fit to them is {trial.times:.3g} times theirs; it is set "
+            "aside, and had no part in the verdict: check its record, its unit and "
+            "its set-up, then correct, withdraw or repeat it"
         )
 
 
@@ -158,11 +154,10 @@ def of_missed(evaluation: Evaluation | None) -> Iterator[str]:
         how = f"missed by {number(trial.size)} {trial.unit}"
         if math.isinf(trial.size):
             how = "measured where the model is sure of no measurement"
-        yield message(
-            "SA514",
-            f"held-out trial {trial.name} is far outside what the verdict's model "
-            f"predicts, {how}: check its record and its unit, or the model is wrong "
-            "there",
+        yield (
+            f"SA514 held-out trial {trial.name} is far outside what the verdict's "
+            f"model predicts, {how}: check its record and its unit, or the model is "
+            "wrong there"
         )
 
 
@@ -185,13 +180,12 @@ def of_noise(detection: Detection | None) -> Iterator[str]:
         return
     least, num = detection.least_chi_square, detection.degrees_of_freedom
     ratio = (least / num) ** 0.5
-    yield message(
-        "SA523",
-        "residuals are far smaller than the declared noise allows: their root mean "
-        f"square is {ratio:.2g} of its standard deviation (chi-square {least:.2g} "
-        f"on {num:.1f} degrees of freedom); declare the error of the measurement in "
-        "the unit of x, since noise that is too large hides effects and widens the "
-        "parameters",
+    yield (
+        "SA523 residuals are far smaller than the declared noise allows: their root "
+        f"mean square is {ratio:.2g} of its standard deviation (chi-square "
+        f"{least:.2g} on {num:.1f} degrees of freedom); declare the error of the "
+        "measurement in the unit of x, since noise that is too large hides effects "
+        "and widens the parameters"
     )
 
 

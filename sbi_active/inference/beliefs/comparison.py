@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from sbi_active.inference.beliefs.belief import Belief, ChainedBelief
-from sbi_active.messages import message
 from sbi_active.seeding import forked_generators
 
 #: Nats by which the network may lie beside the refined belief before it is said.
@@ -49,5 +48,5 @@ def compare(refined: Belief, chained: ChainedBelief) -> None:
         else f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
     )
     refined.diagnostics = refined.diagnostics.extended(
-        network_warnings=(message("SA122", f"the amortized network is {kind}"),)
+        network_warnings=((f"SA122 the amortized network is {kind}"),)
     )

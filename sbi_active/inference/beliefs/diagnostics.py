@@ -164,8 +164,7 @@ class Diagnostics:
 
     def _as_dict(self, used: str) -> dict[str, Any]:
         warn(
-            "SA701",
-            f"diagnostics{used} is deprecated; use an attribute, or to_dict()",
+            f"SA701 diagnostics{used} is deprecated; use an attribute, or to_dict()",
             stacklevel=3,
         )
         return self.to_dict()

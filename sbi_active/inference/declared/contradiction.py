@@ -34,7 +34,6 @@ from torch import Tensor
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
-from sbi_active.messages import message
 from sbi_active.simulation.noise.whitening import whitened
 
 Array = NDArray[Any]
@@ -67,12 +66,11 @@ class Contradiction:
 
     def noted(self, diagnostics: Diagnostics) -> Diagnostics:
         """Return diagnostics of the wider belief that say so first."""
-        text = message(
-            "SA102",
-            f"{self.trials}: the observations are unlike anything simulated (tail "
-            f"probability {self.probability:.1g}), so that the noise was inflated "
-            f"{self.inflation:.3g} times, to what the trials scatter; correct or "
-            "withdraw what is wrong, or criticize the simulator",
+        text = (
+            f"SA102 {self.trials}: the observations are unlike anything simulated "
+            f"(tail probability {self.probability:.1g}), so that the noise was "
+            f"inflated {self.inflation:.3g} times, to what the trials scatter; "
+            "correct or withdraw what is wrong, or criticize the simulator"
         )
         return diagnostics.extended(
             warnings=(),

@@ -37,7 +37,6 @@ from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.student_mixture import Defended
-from sbi_active.messages import message
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -301,16 +300,11 @@ class PooledPosterior:
         )
         if error > LARGE:
             found = found.warned(
-                message(
-                    "SA105",
-                    f"the belief is off by about {error:.2g} nats for want of "
-                    "simulations; allow more of them",
-                )
+                f"SA105 the belief is off by about {error:.2g} nats for want of "
+                "simulations; allow more of them"
             )
         if effective < 100:
-            found = found.warned(
-                message("SA114", "few effective draws; allow more simulations")
-            )
+            found = found.warned("SA114 few effective draws; allow more simulations")
         belief.diagnostics = found
         return belief
 

@@ -11,7 +11,6 @@ from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.products.product import Product
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.messages import message
 
 #: Effective draws below which the normalizer is off by more than a tenth of a nat.
 ENOUGH = 100.0
@@ -58,10 +57,7 @@ def sample_product(
     )
     if effective < ENOUGH:
         belief.diagnostics = belief.diagnostics.warned(
-            message(
-                "SA114",
-                f"the belief rests on {effective:.0f} effective draws; raise "
-                "num_particles",
-            )
+            f"SA114 the belief rests on {effective:.0f} effective draws; raise "
+            "num_particles"
         )
     return belief

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.stages import Stages
-from sbi_active.messages import message
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
@@ -64,11 +63,8 @@ class Confirmation:
         if self.holds:
             return known
         return known.warned(
-            message(
-                "SA101",
-                f"fresh simulations do not confirm the belief: its mean is off by "
-                f"{self.shift:.2g} standard deviations; raise num_histories",
-            )
+            "SA101 fresh simulations do not confirm the belief: its mean is off by "
+            f"{self.shift:.2g} standard deviations; raise num_histories"
         )
 
 

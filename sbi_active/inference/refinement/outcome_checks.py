@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.surrogate import Surrogate
-from sbi_active.messages import message
 
 Array = NDArray[Any]
 
@@ -46,23 +45,17 @@ def check_outcomes(
     texts = []
     if not followed:
         texts.append(
-            message(
-                "SA120",
-                "where simulations have a measurement and where they have none is "
-                f"followed coarsely ({blur:.0%} of repeated simulations would differ "
-                "that do not), so that the belief is too wide; raise num_histories",
-            )
+            "SA120 where simulations have a measurement and where they have none is "
+            f"followed coarsely ({blur:.0%} of repeated simulations would differ that "
+            "do not), so that the belief is too wide; raise num_histories"
         )
     unheard = [k for k, p in enumerate(probability) if p < UNHEARD]
     if unheard:
         texts.append(
-            message(
-                "SA121",
-                f"trials {', '.join(map(str, unheard))} had a measurement, or none, "
-                f"where less than {UNHEARD:.0%} of the simulations near the belief do "
-                "the same: the simulator lacks a way to fail, or the status of the "
-                "trial is wrong",
-            )
+            f"SA121 trials {', '.join(map(str, unheard))} had a measurement, or none, "
+            f"where less than {UNHEARD:.0%} of the simulations near the belief do the "
+            "same: the simulator lacks a way to fail, or the status of the trial is "
+            "wrong"
         )
     assumption = Assumption(followed, float(blur))
     return diagnostics.extended(

@@ -17,7 +17,6 @@ from sbi_active.inference.refinement.regression_error import (
 )
 from sbi_active.inference.refinement.tails import tail_probability
 from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
-from sbi_active.messages import message
 
 Array = NDArray[Any]
 
@@ -185,64 +184,57 @@ def diagnose(
     correlation, is_independent = _trial_correlation(live, num_trials)
     ratio = max((fit.ratio for fit in live), default=np.inf)
 
-    assumptions: dict[str, tuple[bool, float, str, str]] = {
+    assumptions: dict[str, tuple[bool, float, str]] = {
         "gaussian_noise": (
             is_gaussian,
             negentropy,
-            "SA110",
-            "the noise is not Gaussian (it differs by {:.2g} nats a number), and the "
-            "belief, which takes it for Gaussian, may be too wide or too narrow; "
-            "check against a belief of a trained network",
+            "SA110 the noise is not Gaussian (it differs by {:.2g} nats a number), "
+            "and the belief, which takes it for Gaussian, may be too wide or too "
+            "narrow; check against a belief of a trained network",
         ),
         "few_modes": (
             effective >= MIN_EFFECTIVE,
             effective,
-            "SA111",
-            "at some stage only {:.1%} of the particles counted, as with many narrow "
-            "modes, and a mode may be lost; raise num_histories",
+            "SA111 at some stage only {:.1%} of the particles counted, as with "
+            "many narrow modes, and a mode may be lost; raise num_histories",
         ),
         "smooth_response": (
             roughness <= ROUGH,
             roughness,
-            "SA111",
-            "over the prior the outcomes have more turns than a cubic, which misses "
-            "{:.0%} of their variance, so that four or more narrow modes are possible "
-            "and one may be lost; check against another seed or a narrower prior",
+            "SA111 over the prior the outcomes have more turns than a cubic, which "
+            "misses {:.0%} of their variance, so that four or more narrow modes "
+            "are possible and one may be lost; check against another seed or a "
+            "narrower prior",
         ),
         "no_misfit": (
             last.excess <= SERIOUS_MISFIT,
             ratio,
-            "SA112",
-            "the residuals of the surrogate have {:.2g} times the variance of the "
-            "noise, so that the belief is too wide; raise num_histories",
+            "SA112 the residuals of the surrogate have {:.2g} times the variance "
+            "of the noise, so that the belief is too wide; raise num_histories",
         ),
         "settled": (
             len(course.stages) > 1 and course.divergence <= UNSETTLED * dim,
             course.divergence if len(course.stages) > 1 else -1.0,
-            "SA109",
-            "the last stage still changed the belief, by {:.2g} nats; raise "
+            "SA109 the last stage still changed the belief, by {:.2g} nats; raise "
             "num_histories",
         ),
         "independent_trials": (
             is_independent,
             correlation,
-            "SA104",
-            "simulated trials correlate at the same parameters ({:.2f}), yet the "
-            "likelihood is a product over trials; check how the simulator seeds "
+            "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
+            "the likelihood is a product over trials; check how the simulator seeds "
             "its noise",
         ),
         "small_error": (
             last.error <= UNTRUSTED,
             last.error,
-            "SA105",
-            "the belief is off by about {:.2g} nats, since its regressions rest on few "
-            "simulations for so many parameters and numbers; raise num_histories",
+            "SA105 the belief is off by about {:.2g} nats, since its regressions "
+            "rest on few simulations for so many parameters and numbers; raise "
+            "num_histories",
         ),
     }
     warnings = [
-        message(code, text.format(figure))
-        for ok, figure, code, text in assumptions.values()
-        if not ok
+        text.format(figure) for ok, figure, text in assumptions.values() if not ok
     ]
     warnings += misplaced(tail, joint, edge_mass)
     return Diagnostics(
@@ -250,7 +242,7 @@ def diagnose(
         warnings=(*warnings,),
         assumptions={
             name: Assumption(bool(ok), float(figure))
-            for name, (ok, figure, *_) in assumptions.items()
+            for name, (ok, figure, _) in assumptions.items()
         },
         num_simulations=num_simulations,
         effective_sample_size=float(last.fit.fit.effective_sample_size),

@@ -97,10 +97,9 @@ def round_rows(
     if not (exclude_invalid and bool(invalid.any())):
         return rows
     warn(
-        "SA302",
-        f"dropping {int(invalid.sum())} of {len(x)} simulations without a measurement: "
-        "information gain is then biased towards actions that fail. The default "
-        "MixtureDensity network keeps them.",
+        f"SA302 dropping {int(invalid.sum())} of {len(x)} simulations without a "
+        "measurement: information gain is then biased towards actions that fail. The "
+        "default MixtureDensity network keeps them.",
         stacklevel=4,
     )
     return RoundRows(theta[~invalid], x[~invalid], action[~invalid])

@@ -35,7 +35,7 @@ from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
 from sbi_active.inference.trainers.base import Told
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
-from sbi_active.messages import message, warn
+from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators, kept_generators
 
 NUM_PROBES = 64  # draws of the prior, at one of which a network has a finite density
@@ -261,15 +261,14 @@ class ASBI(MixtureRounds, NPE_C):
             if not required:
                 return None
             warn(
-                fault[0],
-                f"the network has never seen an outcome like {trial.x.tolist()}: "
-                f"{fault[1]}, so the belief is left unchanged. Refine with the "
-                "simulator, simulate such outcomes as NaN, or leave the trial out "
-                "where a fault caused them.",
+                f"{fault[0]} the network has never seen an outcome like "
+                f"{trial.x.tolist()}: {fault[1]}, so the belief is left unchanged. "
+                "Refine with the simulator, simulate such outcomes as NaN, or leave "
+                "the trial out where a fault caused them.",
                 stacklevel=5,
             )
             unchanged = UnchangedBelief(prior, previous)
-            unchanged.diagnostics = unchanged.diagnostics.warned(message(*fault))
+            unchanged.diagnostics = unchanged.diagnostics.warned(" ".join(fault))
             return unchanged
         with warnings.catch_warnings():
             if not required:  # refinement repairs what the network misses

@@ -30,7 +30,6 @@ from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
 from sbi_active.inference.trainers.base import Told
-from sbi_active.messages import message
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, simulate
 
@@ -275,12 +274,9 @@ class ProductRounds(ActionRounds):
         num_lost = len(used) - len(counted)
         if num_lost:
             sampled.diagnostics = sampled.diagnostics.warned(
-                message(
-                    "SA113",
-                    f"{num_lost} trials are left out, at which the network's density "
-                    "is finite nowhere: a measurement is wrong, or the simulator lacks "
-                    "much",
-                )
+                f"SA113 {num_lost} trials are left out, at which the network's "
+                "density is finite nowhere: a measurement is wrong, or the simulator "
+                "lacks much"
             )
         return sampled
 

@@ -145,9 +145,8 @@ class SeqBED(AmortizedRounds, NRE_C):
         classifier = args[1] if len(args) > 1 else kwargs.get("classifier")
         if isinstance(classifier, LFIRE) or LFIRE_KEYWORDS & {*kwargs}:
             warn(
-                "SA701",
-                "sbi_active.SeqBED of logistic regressions goes in the next version: "
-                "use sbi_active.inference.SeqBED_LFIRE",
+                "SA701 sbi_active.SeqBED of logistic regressions goes in the next "
+                "version: use sbi_active.inference.SeqBED_LFIRE",
                 stacklevel=2,
             )
             return SeqBED_LFIRE(*args, **kwargs)  # pyright: ignore[reportReturnType]
@@ -159,10 +158,9 @@ class SeqBED(AmortizedRounds, NRE_C):
         """Return the draws as they are, see :meth:`.ActiveInference.arrange`."""
         if self._is_default:  # this method is what the class of that name asked for
             warn(
-                "SA702",
-                "SeqBED(prior) learns one ratio for all parameters, as SeqBED_C did in "
-                "the last version; for a logistic regression at each particle use "
-                "sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
+                "SA702 SeqBED(prior) learns one ratio for all parameters, as SeqBED_C "
+                "did in the last version; for a logistic regression at each particle "
+                "use sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
                 "SeqBED(prior, RatioClassifier())",
                 ChangedWarning,
                 stacklevel=2,

@@ -216,10 +216,9 @@ def _warn(schedule: Schedule) -> None:
         row, text = min(schedule.tracebacks.items())
         last = text.strip().splitlines()[-1]
         warn(
-            "SA301",
-            f"{schedule.faults.total()} of {len(schedule.theta)} rows are missing: "
-            f"{counts}; the first is row {row}: {last}. All tracebacks are in "
-            "Simulations.tracebacks",
+            f"SA301 {schedule.faults.total()} of {len(schedule.theta)} rows are "
+            f"missing: {counts}; the first is row {row}: {last}. All tracebacks are "
+            "in Simulations.tracebacks",
             MissingRowsWarning,
             stacklevel=3,
         )
