@@ -26,6 +26,8 @@ ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "sbi_active"
 #: Errors that another one of the library says in its own words.
 CAUGHT = 9
+#: What takes messages.
+GATHERED = re.compile(r"warn|.*\.warned|(texts|warnings|defects|self\.notes)\.append")
 #: What is yielded there is one sentence of a report each.
 YIELDED = {"cautions.py", "suspects.py", "given.py"}
 
@@ -64,7 +66,9 @@ def texts(path: Path, node: ast.AST) -> list[ast.expr]:
         return [node.value]
     if isinstance(node, ast.Call):
         called = ast.unparse(node.func)
-        return node.args if called == "warn" or called.endswith(".warned") else []
+        return node.args if GATHERED.fullmatch(called) else []
+    if isinstance(node, ast.Tuple) and path.name == "trust.py":
+        return node.elts[2:3]  # holds, figure, text
     return []
 
 
