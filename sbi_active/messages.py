@@ -1,180 +1,167 @@
-"""Where each message of the library is explained, said in its own text.
+"""Messages by code: what each warning is called, its class, and where it is explained.
 
-A warning that Python shows, and a sentence of ``belief.diagnostics.warnings``, of a
-report's or of ``check_simulator``, ends in "(see warnings.html#rows-missing)": a page
-of the site, ``docs/howto/warnings.md``, whose headings are the phrases below. So does
-an error or warning of a class of this library. Built-in errors about an argument say
-what was expected, what was given and what to do, and nothing else.
+``messages.md`` beside this file is the registry: a code, a title, and what to do. The
+site's page "What the warnings mean" is that file. A message ends in its place there,
+"(see warnings.html#sa301-rows-missing)", which is all that it needs to keep its code
+through JSON, a file, or another process. Built-in errors about an argument have none:
+they say what was expected, what was given and what to do.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
+from functools import cache
+from pathlib import Path
 
 PAGE = "warnings.html"
-#: Words of a message, and the place on the page where it is explained. Of several that
-#: occur in a text the first is named.
-ANCHORS = {
-    # Of a belief.
-    "of the network's posterior lies within the": "network-outside-prior",
-    "the network has never seen an outcome like": "unseen-outcome",
-    "no simulation it was trained on lacks": "unseen-outcome",
-    "its density is finite nowhere": "density-nowhere",
-    "are left out, at which the network's density": "density-nowhere",
-    "the ratios are finite nowhere": "density-nowhere",
-    "was not simulated; the": "action-not-simulated",
-    "the belief has to be computed again": "belief-again",
-    "is computed again": "belief-again",
-    "was corrected since": "belief-again",
-    "were told or corrected since": "belief-again",
-    "is recorded and not in the belief": "budget-used-up",
-    "given up, tell it again": "given-up",
-    "hold for this process": "options-of-a-load",
-    "restored from": "given-up",
-    "away from anything simulated": "unlike-simulated",
-    "that no simulation from the prior has": "unlike-simulated",
-    "unlike anything simulated": "unlike-simulated",
-    "fresh simulations do not confirm the belief": "not-confirmed",
-    "lies within 1 % of the prior's edge": "prior-edge",
-    "is at a bound of its prior": "prior-edge",
-    "simulated trials correlate at the same parameters": "trials-correlate",
-    "the belief is off by about": "few-simulations",
-    "the last stage still changed the belief": "not-settled",
-    "the noise is not Gaussian": "not-gaussian",
-    "of the particles counted, as with many": "many-modes",
-    "have more turns than a cubic": "many-modes",
-    "the residuals of the surrogate have": "surrogate-misfit",
-    "the belief rests on": "few-draws",
-    "few effective draws": "few-draws",
-    "effective draws: the posterior is not": "not-linear",
-    "particles are effective": "few-draws",
-    "few draws outweigh all others": "heavy-tail",
-    "of the moves of the particles were accepted": "particles-stuck",
-    "the best mode was found by one of": "one-search",
-    "differs by": "order-matters",
-    "is followed coarsely": "followed-coarsely",
-    "had a measurement, or none, where": "no-way-to-fail",
-    "the amortized network is": "network-blunt",
-    "single trials disagree about": "trials-disagree",
-    "times the declared error": "beyond-declared",
-    # Of trials and tables.
-    "told numbers are infinite and count as": "infinite",
-    "x is inf in trial": "infinite",
-    "is not in": "action-outside",
-    "hold no number": "no-number",
-    "check that all are in one unit": "one-unit",
-    "is its time in ms": "log-in-ms",
-    "as an angle that wraps": "angle-wraps",
-    "are these degrees": "angle-degrees",
-    "begin up to": "late-starts",
-    "have a measurement and no input": "no-input",
-    "takes no argument": "argument-not-taken",
-    "leave a polynomial of order": "not-polynomial",
-    "expected at least 3 repeats to estimate noise": "few-repeats",
-    # Of simulations.
-    "simulations of the design are": "rows-missing",
-    "simulations of the refinement are": "rows-missing",
-    "of the refinement are missing": "rows-missing",
-    "rows are missing": "rows-missing",
-    "simulations without a measurement": "dropped-rows",
-    "change nothing that is read in": "idle-parameters",
-    "rows of the bank are worth": "bank-far",
-    "have density 0 under the proposal": "wrong-label",
-    "no workers at": "no-workers",
-    # Of check_simulator.
-    "rows have no measurement": "rows-without",
-    "no row has a measurement": "rows-without",
-    "their outcome is missing": "rows-missing",
-    "beside declared noise": "noise-twice",
-    "of x have no noise": "no-noise",
-    "rows permuted with their seeds": "rows-depend",
-    "one seed gives two different x": "not-reproducible",
-    "leaves x as it is": "idle-parameters",
-    "no parameter changes x": "idle-parameters",
-    "or permit actions that": "parameters-together",
-    # Of a closed loop.
-    "noise undeclared": "noise-undeclared",
-    "fewer than": "few-trials",
-    "drift aliased with the order of actions": "drift-aliased",
-    "actions chosen for information and not for": "chosen-actions",
-    "is far outside what the verdict's model": "held-out-missed",
-    "is far outside what the other trials show": "trial-outlying",
-    "outcomes that disagree": "outcomes-disagree",
-    "the simulator jumps": "jumps",
-    "independent errors forced on a trajectory": "correlated-errors",
-    "evidence uncertain of": "evidence-uncertain",
-    "the alarm rests on the chi-square alone": "chi-square-alone",
-    "explains the most, and not all": "not-all",
-    "two estimates of the bare model's evidence": "two-estimates",
-    "does not lower the error on trials that": "error-not-lowered",
-    "it does not lower the error": "error-not-lowered",
-    "and with a wider prior the model": "prior-edge",
-    "phi at its prior's edge": "phi-edge",
-    "is more than an instrument gets": "instrument",
-    "not robust to its prior": "not-robust",
-    "no declared effect explains the data": "unexplained",
-    "scatter is larger than the declared noise": "scatter",
-    "exploratory": "exploratory",
-    "does not agree with the others": "outlier",
-    "is not named, since": "outlier",
-    "without it the Bayes factor": "one-trial-decides",
-    "residuals are far smaller than the declared": "noise-too-large",
-    "what they leave out was not looked at": "summaries",
-    "thin=False uses all": "thinned",
-    "the order of the trials is unknown": "order-unknown",
-    "linear evidence puts the others behind": "screened",
-    "trials that were not fitted draw": "start-states",
-    # Names that change.
-    "goes in the next version": "renamed",
-    "is deprecated; use an attribute": "renamed",
-    "learns one ratio for all parameters": "seqbed",
+_ENTRY = re.compile(r"^### (SA\d+) (.+)\n((?:.+\n)+)", re.MULTILINE)
+_PLACE = re.compile(rf"\(see {PAGE}#(?:sa(\d+)-)?([\w-]+)\)$")
+
+
+class SBIActiveWarning(UserWarning):
+    """A warning of this library; those of each hundred of codes have a class."""
+
+    @property
+    def code(self) -> str:
+        """Of what is said, such as "SA301"."""
+        return Message(str(self)).code
+
+
+class BeliefWarning(SBIActiveWarning):
+    """A belief may be wrong."""
+
+
+class TrialWarning(SBIActiveWarning):
+    """Something is odd about what was measured."""
+
+
+class SimulationWarning(SBIActiveWarning):
+    """Simulations were lost, or are not what they were taken for."""
+
+
+class SimulatorWarning(SBIActiveWarning):
+    """A simulator will not serve well."""
+
+
+class LoopWarning(SBIActiveWarning):
+    """What a closed loop concludes is limited."""
+
+
+class StorageWarning(SBIActiveWarning):
+    """What is on disk is not as it should be."""
+
+
+class RenamedWarning(SBIActiveWarning, DeprecationWarning):
+    """A name goes in the next version."""
+
+
+class ChangedWarning(SBIActiveWarning, FutureWarning):
+    """A name means something else than in the last version."""
+
+
+CATEGORIES = {
+    "SA1": BeliefWarning,
+    "SA2": TrialWarning,
+    "SA3": SimulationWarning,
+    "SA4": SimulatorWarning,
+    "SA5": LoopWarning,
+    "SA6": StorageWarning,
+    "SA7": RenamedWarning,
 }
 
 
-def explained(text: str) -> str:
-    """Return a message with its place on the page; one that is unknown as it is.
+class Message(str):
+    """A sentence that knows its code.
+
+    Where it is said the code comes first: "SA301 3 of 9 rows are missing".
 
     Example:
-        >>> explained("3 of 9 rows are missing: 3 raised")
-        '3 of 9 rows are missing: 3 raised (see warnings.html#rows-missing)'
-        >>> explained(explained("few effective draws")) == explained(
-        ...     "few effective draws"
-        ... )
+        >>> said = Message("SA301 3 of 9 rows are missing: 3 raised")
+        >>> said, said.code, said.category.__name__
+        ('3 of 9 rows are missing: 3 raised (see warnings.html#sa301-rows-missing)',
+         'SA301', 'SimulationWarning')
+        >>> Message(said) == said
         True
+        >>> Message("few draws (see warnings.html#few-draws)").code  # as it was
+        'SA114'
     """
-    words = " ".join(text.split())
-    for phrase, anchor in ANCHORS.items():
-        if phrase in words:
-            place = f" (see {PAGE}#{anchor})"
-            return text if text.endswith(place) else text + place
-    return text
+
+    __slots__ = ()
+
+    def __new__(cls, text: object = "") -> Message:
+        """Put the place of a code that comes first to the end of a text."""
+        code, _, rest = str(text).partition(" ")
+        is_coded = code in explanations()
+        return super().__new__(cls, rest + place(code) if is_coded else str(text))
+
+    @property
+    def code(self) -> str:
+        """Its code, "" for a text without one."""
+        place = _PLACE.search(self)
+        if place is None:
+            return ""
+        number, slug = place.groups()
+        return f"SA{number}" if number else _codes().get(slug, "")
+
+    @property
+    def category(self) -> type[SBIActiveWarning]:
+        """Class of its warnings."""
+        return CATEGORIES.get(self.code[:3], SBIActiveWarning)
+
+
+@cache
+def explanations() -> dict[str, tuple[str, str]]:
+    """Return title and explanation of each code.
+
+    Example:
+        >>> explanations()["SA306"]
+        ('No workers', 'A cluster has no workers. Start some; the calls wait.')
+    """
+    text = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
+    return {c: (title, " ".join(t.split())) for c, title, t in _ENTRY.findall(text)}
+
+
+@cache
+def _codes() -> dict[str, str]:
+    """Return codes by slug, by which the last version named its places."""
+    return {_slug(title): code for code, (title, _) in explanations().items()}
+
+
+def _slug(title: str) -> str:
+    return title.lower().replace(" ", "-")
+
+
+def place(code: str) -> str:
+    """Return where a code is explained, as the end of a message."""
+    return f" (see {PAGE}#{code.lower()}-{_slug(explanations()[code][0])})"
 
 
 def warn(
-    text: str, category: type[Warning] = UserWarning, *, stacklevel: int = 1
+    text: str,
+    category: type[SBIActiveWarning] | None = None,
+    *,
+    stacklevel: int = 1,
 ) -> None:
     """Warn as :func:`warnings.warn` does, and say where the message is explained.
 
     Args:
-        text: Words of :data:`ANCHORS` among others.
-        category: Of the warning.
+        text: Code, what is wrong and what to do.
+        category: Class of the warning; None takes that of the code.
         stacklevel: 1 for the line that calls this, 2 for who called its function.
     """
-    warnings.warn(explained(text), category, stacklevel=stacklevel + 1)
+    said = Message(text)
+    warnings.warn(said, category or said.category, stacklevel=stacklevel + 1)
 
 
 class Explained:
-    """An error whose text names its place on the page, by the name of its class.
+    """An error whose text names its place on the page.
 
-    Example:
-        >>> class OddError(Explained, ValueError):
-        ...     pass
-        >>> print(OddError("expected an even number; got 3; pass one"))
-        expected an even number; got 3; pass one (see warnings.html#odd-error)
+    Attributes:
+        code: Its code.
     """
 
+    code: str
+
     def __str__(self) -> str:
-        name = next(c.__name__ for c in type(self).__mro__ if Explained in c.__bases__)
-        anchor = re.sub(r"\B(?=[A-Z])", "-", name).lower()
-        return f"{super().__str__()} (see {PAGE}#{anchor})"
+        return super().__str__() + place(self.code)

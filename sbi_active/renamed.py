@@ -1,16 +1,21 @@
 """Names of packages: imported when they are used, and those of the last version.
 
-The latter still work, and a warning says the new one.
+The latter still work, and a warning says the new one. So do keywords of that version.
 """
 
 from __future__ import annotations
 
+import functools
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
+from sbi_active.callers import stack_level
 from sbi_active.messages import warn
+
+Taking = TypeVar("Taking", bound=Callable[..., Any])
 
 
 def former_names(
@@ -32,8 +37,7 @@ def former_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home, _, new = names[name].partition(":")
         warn(
-            f"{package}.{name} goes in the next version: use {home}.{new}",
-            DeprecationWarning,
+            f"SA701 {package}.{name} goes in the next version: use {home}.{new}",
             stacklevel=stacklevel,
         )
         return pkgutil.resolve_name(names[name])
@@ -63,3 +67,91 @@ def lazy_names(
         return value
 
     return find
+
+
+def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by name, with loose ones in the settings that they belong to.
+
+    Args:
+        values: Some of which are fields of the settings.
+        groups: The class of each settings, a dataclass, by the name of its value.
+
+    Example:
+        >>> from sbi_active.simulation import Workers
+        >>> grouped({"seed": 0, "num_workers": 2}, {"workers": Workers})
+        {'seed': 0, 'workers': Workers(num_workers=2, time_limit=None, num_retries=0)}
+    """
+    found = dict(values)
+    for group, kind in groups.items():
+        names = [entry.name for entry in fields(kind) if entry.name in found]
+        loose = {name: found.pop(name) for name in names}
+        if loose:
+            whole = found.get(group) or kind()
+            whole = whole if isinstance(whole, kind) else kind(whole)
+            found[group] = replace(whole, **loose)
+    return found
+
+
+def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
+    """Let a function or a dataclass take fields of its settings as keywords.
+
+    For one version, with a warning. A dataclass has them as attributes as well.
+
+    Args:
+        **groups: As in :func:`grouped`.
+    """
+    home = {entry.name: g for g, kind in groups.items() for entry in fields(kind)}
+
+    def warned(what: str, name: str) -> None:
+        place = f"{home[name]}={groups[home[name]].__name__}({name}=)"
+        text = f"SA701 {what}({name}=) goes in the next version: use {place}"
+        warn(text, stacklevel=stack_level())
+
+    def decorate(taking: Any) -> Any:
+        function = taking.__init__ if isinstance(taking, type) else taking
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            loose = home.keys() & kwargs.keys()
+            for name in sorted(loose):
+                warned(taking.__name__, name)
+            return function(*args, **grouped(kwargs, groups) if loose else kwargs)
+
+        def find(self: Any, name: str) -> Any:
+            group = vars(self).get(home.get(name, ""))
+            if group is None:
+                raise AttributeError(f"{taking.__name__!r} has no attribute {name!r}")
+            warned(taking.__name__, name)
+            return getattr(group, name)
+
+        if function is taking:
+            return call
+        taking.__init__, taking.__getattr__ = call, find
+        return taking
+
+    return decorate
+
+
+def set_later(*names: str) -> Callable[[Taking], Taking]:
+    """Let a constructor take attributes that are set afterwards, for one version.
+
+    Args:
+        *names: Names of the attributes.
+    """
+
+    def decorate(make: Any) -> Any:
+        @functools.wraps(make)
+        def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+            later = {name: kwargs.pop(name) for name in names if name in kwargs}
+            made = make(self, *args, **kwargs)
+            for name, value in later.items():
+                text = (
+                    f"SA701 the keyword {name}= goes in the next version: set .{name}"
+                )
+                warn(text, stacklevel=stack_level())
+                setattr(self if made is None else made, name, value)
+            return made
+
+        return call
+
+    return decorate

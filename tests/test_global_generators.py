@@ -149,7 +149,7 @@ def test_simulators_and_noise(kept):
     for function in (noisy, by_numpy):
         model = kept("SimulatorModel", lambda f=function: SimulatorModel(f))
         kept("simulate", lambda m=model: simulate(m, THETA, ACTION, seed=0))
-    kept("workers", lambda: simulate(MODEL, THETA, ACTION, seed=0, num_workers=2))
+    kept("workers", lambda: simulate(MODEL, THETA, ACTION, seed=0, workers=2))
     seeds = torch.arange(len(THETA))
     kept("model", lambda: MODEL(THETA, ACTION, seeds=seeds))
     kept("mean", lambda: MODEL.mean(THETA, ACTION))

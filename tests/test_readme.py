@@ -221,6 +221,11 @@ def test_question_recordings(run, tmp_path, monkeypatch):
     assert not read.frame.isna().any().any()
 
 
+def test_question_warnings(run):
+    (page,) = run("docs/howto/warnings.md")
+    assert page.title == "Rows missing"
+
+
 def test_no_page_is_forgotten():
     pages = {
         page.name
@@ -247,6 +252,7 @@ def test_no_page_is_forgotten():
         "recordings.md",
         "pouring.md",
         "robust.md",
+        "warnings.md",
     }
 
 

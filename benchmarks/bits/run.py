@@ -48,6 +48,7 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import close_loop, generic_effects
 from sbi_active.inference import Observation
 from sbi_active.seeding import forked_generators, row_normals
@@ -61,7 +62,7 @@ SMALL = CampaignOptions(
     num_simulations=600,
     num_samples=200,
     density_estimator=MixtureDensity(num_iterations=60),
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
 )
 CURVES: dict[str, Callable[[Tensor], Tensor]] = {
     "linear": lambda t: t,
@@ -94,7 +95,11 @@ def campaign(method: str) -> list[Any]:
     task = get_task("numerical")
     options = SMALL
     if method == "seqbed":
-        options = CampaignOptions(num_simulations=600, num_samples=200, num_scored=200)
+        options = CampaignOptions(
+            num_simulations=600,
+            num_samples=200,
+            details=CampaignDetails(num_scored=200),
+        )
     run = Campaign(
         task.simulator, task.prior, task.actions, method=method, seed=3, options=options
     )
@@ -265,9 +270,9 @@ def engine(num_workers: int) -> list[Any]:
     with forked_generators(0):
         theta = BOX.sample((1_000,))
     action = torch.linspace(-5, 5, 1_000)[:, None]
-    by_seeds = simulate(seeded, theta, action, seed=0, num_workers=num_workers)
+    by_seeds = simulate(seeded, theta, action, seed=0, workers=num_workers)
     task = get_task("numerical")
-    by_blocks = simulate(task.simulator, theta, action, seed=0, num_workers=num_workers)
+    by_blocks = simulate(task.simulator, theta, action, seed=0, workers=num_workers)
     return [by_seeds.x, by_blocks.x]
 
 

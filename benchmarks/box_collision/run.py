@@ -44,7 +44,9 @@ from benchmarks.rows import append, read, short
 from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.campaign.learning.methods import METHODS, find_method
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import Workers
 from sbi_active.tasks import Task, get_task
 from sbi_active.tasks.box_collision import (  # pyright: ignore
     BoxCollisionReference,
@@ -63,7 +65,7 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
             num_samples=500,  # half of them choose, half report
             density_estimator=MixtureDensity.faithful(),
             estimator="posterior",
-            eliminate=False,
+            details=CampaignDetails(eliminate=False),
             refine=False,
         ),
         {"left_table": "paper"},
@@ -73,16 +75,23 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
     "paper_size": (
         CampaignOptions(
             num_simulations=41 * 500,
-            num_scored=500,
-            design_on="training",
+            details=CampaignDetails(num_scored=500, design_on="training"),
             refinement=RefinementOptions(num_effective=100, num_draws=100),
         ),
         {},
     ),
-    "default": (CampaignOptions(num_samples=250, num_scored=500), {}),
+    "default": (
+        CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500)),
+        {},
+    ),
     # Beliefs and information by the networks alone, which is where the methods differ:
     # by default the declared noise gives both, whatever was learned.
-    "learned": (CampaignOptions(num_samples=250, num_scored=500, refine=False), {}),
+    "learned": (
+        CampaignOptions(
+            num_samples=250, details=CampaignDetails(num_scored=500), refine=False
+        ),
+        {},
+    ),
 }
 COLUMNS = [
     *["seed", "theta_true", "round", "speed", "is_valid", "x", "y", "z", "eig"],
@@ -180,7 +189,7 @@ def run_trial(
         task.actions,
         method=method,
         seed=seed,
-        options=replace(options, num_workers=arguments.workers),
+        options=replace(options, workers=Workers(num_workers=arguments.workers)),
     )
     rows: list[dict[str, object]] = []
     past = None

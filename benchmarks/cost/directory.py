@@ -39,6 +39,7 @@ from sbi_active import (
     RefinementOptions,
     SimulatorModel,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import forked_generators
 
 RESULT = Path(__file__).with_suffix(".json")
@@ -49,7 +50,7 @@ PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 ACTIONS = BoxActions([0.5], [2.0])
 OPTIONS = CampaignOptions(
     network="on demand",
-    num_scored=500,
+    details=CampaignDetails(num_scored=500),
     refinement=RefinementOptions(num_histories=1_000),
 )
 THETA = torch.tensor([[0.3, 0.6]])

@@ -37,7 +37,7 @@ from joblib import Parallel, delayed
 from torch import Tensor
 
 from sbi_active.seeding import row_normals, row_seeds
-from sbi_active.simulation import MissingRowsWarning, simulate
+from sbi_active.simulation import MissingRowsWarning, Workers, simulate
 
 TIME_LIMIT = 0.5  # s
 
@@ -140,7 +140,12 @@ def overhead(
 
     def engine() -> None:
         simulate(
-            simulator, theta, theta, seed=0, batch_size=batch_size, time_limit=limit
+            simulator,
+            theta,
+            theta,
+            seed=0,
+            batch_size=batch_size,
+            workers=Workers(time_limit=limit),
         )
 
     clock = cpu_time if burns else time.perf_counter
@@ -178,7 +183,7 @@ def workers(
             theta,
             theta,
             seed=0,
-            num_workers=num,
+            workers=num,
             batch_size=batch_size,
         )
 
@@ -215,8 +220,7 @@ def faults(num_rows: int, num_workers: int) -> dict[str, Any]:
             theta,
             theta,
             seed=0,
-            num_workers=num_workers,
-            time_limit=TIME_LIMIT,
+            workers=Workers(num_workers=num_workers, time_limit=TIME_LIMIT),
         )
     same = bool(torch.equal(rows.x[rows.valid], clean.x[rows.valid]))
     index = torch.arange(num_rows)

@@ -22,6 +22,7 @@ from benchmarks.misfit import cases as misfit
 from benchmarks.oracles.calibration import drawn
 from benchmarks.record.measured import MEASURED
 from sbi_active import BoxActions, Campaign, CampaignOptions
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Trials, close_loop, identify
 from tests.oracles.problem import Problem
 from tests.oracles.ways import trials_of
@@ -122,7 +123,9 @@ def campaign(own: Problem, options: dict[str, Any], seed: int) -> Result:
         counted.simulator(is_declared=True),
         own.prior,
         space,
-        options=CampaignOptions(num_samples=400, num_scored=400, **options),
+        options=CampaignOptions(
+            num_samples=400, details=CampaignDetails(num_scored=400), **options
+        ),
         seed=seed,
     )
     found, rng = Result(), np.random.default_rng(own.seed)

@@ -254,7 +254,7 @@ def _on_dask(simulator: Any, *rows: torch.Tensor, start: Any, workers: int = 2) 
             client.wait_for_workers(workers)
         threading.Thread(target=start, args=(cluster, client), daemon=True).start()
         with joblib.parallel_config(backend="dask"):
-            return simulate(simulator, *rows, seed=0, num_workers=2)
+            return simulate(simulator, *rows, seed=0, workers=2)
 
 
 @ATTACKS.add("Dask workers are killed", cases=(0.3, 1.0, "one"), seconds=300)

@@ -40,6 +40,7 @@ from sbi_active import (
     to_inference_data,
 )
 from sbi_active.campaign import StopRules
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.inference import LFIRE
 
 ATTACKS = Attacks(OUTCOMES)
@@ -227,7 +228,7 @@ def wrong_settings(case: str) -> None:
         if case == "rows":
             replace(OPTIONS, num_simulations=3)
         if case == "scored":
-            replace(OPTIONS, num_scored=3)
+            replace(OPTIONS, details=CampaignDetails(num_scored=3))
         if case == "sd":
             StopRules(max_sd=-1.0)
         if case == "seed":
@@ -249,7 +250,7 @@ def lfire(bad: float) -> None:
 @ATTACKS.add("two workers see the same campaign", cases=("nsbi", "bad number"))
 def workers(case: str) -> None:
     bad = {1: 1e15} if case == "bad number" else {}
-    one, two = (tell(campaign(num_workers=n), bad) for n in (1, 2))
+    one, two = (tell(campaign(workers=n), bad) for n in (1, 2))
     same(one, two)
 
 

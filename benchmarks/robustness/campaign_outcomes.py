@@ -25,6 +25,7 @@ from benchmarks.robustness.campaign_problem import (
     same,
     tell,
 )
+from sbi_active.campaign.options import CampaignDetails
 
 ATTACKS = Attacks()
 
@@ -123,7 +124,7 @@ def seldom_measured(method: str) -> None:
         gone = (action == 1.0) & (theta < 0.99)
         return torch.where(gone, torch.nan, noisy(theta, action))
 
-    c = tell(campaign(method, lost, num_scored=1_000))
+    c = tell(campaign(method, lost, details=CampaignDetails(num_scored=1_000)))
     c.update()
     assert c.belief.diagnostics.trustworthy is False  # pyright: ignore
     c.ask()

@@ -25,6 +25,7 @@ from sbi_active import (
     RefinementOptions,
     SimulatorModel,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Effect
 from sbi_active.inference import RatioClassifier
 
@@ -37,7 +38,7 @@ MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise
 OPTIONS = CampaignOptions(
     num_simulations=300,
     num_samples=100,
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
     refinement=RefinementOptions(num_histories=300, num_effective=25),
 )

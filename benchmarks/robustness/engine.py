@@ -59,12 +59,12 @@ def interrupt(kind: str) -> None:
     expected = quietly(seeded, 5_000).x
     if kind in simulator:
         expected = rows_of(5_000)[0]
-    quietly(seeded, 4, num_workers=2)  # starts what starts workers
+    quietly(seeded, 4, workers=2)  # starts what starts workers
     signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT)).start()
     num_workers = 2 if kind == "two workers" else 1
     try:
-        quietly(simulator.get(kind, slow), 5_000, num_workers=num_workers)
+        quietly(simulator.get(kind, slow), 5_000, workers=num_workers)
     except SimulationInterrupted as error:
         rows = error.simulations
         assert int(rows.valid.sum()) >= 150, rows.counts
@@ -218,4 +218,4 @@ def folder(_: str) -> None:
     def simulator(theta: Tensor, action: Tensor, seeds: Tensor) -> Tensor:
         return theta * 0 + float(Path("value").read_text())
 
-    assert (quietly(simulator, 20, num_workers=2).x == 4).all()
+    assert (quietly(simulator, 20, workers=2).x == 4).all()

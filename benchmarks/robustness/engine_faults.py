@@ -27,6 +27,7 @@ from benchmarks.robustness.simulations import (
 from sbi_active import SimulatorModel
 from sbi_active.simulation import (
     SimulationError,
+    Workers,
 )
 
 ATTACKS = Attacks()
@@ -57,7 +58,7 @@ def raised_in_worker(kind: str) -> None:
             raise error("the reason")
         return seeded(theta, action, seeds)
 
-    rows = quietly(simulator, 100, num_workers=2)
+    rows = quietly(simulator, 100, workers=2)
     require(rows, quietly(seeded, 100).x, missing=(11,))
     assert "the reason" in rows.tracebacks[11]
     assert "in simulator" in rows.tracebacks[11]
@@ -74,7 +75,7 @@ def raised_in_setup(kind: str) -> None:
         return theta
 
     model = SimulatorModel(fn, setup=setup)
-    require_raises(SimulationError, "no licence", lambda: quietly(model, num_workers=2))
+    require_raises(SimulationError, "no licence", lambda: quietly(model, workers=2))
 
 
 class UnprintableError(Exception):
@@ -114,7 +115,7 @@ def death(kind: str) -> None:
         return seeded(theta, action, seeds)
 
     expected = quietly(seeded, 60).x
-    require(quietly(simulator, 60, num_workers=2), expected, missing=(11,))
+    require(quietly(simulator, 60, workers=2), expected, missing=(11,))
 
 
 @ATTACKS.add("a row hangs", cases=(1, 2))
@@ -124,7 +125,9 @@ def hanging(num_workers: int) -> None:
             time.sleep(600)
         return seeded(theta, action, seeds)
 
-    rows = quietly(simulator, 60, num_workers=num_workers, time_limit=0.3)
+    rows = quietly(
+        simulator, 60, workers=Workers(num_workers=num_workers, time_limit=0.3)
+    )
     require(rows, quietly(seeded, 60).x, missing=(11,))
     assert "timed out" in rows.tracebacks[11]
 

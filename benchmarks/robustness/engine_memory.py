@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import joblib
@@ -25,6 +26,7 @@ from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorMode
 from sbi_active.criticism import Trials
 from sbi_active.inference.rounds import action_rows, outcome_rows
 from sbi_active.simulation import (
+    Workers,
     simulate,
 )
 
@@ -98,7 +100,7 @@ def own_buffer(case: tuple[str, str]) -> None:
 def buffer_in_rounds(backend: str) -> None:
     with joblib.parallel_config(backend=backend):
         for simulator in (Buffer("torch"), with_seeds(Buffer("torch"))):
-            rows = quietly(simulator, 700, num_workers=2, batch_size=60)
+            rows = quietly(simulator, 700, workers=2, batch_size=60)
             require(rows, 2 * rows_of(700)[0])
 
 
@@ -176,7 +178,8 @@ def changed_then_raised(way: str) -> None:
         return x
 
     for retries in (0, 2):
-        rows = quietly(simulator, num_retries=retries, **WAYS[way])
+        workers = replace(Workers.of(WAYS[way].get("workers")), num_retries=retries)
+        rows = quietly(simulator, **{**WAYS[way], "workers": workers})
         require(rows, rows_of(300)[0], missing=guilty)
 
 

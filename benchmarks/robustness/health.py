@@ -36,6 +36,7 @@ from sbi_active import (
     MixtureDensity,
     RefinementOptions,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.inference.refinement import LARGE
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -64,7 +65,7 @@ CHEAP = CampaignOptions(
 #: For campaigns of many numbers, which cost more.
 CHEAPER = replace(
     CHEAP,
-    num_scored=1_000,
+    details=CampaignDetails(num_scored=1_000),
     refinement=RefinementOptions(num_histories=400),
 )
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import (
+    Workers,
     simulate,
 )
 
@@ -18,8 +19,8 @@ WAYS: dict[str, dict[str, Any]] = {
     "one call": {},
     "batches of 1": {"batch_size": 1},
     "batches of 33": {"batch_size": 33},
-    "two workers": {"num_workers": 2},
-    "time limit": {"time_limit": 30.0},
+    "two workers": {"workers": Workers(2)},
+    "time limit": {"workers": Workers(time_limit=30.0)},
 }
 FEW_WAYS = ("one call", "batches of 33", "two workers")
 

@@ -33,6 +33,7 @@ from sbi_active import (
     RefinementOptions,
     SimulatorModel,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import derive_seed, forked_generators
 
 RESULT = Path(__file__).parent / "results" / "units.json"
@@ -62,7 +63,7 @@ ACTIONS = BoxActions([3.0], [9.0], names=["speed"], units=["m/s"])
 OPTIONS = CampaignOptions(
     num_simulations=500,
     num_samples=200,
-    num_scored=500,
+    details=CampaignDetails(num_scored=500),
     density_estimator=MixtureDensity(num_iterations=100),
     refinement=RefinementOptions(num_histories=1_000),
 )

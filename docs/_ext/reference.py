@@ -23,6 +23,7 @@ PACKAGES = [n for n in (*sbi_active._HOMES, "pyro", "tasks") if n != "export"]
 #: Modules whose classes and functions users meet without importing them, by package.
 FURTHER = {
     "actions": {"sbi_active.actions.waveforms": ()},
+    "campaign": {"sbi_active.campaign.options": ("CampaignDetails",)},
     "criticism": {
         "sbi_active.criticism.results": (),
         "sbi_active.criticism.contradictions": ("SevereTest",),

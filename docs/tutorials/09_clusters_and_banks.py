@@ -38,12 +38,12 @@ with (
     distributed.Client(cluster),
     joblib.parallel_config(backend="dask"),
 ):
-    there = simulate(model, theta, action, seed=0, num_workers=2)
+    there = simulate(model, theta, action, seed=0, workers=2)
 torch.equal(here.x, there.x)
 
 # %% [markdown]
-# A row that raises, hangs (`time_limit=`) or kills its process is *missing*, with its
-# traceback, and costs no other row:
+# A row that raises, hangs (`Workers(time_limit=)`) or kills its process is *missing*,
+# with its traceback, and costs no other row:
 
 
 # %%
@@ -99,6 +99,6 @@ print(campaign.belief)
 print("simulated", campaign.state.meter.spent, "of", options.max_simulations)
 
 # %% [markdown]
-# With `bank="folder"`, `num_workers=8` and `time_limit=600` these rows are kept, run
+# With `bank="folder"` and `workers=Workers(8, time_limit=600)` these rows are kept, run
 # side by side and given up after ten minutes: see [how
 # many](../howto/how_many_simulations.md).

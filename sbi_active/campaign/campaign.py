@@ -32,6 +32,7 @@ from sbi_active.campaign.storage.manifest import new_manifest, write_manifest
 from sbi_active.campaign.storage.simulations import num_rows
 from sbi_active.campaign.storage.storage import Storage, stored
 from sbi_active.campaign.trials import CampaignTrials
+from sbi_active.renamed import set_later
 from sbi_active.simulation.workers.meter import metering
 
 if TYPE_CHECKING:
@@ -68,8 +69,6 @@ class Campaign(CampaignTrials):
         options: Sizes and estimators; or fields of them in a dict.
         directory: New or empty folder to keep the campaign in, as it happens: whatever
             ends the process, :meth:`load` goes on. None keeps it in memory alone.
-        on_trial: Called with each trial that was told, once it is recorded.
-        on_update: Called with each trial, once the belief contains it.
         show_progress: Draw a bar of what is being done, and of the rounds of
             :meth:`run`. The logger "sbi_active" says it of all that takes 2 s anyway.
 
@@ -96,6 +95,7 @@ class Campaign(CampaignTrials):
         >>> belief = campaign.update()
     """
 
+    @set_later("on_trial", "on_update")
     @isolated
     def __init__(
         self,
@@ -110,8 +110,6 @@ class Campaign(CampaignTrials):
         seed: int = 0,
         options: CampaignOptions | Mapping[str, Any] | None = None,
         directory: str | os.PathLike[str] | None = None,
-        on_trial: Callable[[Trial], None] | None = None,
-        on_update: Callable[[Trial], None] | None = None,
         show_progress: bool = False,
     ) -> None:
         find_method(method)  # an unknown name is an error here
@@ -122,7 +120,6 @@ class Campaign(CampaignTrials):
         limits = Limits(actions, constraint, cost)
         state.watch = StageWatch(show_progress)
         self._begin(state, actions, learner, Planner(limits, state, effects))
-        self.on_trial, self.on_update = on_trial, on_update
         disk = None
         if directory is not None:
             manifest = new_manifest(
@@ -147,6 +144,7 @@ class Campaign(CampaignTrials):
         self._learner, self._planner = learner, planner
 
     @classmethod
+    @set_later("on_trial", "on_update")
     @isolated
     def load(
         cls,
@@ -159,8 +157,6 @@ class Campaign(CampaignTrials):
         cost: Callable[[Tensor], Tensor] | Tensor | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
         options: CampaignOptions | Mapping[str, Any] | None = None,
-        on_trial: Callable[[Trial], None] | None = None,
-        on_update: Callable[[Trial], None] | None = None,
         show_progress: bool = False,
         simulator_changed: bool = False,
         repair: bool = False,
@@ -184,8 +180,6 @@ class Campaign(CampaignTrials):
             options: None takes the directory's; needed where an estimator is of your
                 own. Others than before hold for this process, with a warning. A dict
                 gives all that are not default, as in the constructor.
-            on_trial: As in the constructor.
-            on_update: As in the constructor.
             show_progress: As in the constructor.
             simulator_changed: Take another simulator than the campaign was made with,
                 and compute everything again with it.
@@ -215,7 +209,6 @@ class Campaign(CampaignTrials):
         planner = Planner(limits, found.state, declared)
         found.state.watch = StageWatch(show_progress)
         self._begin(found.state, found.actions, found.learner, planner)
-        self.on_trial, self.on_update = on_trial, on_update
         self._storage = Storage(found.disk, found.state.options.bank, found.prior)
         return self
 

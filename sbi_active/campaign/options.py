@@ -10,11 +10,57 @@ from typing import Any, Literal
 import cloudpickle
 
 from sbi_active.campaign.stopping import StopRules
+from sbi_active.expected import require
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.renamed import grouped, takes_loose
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
+@dataclass(frozen=True, kw_only=True)
+class CampaignDetails:
+    """What few campaigns set otherwise; the papers' experiments do.
+
+    Attributes:
+        posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
+            :class:`.ALHI`.
+        eliminate: Whether candidates far behind the leader get no further samples.
+        design_on: "fresh" simulations, or those of the "training", which costs none
+            further; the estimates are then too high, the more so the fewer rows.
+        min_probability_valid: Actions that give a measurement less often are chosen
+            neither for the parameters nor at random.
+        repeat: Whether an action may be chosen again.
+        num_scored: Simulations of each executed action, from the belief before the
+            trial, that its outcome is compared with.
+    """
+
+    posterior: str = "importance"
+    eliminate: bool = True
+    design_on: Literal["fresh", "training"] = "fresh"
+    min_probability_valid: float = 0.0
+    repeat: bool = True
+    num_scored: int = 2_000
+
+    def __post_init__(self) -> None:
+        require(
+            self.design_on in ("fresh", "training"),
+            "design_on 'fresh' or 'training'",
+            repr(self.design_on),
+            "choose one of these",
+        )
+        require(
+            self.num_scored >= 100,
+            "num_scored >= 100",
+            self.num_scored,
+            "use about 2000, since no tail probability is below 1 / (num_scored + 1)",
+        )
+
+
+#: Settings whose fields were options of a campaign in the last version.
+GROUPS = {"workers": Workers, "details": CampaignDetails}
+
+
+@takes_loose(**GROUPS)
 @dataclass(frozen=True, kw_only=True)
 class CampaignOptions:
     """Sizes and estimators of a campaign.
@@ -26,16 +72,8 @@ class CampaignOptions:
         density_estimator: What is learned: as in :class:`.ASBI` and
             :class:`.ALHI`; for "seqbed" a classifier as in
             :class:`.SeqBED`, or :class:`.LFIRE`.
-        posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
-            :class:`.ALHI`.
         estimator: Of the expected information gain, as in
             :class:`.InformationGainDesigner`; "posterior" is the paper's.
-        eliminate: Whether candidates far behind the leader get no further samples.
-        design_on: "fresh" simulations, or those of the "training", which costs none
-            further; the estimates are then too high, the more so the fewer rows.
-        min_probability_valid: Actions that give a measurement less often are chosen
-            neither for the parameters nor at random.
-        repeat: Whether an action may be chosen again.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
         network: When a round's network is trained: "each round", so that the amortized
@@ -46,8 +84,6 @@ class CampaignOptions:
             time (``benchmarks/cost/network.json``). Beliefs are refined without the
             network whoever asked for it, so that asking changes nothing.
         refinement: Settings of the refinement, whose simulations run as all others.
-        num_scored: Simulations of each executed action, from the belief before the
-            trial, that its outcome is compared with.
         check_every: Every so many-th trial goes where none was, instead of where most
             is to be learned about the parameters: at as many settings as parameters
             any simulator fits, and nothing tells that it is wrong. None never checks.
@@ -60,41 +96,29 @@ class CampaignOptions:
             and the last belief stands. ``Campaign.state.meter`` has what was spent.
         planned_trials: Trials that ``max_simulations`` is to last for; each further one
             gets half of what is left.
-        num_workers: Of all simulations, as in :class:`.Workers`.
-        time_limit: As in :class:`.Workers`.
-        num_retries: As in :class:`.Workers`.
+        workers: Where all simulations run and what a row may cost, or the number of
+            calls at a time.
         bank: Folder of simulations, which campaigns on the same simulator may share one
             after another: what one has simulated the next reads, and its first round
             begins with the rows of others, weighted by :func:`.reuse`. None keeps them
             in the campaign's directory, if it has one.
+        details: What few campaigns set otherwise.
     """
 
     num_simulations: int = 5_000
     num_samples: int = 1_500
     density_estimator: Any = None
-    posterior: str = "importance"
     estimator: Any = "auto"
-    eliminate: bool = True
-    design_on: Literal["fresh", "training"] = "fresh"
-    min_probability_valid: float = 0.0
-    repeat: bool = True
     refine: bool = True
     network: Literal["each round", "on demand"] = "each round"
     refinement: RefinementOptions = RefinementOptions()
-    num_scored: int = 2_000
     check_every: int | None = None
     stop: StopRules = StopRules()
     max_simulations: int | None = None
     planned_trials: int = 6
-    num_workers: int = 1
-    time_limit: float | None = None
-    num_retries: int = 0
+    workers: Workers = IN_PROCESS
     bank: str | None = None
-
-    @property
-    def workers(self) -> Workers:
-        """Where all simulations run."""
-        return Workers(self.num_workers, self.time_limit, self.num_retries)
+    details: CampaignDetails = CampaignDetails()
 
     def __getstate__(self) -> dict[str, Any]:
         # Builders of sbi's are local functions, which pickle refuses.
@@ -103,7 +127,8 @@ class CampaignOptions:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         estimator = cloudpickle.loads(state["density_estimator"])
-        vars(self).update(state, density_estimator=estimator)
+        # Those of the last version had the fields of both settings themselves.
+        vars(self).update(grouped(state, GROUPS), density_estimator=estimator)
 
     @classmethod
     def of(cls, options: Any) -> CampaignOptions:
@@ -115,7 +140,7 @@ class CampaignOptions:
         if options is None or isinstance(options, cls):
             return options or cls()
         known = {f.name for f in fields(cls)}
-        if not isinstance(options, Mapping) or not {*options} <= known:
+        if not isinstance(options, Mapping) or not {*grouped(options, GROUPS)} <= known:
             raise TypeError(
                 f"expected options among {', '.join(sorted(known))}; got {options!r}; "
                 "pass CampaignOptions(...), or a dict of these"
@@ -135,51 +160,36 @@ class CampaignOptions:
             num_samples=2_000,
             density_estimator=MixtureDensity.faithful(),
             estimator="posterior",
-            eliminate=False,
             refine=False,
+            details=CampaignDetails(eliminate=False),
         )
 
     def __post_init__(self) -> None:
         if self.bank is not None:
             object.__setattr__(self, "bank", os.fspath(self.bank))
-        if self.refinement.workers not in (IN_PROCESS, self.workers):
-            raise ValueError(
-                "expected the refinement's simulations to run as all others of a "
-                f"campaign, {self.workers}; got {self.refinement.workers} for them; "
-                "pass num_workers, time_limit and num_retries to CampaignOptions alone"
-            )
-        if self.num_simulations < 100:
-            raise ValueError(
-                f"expected num_simulations >= 100; got {self.num_simulations}; use "
-                "about 5000 a round"
-            )
-        if self.design_on not in ("fresh", "training"):
-            raise ValueError(
-                "expected design_on 'fresh' or 'training'; got "
-                f"{self.design_on!r}; choose one of these"
-            )
-        if self.network not in ("each round", "on demand"):
-            raise ValueError(
-                "expected network 'each round' or 'on demand'; got "
-                f"{self.network!r}; pass one of these"
-            )
-        if self.max_simulations is not None and self.max_simulations < 100:
-            raise ValueError(
-                f"expected max_simulations >= 100 or None; got {self.max_simulations}; "
-                "use some hundred a trial"
-            )
-        if self.planned_trials < 1:
-            raise ValueError(
-                f"expected planned_trials >= 1; got {self.planned_trials}; pass the "
-                "number of trials that you can run"
-            )
-        if self.num_scored < 100:
-            raise ValueError(
-                f"expected num_scored >= 100; got {self.num_scored}; use about "
-                "2000, since no tail probability is below 1 / (num_scored + 1)"
-            )
-        if self.check_every is not None and self.check_every < 1:
-            raise ValueError(
-                f"expected check_every >= 1 or None; got {self.check_every}; use 2 "
-                "or 3 where the simulator may lack something"
-            )
+        object.__setattr__(self, "workers", Workers.of(self.workers))
+        require(
+            self.refinement.workers in (IN_PROCESS, self.workers),
+            "the refinement's simulations to run as all others of a campaign, "
+            f"{self.workers}",
+            f"{self.refinement.workers} for them",
+            "pass workers to CampaignOptions alone",
+        )
+        require(
+            self.network in ("each round", "on demand"),
+            "network 'each round' or 'on demand'",
+            repr(self.network),
+            "pass one of these",
+        )
+        for name, least, advice in (
+            ("num_simulations", 100, "use about 5000 a round"),
+            ("max_simulations", 100, "use some hundred a trial"),
+            ("planned_trials", 1, "pass the number of trials that you can run"),
+            ("check_every", 1, "use 2 or 3 where the simulator may lack something"),
+        ):
+            value = getattr(self, name)
+            expected = f"{name} >= {least}"
+            if getattr(type(self), name) is None:
+                expected += " or None"
+                value = least if value is None else value
+            require(value >= least, expected, value, advice)

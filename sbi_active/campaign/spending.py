@@ -47,7 +47,7 @@ def learned(learner: Any, state: CampaignState, trial: Trial) -> bool:
     except SimulationBudgetError as error:
         state.unscore(trial.index)
         warn(
-            f"trial {trial.index} is recorded and not in the belief: {error}",
+            f"SA602 trial {trial.index} is recorded and not in the belief: {error}",
             stacklevel=4,
         )
         return False

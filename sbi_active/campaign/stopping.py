@@ -9,6 +9,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
+from sbi_active.expected import require
 from sbi_active.seeding import derive_seed, forked_generators
 
 NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
@@ -45,11 +46,12 @@ class StopRules:
         if isinstance(self.max_sd, Sequence):
             object.__setattr__(self, "max_sd", (*map(float, self.max_sd),))
         limits = [self.min_information_gain, *self._limits()]
-        if any(limit is not None and not limit > 0 for limit in limits):
-            raise ValueError(
-                f"expected positive limits to stop at; got {self}; leave a rule "
-                "at None that is not wanted"
-            )
+        require(
+            all(limit is None or limit > 0 for limit in limits),
+            "positive limits to stop at",
+            self,
+            "leave a rule at None that is not wanted",
+        )
 
     def reason(
         self, belief: Distribution, design: Design | None, *, seed: int

@@ -62,8 +62,8 @@ def told_trial(
     )
     if not bool(actions.contains(executed)):
         warn(
-            f"the executed action {executed.tolist()} is not in {actions}; it is "
-            "simulated where it was executed",
+            f"SA202 the executed action {executed.tolist()} is not in {actions}; it "
+            "is simulated where it was executed",
             stacklevel=5,
         )
     told = replace(target, action=executed, x=outcome, status=status)
@@ -157,8 +157,8 @@ def _measured(x: Tensor) -> Tensor:
     if not bool(infinite.any()):
         return x
     warn(
-        f"{int(infinite.sum())} of {x.numel()} told numbers are infinite and count as "
-        "not measured; pass NaN where a sensor gave nothing",
+        f"SA201 {int(infinite.sum())} of {x.numel()} told numbers are infinite and "
+        "count as not measured; pass NaN where a sensor gave nothing",
         stacklevel=7,
     )
     return torch.where(infinite, torch.nan, x)

@@ -19,10 +19,12 @@ class CampaignTrials(CampaignView):
     """The half of a :class:`.Campaign` that takes what happened, and computes nothing.
 
     Attributes:
-        on_trial: Called with each trial that was told, once it is recorded.
+        on_trial: Called with each trial that was told, once it is recorded; set it.
+        on_update: Called with each trial, once the belief contains it; set it.
     """
 
-    on_trial: Callable[[Trial], None] | None
+    on_trial: Callable[[Trial], None] | None = None
+    on_update: Callable[[Trial], None] | None = None
 
     @guarded
     @isolated

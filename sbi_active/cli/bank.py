@@ -60,7 +60,7 @@ def build(
                 theta[:num_rows],
                 action[:num_rows],
                 seed=block,
-                num_workers=workers,
+                workers=workers,
                 store=_Block(store, run_digest(block, theta, action), num_rows),
             )
             missing += done.counts["missing"]

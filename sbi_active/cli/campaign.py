@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign import Campaign, CampaignOptions
+from sbi_active.campaign.options import GROUPS
 from sbi_active.campaign.storage.damage import naming
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.declared import (
@@ -26,6 +27,7 @@ from sbi_active.cli.given import (
 from sbi_active.cli.output import Answer, say
 from sbi_active.cli.trials import status, sum_up_campaign
 from sbi_active.criticism import Effect
+from sbi_active.renamed import grouped
 from sbi_active.simulation.bank.store import Store
 
 SIZES = ("num_simulations", "num_samples", "num_workers", "time_limit")
@@ -56,7 +58,7 @@ def init(
         method=method,
         effects=effects_of(declared["effects"]),
         seed=seed,
-        options=CampaignOptions(**sizes),
+        options=CampaignOptions(**grouped(sizes, GROUPS)),
         directory=folder,
     ) as campaign:
         write_declared(folder, declared)

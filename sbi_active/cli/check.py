@@ -17,6 +17,7 @@ from sbi_active.cli.output import say
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.simulation.check import check_simulator
+from sbi_active.simulation.workers.settings import Workers
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
 LONG = 20.0  # seconds of simulation a round, beside which learning counts little
@@ -32,7 +33,7 @@ def check(*, rows: int, rounds: int, workers: int, seed: int, **problem: Any) ->
         actions,
         num_rows=rows,
         num_simulations=_campaign_size(actions, rounds),
-        num_workers=workers,
+        workers=workers,
         seed=seed,
     )
     # Where simulations take longer than this, they are what a campaign takes.
@@ -56,7 +57,7 @@ def _time_round(
     seed: int,
 ) -> float:
     """Return wall seconds of a round on an outcome that the prior allows."""
-    options = CampaignOptions(num_workers=workers)
+    options = CampaignOptions(workers=Workers(workers))
     start = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the round is thrown away

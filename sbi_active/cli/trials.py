@@ -116,6 +116,7 @@ def found_in(campaign: Any) -> dict[str, Any]:
     mean, variance = belief.mean.reshape(-1), belief.variance.reshape(-1)
     names = campaign.parameter_names or [f"theta_{k + 1}" for k in range(len(mean))]
     diagnostics = getattr(belief, "diagnostics", None)
+    said = [] if diagnostics is None else [*diagnostics.warnings]
     together = getattr(diagnostics, "combinations", None)
     waiting = [t.index for t in campaign.history if not campaign.contains(t)]
     return {
@@ -127,7 +128,8 @@ def found_in(campaign: Any) -> dict[str, Any]:
                 for name, m, v in zip(names, mean, variance, strict=True)
             },
             "trustworthy": None if diagnostics is None else diagnostics.trustworthy,
-            "warnings": [] if diagnostics is None else [*diagnostics.warnings],
+            "warnings": said,
+            "codes": [warning.code for warning in said],
             "combinations": str(together) if together else None,
         },
         "health": campaign.health,

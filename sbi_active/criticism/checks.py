@@ -187,7 +187,7 @@ def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
     for name in ("inputs", "start"):
         if getattr(trials, name) is not None and name not in model.conditions:
             warn(
-                f"the trials have {name}, and the simulator's function takes no "
+                f"SA210 the trials have {name}, and the simulator's function takes no "
                 f"argument {name!r}: they are not used; write fn(theta, action, *, "
                 f"{name})",
                 stacklevel=stack_level(),
@@ -202,7 +202,7 @@ def _warn_outside(trials: Trials, actions: ActionSpace) -> None:
         return
     places = outside.nonzero()[:, 0].tolist()
     warn(
-        f"the executed action {trials.action[places[0]].tolist()} of trial "
+        f"SA202 the executed action {trials.action[places[0]].tolist()} of trial "
         f"{trials.names[places[0]]} is not in {actions} ({trials.called(places)}); it "
         "is simulated where it was executed",
         stacklevel=stack_level(),

@@ -33,27 +33,27 @@ def made_given(
     """
     if num_summaries:
         yield (
-            f"given {num_summaries} summaries of the {trials.x[0].numel()} numbers of "
-            "a trial: what they leave out was not looked at"
+            f"SA524 given {num_summaries} summaries of the {trials.x[0].numel()} "
+            "numbers of a trial: what they leave out was not looked at"
         )
     if sampling is not None and sampling.every > 1:
         yield in_words(sampling)
     if left_out:
         yield (
-            "the order of the trials is unknown: what grows from trial to trial was "
-            f"not looked for ({', '.join(left_out)})"
+            "SA526 the order of the trials is unknown: what grows from trial to trial "
+            f"was not looked for ({', '.join(left_out)})"
         )
     if screening is not None:
         nearest, behind = next(iter(screening.behind.items()))
         num = len(screening.behind)
         yield (
-            f"of {num + len(screening.kept)} effects {len(screening.kept)} were "
+            f"SA527 of {num + len(screening.kept)} effects {len(screening.kept)} were "
             f"fitted: linear evidence puts the others behind, the nearest ({nearest}) "
             f"by {behind:.1f} nats"
         )
     if nuisances and warm_up == 0:
         yield (
-            f"trials that were not fitted draw {', '.join(nuisances)} from the prior, "
-            "which is part of their error; pass warm_up, the time in which their first "
-            "samples tell of it"
+            f"SA528 trials that were not fitted draw {', '.join(nuisances)} from the "
+            "prior, which is part of their error; pass warm_up, the time in which "
+            "their first samples tell of it"
         )

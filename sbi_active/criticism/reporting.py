@@ -129,8 +129,10 @@ def _outlying(loop: Steps, tracing: Tracing) -> list[str]:
     if len(squares) != len(measured):  # a trial that no other tells about
         return []
     return [
-        f"trial {trials.names[measured[k]]} is far outside what the other trials show: "
-        f"its error on the fit to them is {times:.3g} times theirs; check its record "
-        "and its unit, and see what the verdict is without it"
+        (
+            f"SA513 trial {trials.names[measured[k]]} is far outside what the other "
+            f"trials show: its error on the fit to them is {times:.3g} times theirs; "
+            "check its record and its unit, and see what the verdict is without it"
+        )
         for k, times in outlying_trials(squares)
     ]

@@ -62,12 +62,12 @@ def thinned_to_need(
 def in_words(found: Sampling) -> str:
     """Return what was left out and why."""
     return (
-        f"of {1 / found.step:.3g} samples a second every {_ordinal(found.every)} is "
-        f"used ({1 / found.suggested_step:.3g} a second; inputs as given): of what the "
-        "bare model leaves, neighboring innovations of an autocorrelated error have a "
-        f"correlation of up to {found.before:.2f} at higher rates, so that evidence "
-        f"would count the same motion several times, and of {found.after:.2f} at this "
-        "one; thin=False uses all"
+        f"SA525 of {1 / found.step:.3g} samples a second every "
+        f"{_ordinal(found.every)} is used ({1 / found.suggested_step:.3g} a second; "
+        "inputs as given): of what the bare model leaves, neighboring innovations of "
+        f"an autocorrelated error have a correlation of up to {found.before:.2f} at "
+        "higher rates, so that evidence would count the same motion several times, "
+        f"and of {found.after:.2f} at this one; thin=False uses all"
     )
 
 

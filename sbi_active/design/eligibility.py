@@ -154,7 +154,7 @@ def warn_missing(num_missing: int, num_simulations: int) -> None:
     """Warn once a design of simulations lost to faults."""
     if num_missing:
         warn(
-            f"{num_missing} of {num_simulations} simulations of the design are "
+            f"SA301 {num_missing} of {num_simulations} simulations of the design are "
             "missing, by faults of the simulator; they were left out",
             MissingRowsWarning,
             stacklevel=3,

@@ -67,7 +67,7 @@ def warn_of_idle(
     if idle:
         where = "the recorded trials" if trials is not None else "permitted actions"
         warn(
-            f"{', '.join(idle)} change nothing that is read in {len(action)} of "
+            f"SA303 {', '.join(idle)} change nothing that is read in {len(action)} of "
             f"{where}: no such trial tells of them; leave them out, or read another "
             "sensor",
             stacklevel=4,

@@ -212,9 +212,9 @@ def _require_seconds(time: Array, step: float, what: str) -> None:
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > MOST_APART * step:
         warn(
-            f"{what} has a sample every {spacing:g} s, {spacing / step:,.0f} time "
-            f"steps of {step:g} s, and asks for {time[-1] / step:,.0f} steps: is its "
-            "time in ms? Convert it to seconds, or raise the time step",
+            f"SA204 {what} has a sample every {spacing:g} s, {spacing / step:,.0f} "
+            f"time steps of {step:g} s, and asks for {time[-1] / step:,.0f} steps: is "
+            "its time in ms? Convert it to seconds, or raise the time step",
             stacklevel=stack_level(),
         )
 
@@ -236,8 +236,9 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
         wraps = np.abs(jumps - turn) < 0.1 * turn
         if wraps.any() and np.median(jumps) < 0.2 * turn:
             warn(
-                f"{channel.name} in {what} jumps by about {unit} in {int(wraps.sum())} "
-                "places, as an angle that wraps: pass numpy.unwrap of it",
+                f"SA205 {channel.name} in {what} jumps by about {unit} in "
+                f"{int(wraps.sum())} places, as an angle that wraps: pass "
+                "numpy.unwrap of it",
                 stacklevel=stack_level(),
             )
     names = names_of(model, "joint")
@@ -246,8 +247,9 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
         limit = float(np.abs(model.jnt_range[joint]).max())
         if model.jnt_limited[joint] and np.abs(seen).max() > DEGREES * limit:
             warn(
-                f"{channel.name} in {what} reaches {np.abs(seen).max():g}, where its "
-                f"joint's range ends at {limit:g} rad: are these degrees? Convert them",
+                f"SA206 {channel.name} in {what} reaches {np.abs(seen).max():g}, "
+                f"where its joint's range ends at {limit:g} rad: are these degrees? "
+                "Convert them",
                 stacklevel=stack_level(),
             )
 

@@ -15,7 +15,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.messages import explained
+from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.identifiability import (
     MAX_ACTIONS,
@@ -27,6 +27,7 @@ from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, Simulati
 from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.simulator import outcome_tensor, require_noise
 from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.settings import Workers
 
 MIN_ROWS = 16  # a choice: of the first runs, which are timed
 RUNS = 6  # of all rows, beside one a parameter and one an entry of the action
@@ -34,6 +35,7 @@ ROUNDING = 1e-5  # relative difference between batches that mixes no rows
 MANY = 0.5  # share of rows without a measurement that is worth a word
 
 
+@takes_loose(workers=Workers)
 def check_simulator(
     simulator: Callable[..., Any],
     prior: Distribution,
@@ -42,7 +44,7 @@ def check_simulator(
     num_rows: int = 256,
     max_seconds: float = 60.0,
     num_simulations: int | None = None,
-    num_workers: int = 1,
+    workers: Workers | int | None = None,
     seed: int = 0,
 ) -> SimulatorReport:
     """Run a simulator over draws of the prior and say what a campaign would meet.
@@ -60,7 +62,7 @@ def check_simulator(
         num_rows: Rows a check, at least 16.
         max_seconds: Of simulation time; a slow simulator gets fewer rows, 16 at least.
         num_simulations: That the campaign needs, for :attr:`SimulatorReport.minutes`.
-        num_workers: That share them.
+        workers: Where they will run, or the number of calls at a time.
         seed: Of the draws.
 
     Example:
@@ -78,7 +80,7 @@ def check_simulator(
     report = SimulatorReport(
         takes_seeds=takes_seeds(simulator),
         num_simulations=num_simulations,
-        num_workers=num_workers,
+        num_workers=Workers.of(workers).num_workers,
     )
     try:
         report = _look(run, theta, action, report)
@@ -127,13 +129,11 @@ class _Runs:
 
     def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Any:
         """Call the simulator as it is, whatever it returns."""
-        taken = takes_seeds(self.simulator)
-        theta, action, seeds = theta.clone(), action.clone(), seeds.clone()
-        if isinstance(self.simulator, SimulatorModel) or taken:
-            with forked_generators(self.seed, "call"):
-                return self.simulator(theta, action, seeds=seeds)
+        is_model = isinstance(self.simulator, SimulatorModel)
+        takes = is_model or takes_seeds(self.simulator)
+        given = {"seeds": seeds.clone()} if takes else {}
         with forked_generators(self.seed, "call"):
-            return self.simulator(theta, action)
+            return self.simulator(theta.clone(), action.clone(), **given)
 
     def simulate(self, theta: Tensor, action: Tensor, key: str = "x") -> Any:
         """Return simulations, what raises being missing."""
@@ -294,16 +294,17 @@ def _judge(
     run: _Runs, report: SimulatorReport, theta: Tensor, action: Tensor, rows: Any
 ) -> SimulatorReport:
     """Add defects and warnings."""
-    defects, notes = [], []
+    defects: list[str] = []
+    notes: list[str] = []
     lost = len(theta) - report.counts["ok"]
     if lost == len(theta):
-        defects.append("no row has a measurement")
+        defects.append("SA401 no row has a measurement")
     elif lost > MANY * len(theta):
-        notes.append(f"{lost / len(theta):.0%} of the rows have no measurement")
+        notes.append(f"SA401 {lost / len(theta):.0%} of the rows have no measurement")
     if report.counts["missing"]:
         text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
         notes.append(
-            f"{report.counts['missing']} rows raise, the first "
+            f"SA301 {report.counts['missing']} rows raise, the first "
             f"{text[-1] if text else 'without a word'}; their outcome is missing; "
             "return NaN where the system gave no measurement"
         )
@@ -317,33 +318,32 @@ def _judge(
     sound = report.counts["missing"] == 0
     if declared and sound and not model.is_deterministic(theta, action):
         notes.append(
-            "fn is random beside declared noise, which so counts twice; declare "
+            "SA402 fn is random beside declared noise, which so counts twice; declare "
             "noise=None, or remove the random numbers from fn"
         )
     if report.noiseless:
         notes.append(
-            f"numbers {', '.join(map(str, report.noiseless))} of x have no noise, and "
-            "so no density; declare the noise of every channel"
+            f"SA403 numbers {', '.join(map(str, report.noiseless))} of x have no "
+            "noise, and so no density; declare the noise of every channel"
         )
     if report.rows_are_independent is False:
         defects.append(
-            "rows permuted with their seeds do not give permuted x; let row i "
+            "SA404 rows permuted with their seeds do not give permuted x; let row i "
             "depend on theta[i], action[i] and seeds[i] alone"
         )
     if not report.is_reproducible:
         notes.append(
-            "one seed gives two different x, so that no run can be repeated; take "
-            "seeds, or draw from torch's or NumPy's global generator"
+            "SA405 one seed gives two different x, so that no run can be repeated; "
+            "take seeds, or draw from torch's or NumPy's global generator"
         )
     if len(report.idle_parameters) == theta.shape[1]:
-        defects.append("no parameter changes x")
-    elif report.idle_parameters:
-        notes.append(f"changing {', '.join(report.idle_parameters)} leaves x as it is")
-    if report.idle_actions:
-        notes.append(f"changing {', '.join(report.idle_actions)} leaves x as it is")
-    notes += [str(group) for group in report.undetermined]
-    said = {"defects": defects, "warnings": notes}
-    return replace(report, **{k: tuple(map(explained, v)) for k, v in said.items()})
+        defects.append("SA303 no parameter changes x")
+    elif idle := ", ".join(report.idle_parameters):
+        notes.append(f"SA303 changing {idle} leaves x as it is")
+    if idle := ", ".join(report.idle_actions):
+        notes.append(f"SA303 changing {idle} leaves x as it is")
+    notes += [f"SA406 {group}" for group in report.undetermined]
+    return replace(report, defects=(*defects,), warnings=(*notes,))
 
 
 def _lost(action: Tensor, lost: Tensor) -> tuple[tuple[tuple[float, ...], float], ...]:

@@ -8,7 +8,7 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from sbi_active.messages import Explained
+from sbi_active.messages import Explained, SimulationWarning
 
 
 class Outcome(IntEnum):
@@ -77,6 +77,8 @@ class Simulations:
 class SimulationError(Explained, RuntimeError):
     """No row could be simulated, or the simulator could not be loaded in a worker."""
 
+    code = "SA307"
+
 
 class SimulationInterrupted(Explained, KeyboardInterrupt):
     """The user interrupted a simulation.
@@ -85,11 +87,13 @@ class SimulationInterrupted(Explained, KeyboardInterrupt):
         simulations: What is finished; the other rows are missing.
     """
 
+    code = "SA308"
+
     def __init__(self, simulations: Simulations) -> None:
         counts = ", ".join(f"{k} {name}" for name, k in simulations.counts.items())
         super().__init__(f"simulation interrupted: {counts}")
         self.simulations = simulations
 
 
-class MissingRowsWarning(UserWarning):
+class MissingRowsWarning(SimulationWarning):
     """Some rows are missing; the others stand."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from sbi_active.messages import Message
 from sbi_active.simulation.identifiability import Undetermined
 
 LINES = 10  # of actions without a measurement
@@ -62,6 +63,10 @@ class SimulatorReport:
     noiseless: tuple[int, ...] = ()
     defects: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("defects", "warnings"):
+            object.__setattr__(self, name, tuple(map(Message, getattr(self, name))))
 
     @property
     def is_ready(self) -> bool:

@@ -302,7 +302,7 @@ class BoxCollisionReference:
         if self._num_workers == 1:
             return model.mean(theta, action).double()
         bare = SimulatorModel(model.fn, setup=model.setup)
-        rows = simulate(bare, theta, action, seed=0, num_workers=self._num_workers)
+        rows = simulate(bare, theta, action, seed=0, workers=self._num_workers)
         return rows.x.double()
 
 

@@ -14,6 +14,7 @@ from sbi_active import (
     MixtureDensity,
     SimulatorModel,
 )
+from sbi_active.campaign.options import CampaignDetails
 from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
@@ -21,7 +22,7 @@ ACTIONS = DiscreteActions([0.1, 1.0, 3.0])
 OPTIONS = CampaignOptions(
     num_simulations=600,
     num_samples=100,
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
     density_estimator=MixtureDensity(
         hidden_features=(32,), num_components=2, num_iterations=400, learning_rate=3e-3
     ),

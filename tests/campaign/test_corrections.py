@@ -18,6 +18,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.campaign.checks import outlyingness
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Effect
 from sbi_active.inference import RatioClassifier
 from tests.campaign.sizes import REFINEMENT
@@ -28,7 +29,7 @@ MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise
 OPTIONS = CampaignOptions(
     num_simulations=300,
     num_samples=100,
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
     refinement=REFINEMENT,
 )
@@ -141,7 +142,9 @@ def test_a_measurement_that_is_too_rare_to_simulate():
         x = theta * action + 0.1 * torch.randn_like(theta)
         return torch.where((action == 3.0) & (theta < 0.985), torch.nan, x)
 
-    c = tell(campaign(simulator=almost_never, num_scored=1_000))
+    c = tell(
+        campaign(simulator=almost_never, details=CampaignDetails(num_scored=1_000))
+    )
     with pytest.warns(UserWarning, match="trial 1"):
         belief = c.update()
     assert belief.diagnostics.trustworthy is False

@@ -14,7 +14,9 @@ from sbi_active import (
     DiscreteActions,
     MixtureDensity,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import row_normals
+from sbi_active.simulation import Workers
 from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
@@ -22,7 +24,7 @@ ACTIONS = DiscreteActions([0.5, 1.0, 2.0])
 OPTIONS = CampaignOptions(
     num_simulations=500,
     num_samples=100,
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=150),
     refinement=REFINEMENT,
 )
@@ -136,8 +138,7 @@ def test_a_faulty_simulator_completes_a_campaign(tmp_path):
         method="asbi",
         num_simulations=300,
         refinement=REFINEMENT,
-        num_workers=2,
-        time_limit=0.05,
+        workers=Workers(2, time_limit=0.05),
     )
     with pytest.warns(UserWarning, match="are missing"):
         c.run(lambda action: 0.6 * action, num_rounds=2)

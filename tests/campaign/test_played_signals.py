@@ -12,6 +12,7 @@ from sbi_active import (
 )
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Criticism, Trials, generic_effects
 from tests.campaign.sizes import REFINEMENT
 
@@ -28,7 +29,10 @@ SPACE = SignalActions(
 PRIOR = BoxUniform(torch.tensor([1.0, 0.05]), torch.tensor([5.0, 0.5]))
 TRUTH = torch.tensor([[3.0, 0.2]])
 OPTIONS = CampaignOptions(
-    num_samples=200, num_scored=500, network="on demand", refinement=REFINEMENT
+    num_samples=200,
+    details=CampaignDetails(num_scored=500),
+    network="on demand",
+    refinement=REFINEMENT,
 )
 
 
@@ -114,7 +118,7 @@ def test_recorded_inputs_take_the_place_of_the_signals():
 def test_workers_play_the_same_signals():
     theta, action = PRIOR.sample((40,)), SPACE.sample((40,), seed=2)
     one, two = (
-        simulate(MODEL, theta, action, seed=5, num_workers=n, show_progress=False).x
+        simulate(MODEL, theta, action, seed=5, workers=n, show_progress=False).x
         for n in (1, 2)
     )
     assert torch.equal(one, two)

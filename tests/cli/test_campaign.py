@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 
 from sbi_active import CampaignOptions
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.cli import campaign as commands
 from sbi_active.cli import given, main
 from tests.campaign.sizes import REFINEMENT
@@ -37,7 +38,9 @@ seed = 4
 def made(tmp_path, capsys, monkeypatch):
     monkeypatch.delitem(sys.modules, "sled", raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    small = partial(CampaignOptions, num_scored=500, refinement=REFINEMENT)
+    small = partial(
+        CampaignOptions, details=CampaignDetails(num_scored=500), refinement=REFINEMENT
+    )
     monkeypatch.setattr(commands, "CampaignOptions", small)
     (tmp_path / "sled.py").write_text(SIMULATOR)
     (tmp_path / "campaign.toml").write_text(CONFIG)

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from sbi_active import Campaign, CampaignOptions
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.cli import campaign as commands
 from sbi_active.cli import main
 from tests.campaign.sizes import REFINEMENT
@@ -224,7 +225,9 @@ def folder(tmp_path_factory):
     for name, text in TOML.items():
         (place / name).write_text(text)
     (place / "bytes.toml").write_bytes(b"\xff\xfe")
-    small = partial(CampaignOptions, num_scored=500, refinement=REFINEMENT)
+    small = partial(
+        CampaignOptions, details=CampaignDetails(num_scored=500), refinement=REFINEMENT
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         patch.delitem(sys.modules, "sled", raising=False)

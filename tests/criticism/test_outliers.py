@@ -22,7 +22,7 @@ from sbi_active.criticism.report.suspects import (
 from sbi_active.criticism.rivals import NoiseCell, NoiseGrid
 from sbi_active.criticism.steps import is_left_to_chance, unless_refuted, withdrawn
 from sbi_active.inference.sampling.student_mixture import lower_factors
-from sbi_active.messages import explained
+from sbi_active.messages import Message
 from tests.criticism.report.reports import evaluation, flat, report, tracing
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
@@ -218,7 +218,7 @@ def test_noise_declared_too_large_is_said():
     right = criticism(x).detect()
     assert right.lower_p_value > 0.01
     assert [*of_noise(right)] == []
-    assert explained(sentence) in report(detection=detection).warnings
+    assert Message(sentence) in report(detection=detection).warnings
 
 
 def test_large_t_noise_and_trajectories_are_looked_at_as_well():

@@ -1,7 +1,9 @@
-"""Every warning and error of the library names its place on the page about warnings."""
+"""Every warning and error of the library says its code, and each code is explained."""
 
 import ast
 import importlib
+import json
+import pickle
 import re
 import warnings
 from pathlib import Path
@@ -9,61 +11,40 @@ from pathlib import Path
 import pytest
 import torch
 
+from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.criticism import Trials
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.messages import ANCHORS, PAGE, Explained, explained
+from sbi_active.messages import (
+    CATEGORIES,
+    Explained,
+    Message,
+    TrialWarning,
+    explanations,
+)
 
 ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "sbi_active"
-TEXT = (ROOT / "docs" / "howto" / "warnings.md").read_text(encoding="utf-8")
-HEADINGS = dict(re.findall(r"^\(([\w-]+)\)=\n### `(.+)`$", TEXT, re.MULTILINE))
-PLACE = re.compile(rf"\(see {PAGE}#([\w-]+)\)$")
-#: Whose texts are warnings: what is yielded there is one sentence of a report each.
-YIELDED = {"cautions.py", "suspects.py", "given.py"}
-FORWARDED = 2  # calls whose text comes from where it is named in ANCHORS, or an error
 #: Errors that another one of the library says in its own words.
 CAUGHT = 9
-
-
-def constants(node: ast.AST) -> str:
-    """Return the fixed words of a text, what is filled in left out."""
-    parts = [
-        n.value
-        for n in ast.walk(node)
-        if isinstance(n, ast.Constant) and isinstance(n.value, str)
-    ]
-    return "".join(parts)
-
-
-def files() -> list[Path]:
-    return [p for p in sorted(LIBRARY.rglob("*.py")) if "tasks" not in p.parts]
+#: What takes messages.
+GATHERED = re.compile(r"warn|.*\.warned|(texts|warnings|defects|self\.notes)\.append")
+#: What is yielded there is one sentence of a report each.
+YIELDED = {"cautions.py", "suspects.py", "given.py"}
 
 
 def nodes() -> list[tuple[Path, ast.AST]]:
     return [
         (path, node)
-        for path in files()
+        for path in sorted(LIBRARY.rglob("*.py"))
+        if "tasks" not in path.parts
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
     ]
 
 
-def given() -> list[tuple[str, str]]:
-    """Return the texts of all warnings that are given, with their files."""
-    found = []
-    for path, node in nodes():
-        called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
-        if isinstance(node, ast.Call) and (
-            called == "warn" or called.endswith(".warned")
-        ):
-            found += [(path.name, constants(text)) for text in node.args[:1]]
-        elif isinstance(node, ast.Yield) and path.name in YIELDED:
-            assert node.value is not None
-            found.append((path.name, constants(node.value)))
-    trust = LIBRARY / "inference" / "refinement" / "trust.py"
-    for node in ast.walk(ast.parse(trust.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Tuple) and len(node.elts) == 3:  # holds, figure, text
-            found.append((trust.name, constants(node.elts[2])))
-    return [(file, text) for file, text in found if " " in text]
+def constants(node: ast.AST) -> list[str]:
+    """Return the fixed words of a text, what is filled in left out."""
+    found = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)]
+    return [value for value in found if isinstance(value, str)]
 
 
 def named() -> list[type]:
@@ -76,42 +57,56 @@ def named() -> list[type]:
         ):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found.append(getattr(importlib.import_module(".".join(parts)), node.name))
-    return [c for c in found if c.__name__ != "OddError"]
+    return found
 
 
-@pytest.mark.parametrize(("file", "text"), given(), ids=lambda v: v[:40])
-def test_every_warning_names_its_place(file, text):
-    place = PLACE.search(explained(text))
-    assert place, f"{file}: expected words of ANCHORS in {text!r}; add them there"
-    assert place.group(1) in HEADINGS
+def texts(path: Path, node: ast.AST) -> list[ast.expr]:
+    """Return what a line of code says that becomes a message."""
+    if isinstance(node, ast.Yield) and path.name in YIELDED and node.value:
+        return [node.value]
+    if isinstance(node, ast.Call):
+        called = ast.unparse(node.func)
+        return node.args if GATHERED.fullmatch(called) else []
+    if isinstance(node, ast.Tuple) and path.name == "trust.py":
+        return node.elts[2:3]  # holds, figure, text
+    return []
+
+
+def test_codes_are_those_of_the_registry():
+    said = {
+        value[:5]
+        for path, node in nodes()
+        if path.name != "messages.py"
+        for value in constants(node)
+        if re.match(r"SA\d{3}\b", value)
+    }
+    assert said == {*explanations()}
+    headings = re.findall("^### .*", (LIBRARY / "messages.md").read_text(), re.M)
+    assert len(headings) == len(said)
+    assert {code[:3] for code in said} == {*CATEGORIES}
 
 
 def test_there_is_one_door():
-    """Or a warning could leave without its place."""
+    """Or a warning could leave without its code."""
     doors = {
         path.name
         for path, node in nodes()
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "warnings.warn"
     }
     assert doors == {"messages.py"}
-
-
-def test_headings_are_words_of_messages():
-    classes = {error.__name__ for error in named()}
-    places = {name: text for name, text in HEADINGS.items() if text not in classes}
-    assert {*places} == {*ANCHORS.values()}
-    assert [n for n, text in places.items() if ANCHORS.get(text) != n] == []
-
-
-def test_every_phrase_is_said_somewhere():
-    """A phrase whose message was reworded is found."""
-    texts = [
-        constants(ast.parse(p.read_text(encoding="utf-8")))
-        for p in files()
-        if p.name != "messages.py"
+    plain = [
+        ast.unparse(text)
+        for path, node in nodes()
+        for text in texts(path, node)
+        if isinstance(text, ast.Constant | ast.JoinedStr)
+        and not re.match(r"f?.(SA\d{3}|\{\w+(\[0\])?\}) ", ast.unparse(text))
     ]
-    everything = " ".join(" ".join(texts).split())
-    assert [p for p in ANCHORS if p not in everything] == []
+    assert plain == []
+
+
+def test_the_page_is_the_registry():
+    page = (ROOT / "docs" / "howto" / "warnings.md").read_text(encoding="utf-8")
+    assert "{include} ../../sbi_active/messages.md" in page
 
 
 def test_warnings_as_python_shows_them():
@@ -119,37 +114,58 @@ def test_warnings_as_python_shows_them():
         warnings.simplefilter("always")
         Trials([1.0, 2.0], torch.tensor([1.0, torch.inf]))
     (note,) = noted
-    assert str(note.message).endswith("(see warnings.html#infinite)")
+    assert str(note.message).endswith("(see warnings.html#sa201-infinite)")
     assert note.filename == __file__
+    assert isinstance(note.message, TrialWarning)
+    assert note.message.code == "SA201"
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        warnings.filterwarnings("ignore", ".*#sa201-")
+        Trials([1.0, 2.0], torch.tensor([1.0, torch.inf]))
+    assert not noted
 
 
-def test_warnings_as_a_belief_keeps_them():
-    known = Diagnostics().warned("few effective draws; raise num_histories")
-    again = known.warned("the best mode was found by one of 3 searches")
-    assert [PLACE.findall(text) for text in again.warnings] == [
-        ["few-draws"],
-        ["one-search"],
-    ]
-    assert str(again).count(PAGE) == 2
+@pytest.mark.parametrize(
+    "through",
+    [
+        lambda known: known,
+        lambda known: pickle.loads(pickle.dumps(known)),
+        lambda known: decode(encode(known, known={}), known={}),
+        lambda known: Diagnostics(warnings=json.loads(json.dumps(known.warnings))),
+    ],
+    ids=["at once", "pickle", "campaign", "json"],
+)
+def test_warnings_as_a_belief_keeps_them(through):
+    known = Diagnostics().warned("SA114 few; raise num_histories")
+    known = through(known.warned("found by one (see warnings.html#one-search)", "odd"))
+    assert [warning.code for warning in known.warnings] == ["SA114", "SA118", ""]
+    assert known.warnings[0] == (
+        "few; raise num_histories (see warnings.html#sa114-few-draws)"
+    )
+    assert str(known).count("warnings.html#") == 2
+
+
+def test_a_message_says_its_place_once():
+    said = Message("SA114 few draws")
+    assert Message(said) == said
+    assert Message("few draws").category is Message("").category
 
 
 @pytest.mark.parametrize("error", named(), ids=lambda c: c.__name__)
 def test_every_error_with_a_name_says_its_place(error):
     assert issubclass(error, Explained)
-    place = PLACE.search(str(error.__new__(error, "expected ...; got ...")))
-    assert place is not None
-    assert HEADINGS[place.group(1)] == error.__name__
+    said = Message(error.__new__(error, "expected ...; got ..."))
+    assert said.code == error.code
+    assert f"`{error.__name__}`" in explanations()[said.code][1]
 
 
 def test_other_errors_say_what_was_expected():
-    """Which is their place: the heading "expected"."""
-    assert "### `expected`" in TEXT
     other = [
         f"{path.name}: {constants(node.exc)}"
         for path, node in nodes()
         if isinstance(node, ast.Raise)
         and isinstance(node.exc, ast.Call)
         and re.fullmatch("(Value|Type|Runtime)Error", ast.unparse(node.exc.func))
-        and "expected" not in constants(node.exc)
+        and "expected" not in "".join(constants(node.exc))
     ]
     assert len(other) <= CAUGHT, other

@@ -176,9 +176,7 @@ def test_it_goes_to_other_processes_with_its_modifiers():
     theta = robot.prior.sample((6,))
     action = robot.actions.sample((6,))
     x = simulate(robot.simulator, theta, action, seed=0).x
-    other = simulate(
-        robot.simulator, theta, action, seed=0, num_workers=2, batch_size=2
-    )
+    other = simulate(robot.simulator, theta, action, seed=0, workers=2, batch_size=2)
     assert (other.x == x).all()
     again = pickle.loads(pickle.dumps(robot.simulator.fn.machines[0]))
     assert again.model.nq == 1

@@ -24,6 +24,7 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Criticism, Trials, identify
 from sbi_active.inference import refine
 from tests.oracles.judging import Found
@@ -137,7 +138,7 @@ def in_campaign(**options: Any) -> Run:
 
 SMALL: dict[str, Any] = {
     "num_simulations": 2_000,
-    "num_scored": 200,
+    "details": CampaignDetails(num_scored=200),
     "density_estimator": MixtureDensity(num_iterations=600),
 }
 
@@ -146,7 +147,7 @@ WAYS["refine, noise drawn"] = Way(refined, always, is_declared=False)
 WAYS["campaign"] = Way(
     in_campaign(
         network="on demand",
-        num_scored=200,
+        details=CampaignDetails(num_scored=200),
         refinement=RefinementOptions(defensive=DEFENSIVE),
     ),
     declared,

@@ -94,7 +94,7 @@ def test_a_simulator_may_return_the_buffer_it_fills_again(kind, seeded, options)
 def test_buffers_in_rounds_of_joblib(seeded):
     with joblib.parallel_config(backend="sequential"):
         x = simulate(
-            Buffer("torch", seeded), THETA, ACTION, seed=0, num_workers=2, batch_size=50
+            Buffer("torch", seeded), THETA, ACTION, seed=0, workers=2, batch_size=50
         ).x
     assert torch.equal(x, 2 * THETA)
 
@@ -153,7 +153,7 @@ def test_a_simulator_may_change_its_arguments(simulator, options):
     assert torch.equal(action, ACTION)
     assert torch.equal(rows.theta, THETA)
     assert torch.equal(rows.action, ACTION)
-    again = simulate(simulator, THETA, ACTION, seed=3, num_workers=2)
+    again = simulate(simulator, THETA, ACTION, seed=3, workers=2)
     assert torch.equal(rows.x, again.x)
 
 
@@ -181,7 +181,7 @@ def test_a_row_that_is_tried_again_gets_its_own_theta(num_workers):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingRowsWarning)
-        rows = simulate(simulator, theta, action, seed=0, num_workers=num_workers)
+        rows = simulate(simulator, theta, action, seed=0, workers=num_workers)
     assert rows.tracebacks.keys() == {5, 70, 200}
     assert torch.equal(rows.x[rows.valid], theta[rows.valid])
 

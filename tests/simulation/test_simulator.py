@@ -94,7 +94,7 @@ EMPTY = [
 def test_numbers_that_would_be_lost_are_refused(functions, text, num_workers):
     for function in functions[: 1 if num_workers == 2 else None]:
         with pytest.raises(ValueError, match=text):
-            x_of(function, num_workers=num_workers)
+            x_of(function, workers=num_workers)
         with pytest.raises(ValueError, match=text):
             simulate(model_of(function), THETA, THETA, seed=0)
 

@@ -141,7 +141,7 @@ def permuted(task, theta, action, order):
 def test_workers_change_nothing(task, num_workers):
     theta, action = rows(300)
     one = simulate(task.simulator, theta, action, seed=3)
-    more = simulate(task.simulator, theta, action, seed=3, num_workers=num_workers)
+    more = simulate(task.simulator, theta, action, seed=3, workers=num_workers)
     assert torch.equal(one.x.nan_to_num(), more.x.nan_to_num())
     assert torch.equal(one.status, more.status)
     assert 0 < int(one.valid.sum()) < 300

@@ -101,7 +101,7 @@ def test_outcomes_are_bit_identical(task):
 def test_workers_change_nothing(task):
     theta, action = rows(12)
     one, two = (
-        simulate(task.simulator, theta, action, seed=3, num_workers=n, batch_size=3).x
+        simulate(task.simulator, theta, action, seed=3, workers=n, batch_size=3).x
         for n in (1, 2)
     )
     assert torch.equal(one, two)

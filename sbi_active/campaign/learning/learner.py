@@ -150,7 +150,9 @@ class Learner:
         """The belief, marked untrustworthy where trials are beyond all simulations."""
         belief, texts = self.belief, doubts(self._state.measured)
         if self._state.is_stale:
-            texts.append("a trial was corrected since: update() computes it again")
+            texts.append(
+                "SA601 a trial was corrected since: update() computes it again"
+            )
         if self._stated is None or self._stated[:2] != (belief, texts):
             marked = named(in_doubt(belief, self.prior, texts), self.simulator)
             self._stated = belief, texts, marked
@@ -170,7 +172,7 @@ class Learner:
                 trial.action,
                 self.at(trial.index),
                 self.belief,
-                num_samples=state.options.num_scored,
+                num_samples=state.options.details.num_scored,
                 seed=derive_seed(state.seed, "score", trial.index),
                 workers=state.options.workers,
             )
@@ -196,7 +198,7 @@ class Learner:
                 trial,
                 self.at(trial.index),
                 self.prior,
-                num_samples=state.options.num_scored,
+                num_samples=state.options.details.num_scored,
                 seed=derive_seed(state.seed, "prior", trial.index),
                 workers=state.options.workers,
             )
@@ -308,7 +310,7 @@ class Learner:
         if Enumeration.of(self.prior) is not None:
             return RoundModel(None)
         options = self._state.options
-        can_wait = self._inference.amortized and options.design_on == "fresh"
+        can_wait = self._inference.amortized and options.details.design_on == "fresh"
         is_due = self._trains_each_round or not can_wait
         return RoundModel(
             lambda: self.trained(index), self.trained(index) if is_due else None
@@ -369,7 +371,7 @@ class Learner:
                     )
                     known = rows.without_missing()
                     num, num_missing = len(rows), rows.counts["missing"]
-                if options.design_on == "training":
+                if options.details.design_on == "training":
                     self.simulations = known
             with state.stage(index, "training"):
                 self._inference.append_simulations(

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch.distributions import Distribution
 
-from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.options import CampaignDetails, CampaignOptions
 from sbi_active.inference import (
     ALHI,
     ASBI,
@@ -47,10 +47,10 @@ class Method:
 
 
 def _asbi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
-    if options.posterior != "importance":
+    if options.details.posterior != "importance":
         raise ValueError(
             "expected posterior 'importance' for ASBI, whose network is a density and "
-            f"needs no sampler; got {options.posterior!r}; leave it out"
+            f"needs no sampler; got {options.details.posterior!r}; leave it out"
         )
     return ASBI(prior, options.density_estimator, show_progress_bars=False)
 
@@ -60,7 +60,7 @@ def _alhi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
         prior,
         options.density_estimator,
         show_progress_bars=False,
-        posterior=options.posterior,
+        posterior=options.details.posterior,
     )
 
 
@@ -71,11 +71,14 @@ def _seqbed(prior: Distribution, options: CampaignOptions) -> ActiveInference:
         prior,
         options.density_estimator,
         show_progress_bars=False,
-        posterior=options.posterior,
+        posterior=options.details.posterior,
     )
 
 
-_ALHI = {"estimator": "likelihood", "posterior": "kde"}
+_ALHI = {
+    "estimator": "likelihood",
+    "details": CampaignDetails(posterior="kde", eliminate=False),
+}
 #: Of 52,000 simulations a round, as the others: LFIRE needs those to learn from.
 _SEQBED = {
     "estimator": "ratio",

@@ -57,7 +57,7 @@ class Planner:
                 actions,
                 num_samples=options.num_samples,
                 estimator=options.estimator,
-                eliminate=options.eliminate,
+                eliminate=options.details.eliminate,
                 workers=options.workers,
             )
             if self._designs
@@ -125,9 +125,9 @@ class Planner:
         options = self._state.options
         told = [t for t in self._state.trials if t.is_measured]
         executed = torch.stack([t.action for t in told]) if told else torch.empty(0)
-        exclude = None if options.repeat or not told else executed
+        exclude = None if options.details.repeat or not told else executed
         limits = self._limits.options(exclude)
-        limits["min_probability_valid"] = options.min_probability_valid
+        limits["min_probability_valid"] = options.details.min_probability_valid
         if not self._designs:
             return self._select(index, learner, self._designer, **limits), "random"
         if target == "auto" and self._checks(index):
@@ -149,7 +149,7 @@ class Planner:
         if isinstance(learner, PooledLearner):
             pooled = learner.design(
                 index,
-                self._limits.design(exclude, options.min_probability_valid),
+                self._limits.design(exclude, options.details.min_probability_valid),
             )
             if about_model is not None and _utility(about_model) > _utility(pooled):
                 return about_model, "model"

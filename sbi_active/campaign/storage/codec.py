@@ -22,8 +22,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.sampling.row_cache import RowCache
-from sbi_active.messages import Explained
+from sbi_active.messages import Explained, Message
 
 #: Packages whose classes are stored by their attributes.
 TRUSTED = (
@@ -57,6 +58,8 @@ class Absent:
 
 class NotStorableError(Explained, TypeError):
     """Something in an object is neither of this library nor given again."""
+
+    code = "SA609"
 
 
 def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
@@ -221,6 +224,8 @@ class _Reader:
             for name, part in node["state"]:
                 # Frozen dataclasses refuse to be changed, and modules look first.
                 object.__setattr__(made, name, self.value(part))
+            if isinstance(made, Diagnostics):  # whose messages are stored as texts
+                made.__post_init__()
         else:
             made = self._seen[number] = self._whole(kind, node)
         return made
@@ -249,7 +254,7 @@ class _Reader:
 
 
 def _is_scalar(value: Any) -> bool:
-    return value is None or type(value) in (bool, int, float, str)
+    return value is None or type(value) in (bool, int, float, str, Message)
 
 
 def _scalar(value: Any) -> Any:

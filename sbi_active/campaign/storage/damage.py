@@ -18,6 +18,8 @@ class DamagedCampaignError(Explained, OSError):
         reason: What is wrong with it, and what is whole.
     """
 
+    code = "SA606"
+
     def __init__(self, path: Path, reason: str) -> None:
         self.path, self.reason = path, reason
         super().__init__(
@@ -33,6 +35,8 @@ class LogChangedError(Explained, ValueError):
     Attributes:
         path: The file.
     """
+
+    code = "SA607"
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -13,12 +13,13 @@ from torch import Tensor
 from torch import distributions as td
 
 from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
-from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.options import GROUPS, CampaignDetails, CampaignOptions
 from sbi_active.campaign.stopping import StopRules
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.ratio_network import RatioClassifier
+from sbi_active.renamed import grouped
 from sbi_active.simulation.workers.settings import Workers
 
 #: Arguments by which each is made anew.
@@ -38,6 +39,7 @@ _BY_NAME = {kind.__name__: kind for kind in _PRIORS}
 _SETTINGS = {
     kind.__name__: kind
     for kind in (
+        CampaignDetails,
         CampaignOptions,
         LFIRE,
         MixtureDensity,
@@ -137,7 +139,10 @@ def options_from(described: Any) -> Any:
         return float(described["number"])
     kind = _SETTINGS[described["settings"]]
     known = {f.name for f in dataclasses.fields(kind)}
-    return kind(**{n: options_from(v) for n, v in described.items() if n in known})
+    values = {name: options_from(value) for name, value in described.items()}
+    if kind is CampaignOptions:
+        values = grouped(values, GROUPS)
+    return kind(**{name: value for name, value in values.items() if name in known})
 
 
 def _plain(value: Any) -> Any:

@@ -57,7 +57,8 @@ class CampaignDirectory:
     """
 
     def __init__(self, path: Path, *, repair: bool = False) -> None:
-        self.path, self.notes = path, []
+        self.path = path
+        self.notes: list[str] = []
         with naming():
             self.store = Store(path, "campaign")
             if repair and self.store.problems():
@@ -239,7 +240,9 @@ class CampaignDirectory:
             except CorruptSegmentError as error:
                 left = self.store.remains(EVENTS, LOG, number)
                 lost.append(error.reason)
-                self.notes.append(f"given up, tell it again: {left or error.reason}")
+                self.notes.append(
+                    f"SA603 given up, tell it again: {left or error.reason}"
+                )
         return whole, lost
 
     def _mend(self) -> None:
@@ -260,7 +263,7 @@ class CampaignDirectory:
             content = self.store.get(OBJECTS, STATE)
             return None if content is None else decode(content, known={})
         except (CorruptSegmentError, ValueError) as error:
-            self.notes.append(f"{STATE} is computed again: {error}")
+            self.notes.append(f"SA601 {STATE} is computed again: {error}")
             return None
 
     def _require_whole(self, *, repair: bool) -> None:
@@ -269,7 +272,7 @@ class CampaignDirectory:
         A repair takes their trials from the state, and has all else computed again.
         """
         saved = self._saved
-        mended = any(note.startswith("given up") for note in self.notes)
+        mended = any(note.startswith("SA603") for note in self.notes)
         if saved is None or saved["lines"] <= len(self._entries) and not mended:
             return
         told = [t for t in saved["trials"] if t.status != "pending"]
@@ -289,7 +292,7 @@ class CampaignDirectory:
         for trial in [t for t in told if not _has(state, t)]:
             self.write("restored", trial)
             self.notes.append(
-                f"restored from {STATE}: trial {trial.index}, x = {trial.x}"
+                f"SA603 restored from {STATE}: trial {trial.index}, x = {trial.x}"
             )
         self.close()
 

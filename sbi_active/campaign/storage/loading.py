@@ -89,7 +89,10 @@ class StoredLearner:
             try:
                 self._belief = stood_for(saved(), self.first_prior, self._state)
             except ValueError as error:
-                warn(f"the belief has to be computed again: {error}", stacklevel=3)
+                warn(
+                    f"SA601 the belief has to be computed again: {error}",
+                    stacklevel=3,
+                )
                 self._state.is_stale = True
         return self._belief
 
@@ -99,7 +102,7 @@ class StoredLearner:
         texts = doubts(self._state.measured)
         if self._state.is_stale:
             texts.append(
-                "trials were told or corrected since: update() computes it again"
+                "SA601 trials were told or corrected since: update() computes it again"
             )
         return in_doubt(self.belief, self.prior, texts)
 
@@ -129,9 +132,11 @@ def load(
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest = disk.manifest
     settings: CampaignOptions = _given("options", options, disk, options_from)
-    if options is not None and describe_options(options) != manifest.get("options"):
+    kept = manifest.get("options")
+    known = None if kept is None else describe_options(options_from(kept))
+    if options is not None and describe_options(options) != known:
         warn(
-            f"options= hold for this process: the campaign in {directory} keeps "
+            f"SA604 options= hold for this process: the campaign in {directory} keeps "
             f"{manifest.get('options_text')}; pass them at each load",
             stacklevel=4,
         )
@@ -188,7 +193,7 @@ def _belief(
     try:
         return disk.belief(name, known)
     except ValueError as error:
-        warn(f"the belief is computed again: {error}", stacklevel=4)
+        warn(f"SA601 the belief is computed again: {error}", stacklevel=4)
         learner.forget()
         return learner.prior
 

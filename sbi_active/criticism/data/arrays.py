@@ -71,8 +71,8 @@ def without_inf(x: Tensor, names: Sequence[str]) -> Tensor:
     if lost:
         which = ", ".join(names[int(i)] for i in lost)
         warn(
-            f"x is inf in trial{'s' * (len(lost) > 1)} {which}: taken as not measured, "
-            "as NaN is",
+            f"SA201 x is inf in trial{'s' * (len(lost) > 1)} {which}: taken as not "
+            "measured, as NaN is",
             stacklevel=stack_level(),
         )
     return x.where(x.isfinite(), torch.nan)

@@ -313,8 +313,9 @@ def _require_one_origin(ends: list[tuple[float, float]], low: float) -> None:
             f"that begins {after:g} after the earliest; {remedy}, and all in one unit"
         )
     warn(
-        f"trials {[i for i, *_ in late]} begin up to {after:g} after the earliest, and "
-        f"hold their first inputs until then: {remedy} where a simulator starts there",
+        f"SA208 trials {[i for i, *_ in late]} begin up to {after:g} after the "
+        f"earliest, and hold their first inputs until then: {remedy} where a "
+        "simulator starts there",
         stacklevel=stack_level(),
     )
 

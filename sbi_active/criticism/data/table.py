@@ -258,7 +258,7 @@ class _TrialRows(Rows):
                 some = ", ".join(map(self.place, at[:SHOWN]))
                 more = f" and {len(at) - SHOWN} more" if len(at) > SHOWN else ""
                 warn(
-                    f"{len(at)} of {len(rows)} cells of column {column} in "
+                    f"SA203 {len(at)} of {len(rows)} cells of column {column} in "
                     f"{self.source} hold no number: {some}{more}; they count as not "
                     "measured",
                     stacklevel=stack_level(),
@@ -282,8 +282,8 @@ class _TrialRows(Rows):
         which = ", ".join(self.names[some[i]] for i in sorted(fewer)[:SHOWN])
         factor = 10 ** abs(np.median(high) - np.median(low))
         warn(
-            f"{column} of {'trials' if self.columns.trial else 'rows'} {which} in "
-            f"{self.source} is about {factor:.0f} times {word} than that of the "
+            f"SA207 {column} of {'trials' if self.columns.trial else 'rows'} {which} "
+            f"in {self.source} is about {factor:.0f} times {word} than that of the "
             "others: check that all are in one unit",
             stacklevel=stack_level(),
         )

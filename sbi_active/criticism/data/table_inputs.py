@@ -69,8 +69,9 @@ class InputRows:
         lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
         if len(lost):
             warn(
-                f"{len(lost)} rows of {self.source} have a measurement and no input, "
-                f"the first in {self.place(lost[0])}; there the input before holds",
+                f"SA209 {len(lost)} rows of {self.source} have a measurement and no "
+                f"input, the first in {self.place(lost[0])}; there the input before "
+                "holds",
                 stacklevel=stack_level(),
             )
 

@@ -114,10 +114,10 @@ def start_from_first_samples(
             errors[key].append(factorial(order) * own * error[order])
     if bent:
         warn(
-            f"the first samples of {trials.called(sorted(bent))} leave a polynomial of "
-            f"order {degree} by more than the sensor's error, so that their start is "
-            "wrong and hides what bends them, such as gravity: name a derivative of "
-            f"order {degree + 1} as well, or pass a shorter within",
+            f"SA211 the first samples of {trials.called(sorted(bent))} leave a "
+            f"polynomial of order {degree} by more than the sensor's error, so that "
+            "their start is wrong and hides what bends them, such as gravity: name a "
+            f"derivative of order {degree + 1} as well, or pass a shorter within",
             stacklevel=stack_level(),
         )
     if trials.start is not None and not isinstance(trials.start, dict):

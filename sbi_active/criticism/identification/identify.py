@@ -159,16 +159,16 @@ def identify(
     if disagree:
         worst = names[int(np.argmin(parts.p_value))]
         notes.append(
-            f"single trials disagree about {worst} (p = {least:.1g}): "
-            "the model lacks something, and intervals are as wide as they disagree; "
-            "ask close_loop what it lacks"
+            f"SA123 single trials disagree about {worst} (p = {least:.1g}): the model "
+            "lacks something, and intervals are as wide as they disagree; ask "
+            "close_loop what it lacks"
         )
     dim = len(names)
     fewest = max(own.fewest, own.fewest_each * dim * (dim + 3))
     if shape is not None and (effective < fewest or shape > own.largest_shape):
         notes.append(
-            f"{effective:.0f} effective draws: the posterior is not that of a nearly "
-            "linear model; use Campaign, or a narrower prior"
+            f"SA115 {effective:.0f} effective draws: the posterior is not that of a "
+            "nearly linear model; use Campaign, or a narrower prior"
         )
     notes += _at_bounds(belief)
     errors = _errors(found, model)
@@ -302,9 +302,9 @@ def _beyond(
         # What is left, since shapes of the error only have sizes some steps apart.
         ratio = found.sizes[c] / declared[c]
         notes.append(
-            f"residuals of {name} are {ratio:.2g} times the declared error: the model "
-            "lacks something, or the error is declared too small; ask close_loop what "
-            "it lacks"
+            f"SA124 residuals of {name} are {ratio:.2g} times the declared error: the "
+            "model lacks something, or the error is declared too small; ask "
+            "close_loop what it lacks"
         )
     return notes
 
@@ -335,7 +335,7 @@ def _at_bounds(belief: IdentifiedBelief) -> list[str]:
             if side < 0:
                 limit = f"lower one: at most {high:.3g}"
             notes.append(
-                f"{name} is at a bound of its prior, the {limit}, and nothing says how "
-                "far beyond; move the bound, or say why"
+                f"SA103 {name} is at a bound of its prior, the {limit}, and nothing "
+                "says how far beyond; move the bound, or say why"
             )
     return notes

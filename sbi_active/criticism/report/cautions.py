@@ -33,6 +33,7 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.rivals.validity import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED
+from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
@@ -63,7 +64,7 @@ def find_warnings(
     effects: Sequence[Effect] = (),
     exploratory: bool = False,
     designed: bool = False,
-) -> tuple[str, ...]:
+) -> tuple[Message, ...]:
     """Return what limits the conclusions, a sentence each.
 
     Args:
@@ -77,7 +78,7 @@ def find_warnings(
         exploratory: What was frozen was changed after the data were seen.
         designed: Actions were chosen for their information.
     """
-    return (
+    found = (
         *_of_trials(
             trials.fit,
             residuals,
@@ -93,6 +94,7 @@ def find_warnings(
         *of_trials(tracing),
         *_of_verdict(tracing, effects, evaluation, exploratory=exploratory),
     )
+    return (*map(Message, found),)
 
 
 def _of_trials(
@@ -100,25 +102,26 @@ def _of_trials(
 ) -> Iterator[str]:
     if residuals.noise == "estimated" and not has_sensor:
         yield (
-            "noise undeclared: its size has a prior or is estimated from repeated "
-            "trials, which show scatter and no bias, and what differs from repeat to "
-            "repeat passes for noise"
+            "SA501 noise undeclared: its size has a prior or is estimated from "
+            "repeated trials, which show scatter and no bias, and what differs from "
+            "repeat to repeat passes for noise"
         )
     num = int(trials.valid.sum())
     if num < FEW_TRIALS:
         yield (
-            f"fewer than {FEW_TRIALS} trials ({num}): several effects may explain as "
-            "few"
+            f"SA502 fewer than {FEW_TRIALS} trials ({num}): several effects may "
+            "explain as few"
         )
     if not trials.action_is_label and _aliased(trials):
         yield (
-            "drift aliased with the order of actions: they were executed in sorted "
-            "order, so that what grows with time looks like what grows with the action"
+            "SA503 drift aliased with the order of actions: they were executed in "
+            "sorted order, so that what grows with time looks like what grows with "
+            "the action"
         )
     if designed:
         yield (
-            "actions chosen for information and not for deployment: the error before "
-            "and after is that of such actions"
+            "SA504 actions chosen for information and not for deployment: the error "
+            "before and after is that of such actions"
         )
 
 
@@ -129,7 +132,7 @@ def _of_errors(
     lost, kept = surprising_outcomes(own)
     if lost or kept:
         yield (
-            "outcomes that disagree: "
+            "SA505 outcomes that disagree: "
             + " and ".join(
                 f"trial{'s' * (len(which) > 1)} "
                 f"{', '.join(called(own.names, i) for i in which)} {what}"
@@ -143,10 +146,10 @@ def _of_errors(
     if own.roughness is not None:
         rough = own.roughness[own.roughness > 0]
         yield (
-            "the simulator jumps: where parameters change within their posterior, x "
-            f"strays by {rough.min():.2g} to {rough.max():.2g} from a smooth function "
-            "of them, which counts as an error of its own beside the noise, so that "
-            "less is concluded than the trials may hold"
+            "SA506 the simulator jumps: where parameters change within their "
+            f"posterior, x strays by {rough.min():.2g} to {rough.max():.2g} from a "
+            "smooth function of them, which counts as an error of its own beside the "
+            "noise, so that less is concluded than the trials may hold"
         )
     assumed_independent = own.times is None or own.correlation == 0.0
     if assumed_independent and own.x.shape[1] >= LONG:
@@ -158,9 +161,9 @@ def _of_errors(
                 else "declare GaussianNoise or AutocorrelatedNoise"
             )
             yield (
-                "independent errors forced on a trajectory: neighboring residuals have "
-                f"a correlation of {correlation:.2f}, which makes false alarms and "
-                f"intervals that are too narrow; {advice}"
+                "SA507 independent errors forced on a trajectory: neighboring "
+                f"residuals have a correlation of {correlation:.2f}, which makes "
+                f"false alarms and intervals that are too narrow; {advice}"
             )
 
 
@@ -176,13 +179,13 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
     ]
     if weak:
         yield (
-            f"evidence uncertain of {', '.join(weak)}: so are the probabilities that "
-            "rest on it"
+            f"SA508 evidence uncertain of {', '.join(weak)}: so are the probabilities "
+            "that rest on it"
         )
     if detection is not None and detection.alarm and not detection.by_evidence:
         yield (
-            "the alarm rests on the chi-square alone: no alternative has a Bayes "
-            "factor of 20, so that what is lacking is a suggestion"
+            "SA509 the alarm rests on the chi-square alone: no alternative has a "
+            "Bayes factor of 20, so that what is lacking is a suggestion"
         )
     if (
         detection is not None
@@ -191,17 +194,18 @@ def _of_evidence(tracing: Tracing, detection: Detection | None) -> Iterator[str]
         and detection.refutes(tracing.evidences[tracing.verdict], REFUTED)
     ):
         yield (
-            f"{tracing.verdict} explains the most, and not all: the chi-square of the "
-            f"trials with it has p < {REFUTED:g}, so that something else is missing too"
+            f"SA510 {tracing.verdict} explains the most, and not all: the chi-square "
+            f"of the trials with it has p < {REFUTED:g}, so that something else is "
+            "missing too"
         )
     check = None if detection is None else detection.null_cross_check
     if detection is not None and check is not None:
         difference = check - detection.null_log_evidence
         if abs(difference) > DISAGREEMENT:
             yield (
-                "two estimates of the bare model's evidence differ by "
-                f"{abs(difference):.1f} nats: its posterior has parts that one of them "
-                "missed"
+                "SA511 two estimates of the bare model's evidence differ by "
+                f"{abs(difference):.1f} nats: its posterior has parts that one of "
+                "them missed"
             )
 
 
@@ -216,27 +220,27 @@ def _of_verdict(
         rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
         if rmse["after"] >= rmse["before"]:
             yield (
-                f"{ModelKey(tracing.chosen)} does not lower the error on trials that "
-                f"had no part in it: RMSE {rmse['before']:.3g} before and "
+                f"SA512 {ModelKey(tracing.chosen)} does not lower the error on trials "
+                f"that had no part in it: RMSE {rmse['before']:.3g} before and "
                 f"{rmse['after']:.3g} after"
             )
     edge = _at_edge(tracing, effects)
     if edge:
         yield (
-            f"phi at its prior's edge ({', '.join(e.name for e, _ in edge)}): the "
-            "effect is stronger than declared, or stands in for another"
+            f"SA515 phi at its prior's edge ({', '.join(e.name for e, _ in edge)}): "
+            "the effect is stronger than declared, or stands in for another"
         )
     for effect, phi in edge:
         if effect.hook == "observation" or effect.family in INSTRUMENTS:
             size = f"{number(float(phi[np.argmax(np.abs(phi))]))} {effect.units}"
             yield (
-                f"{effect.name} of {size.strip()} is more than an instrument gets "
-                "wrong: it stands in for something else, however well it predicts"
+                f"SA516 {effect.name} of {size.strip()} is more than an instrument "
+                "gets wrong: it stands in for something else, however well it predicts"
             )
     if not tracing.robust:
         yield (
-            "not robust to its prior: effect priors a third or three times as wide "
-            "give another verdict"
+            "SA517 not robust to its prior: effect priors a third or three times as "
+            "wide give another verdict"
         )
     is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
     if is_bare and not tracing.bounds.replaces:
@@ -244,15 +248,15 @@ def _of_verdict(
             f"beside {ModelKey(tracing.beside)}" if tracing.beside else "in its place"
         )
         yield (
-            f"no declared effect explains the data: the residual process {place} does "
-            "not extrapolate"
+            "SA518 no declared effect explains the data: the residual process "
+            f"{place} does not extrapolate"
         )
     if tracing.verdict == SCATTER:
-        yield "scatter is larger than the declared noise, which is no cause"
+        yield "SA519 scatter is larger than the declared noise, which is no cause"
     if exploratory:
         yield (
-            "exploratory: library or priors were changed after the data were seen, so "
-            "the false-alarm rate is not what is stated"
+            "SA520 exploratory: library or priors were changed after the data were "
+            "seen, so the false-alarm rate is not what is stated"
         )
 
 

@@ -21,7 +21,8 @@ def first_paragraph(report: Contents) -> str:
     tracing = report.tracing
     against = [*of_outlying(tracing), *of_missed(report.evaluation)]
     against += of_bounds(tracing.bounds)
-    said = [f"{text[0].upper()}{text[1:]}." for text in against]
+    texts = [text.partition(" ")[2] for text in against]  # without their codes
+    said = [f"{text[0].upper()}{text[1:]}." for text in texts]
     return " ".join([summary_sentence(report), *said, *conditions(report)])
 
 

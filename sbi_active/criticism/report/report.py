@@ -20,7 +20,7 @@ from sbi_active.criticism.report.sections import page
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
 from sbi_active.display.table import Table, number
-from sbi_active.messages import explained
+from sbi_active.messages import Message
 
 
 class Report(Contents):
@@ -129,7 +129,7 @@ def build_report(
     channels = trials.channel_labels or parts["simulator"].channel_names
     return Report(
         **parts,
-        warnings=tuple(map(explained, (*found, *warnings))),
+        warnings=tuple(map(Message, (*found, *warnings))),
         exploratory=exploratory,
         num_trials=len(trials.fit),
         action_labels=tuple(labels),

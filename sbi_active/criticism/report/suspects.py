@@ -59,32 +59,33 @@ def of_trials(tracing: Tracing) -> Iterator[str]:
     if tracing.verdict == OUTLIER:
         which = in_words(tracing)
         yield (
-            f"{which} does not agree with the others: check its record, its unit and "
-            "its set-up, then correct, withdraw or repeat it; nothing is added for it"
+            f"SA521 {which} does not agree with the others: check its record, its "
+            "unit and its set-up, then correct, withdraw or repeat it; nothing is "
+            "added for it"
         )
     if tracing.instead_of:
         p = tracing.probabilities.get(tracing.instead_of)
         stated = "" if p is None else f" (probability {p:.2g})"
-        why = _why_withdrawn(tracing)
-        yield f"{tracing.instead_of}{stated} is not named, since {why}"
+        code, why = _why_withdrawn(tracing)
+        yield f"{code} {tracing.instead_of}{stated} is not named, since {why}"
     elif len(tracing.needed) == 1:
         yield (
-            f"{tracing.verdict} {_rests(tracing)}: without it the Bayes factor "
+            f"SA522 {tracing.verdict} {_rests(tracing)}: without it the Bayes factor "
             "against the bare model is below 20; repeat its action"
         )
 
 
-def _why_withdrawn(tracing: Tracing) -> str:
+def _why_withdrawn(tracing: Tracing) -> tuple[str, str]:
     if tracing.bounds.replaces:
-        return narrow_prior(tracing)
+        return "SA103", narrow_prior(tracing)
     if tracing.refuted:
         before, after = tracing.refuted
         where = tracing.refuted_on or NO_PART
-        return (
+        return "SA512", (
             f"it does not lower the error on {where}: RMSE {before:.3g} before and "
             f"{after:.3g} after"
         )
-    return (
+    return "SA521", (
         f"it {_rests(tracing)}, and {in_words(tracing)} may as well have a "
         "gross error: repeat its action before adding it"
     )
@@ -119,7 +120,7 @@ def of_bounds(bounds: Bounds) -> Iterator[str]:
         if not math.isnan(p.beyond):
             beyond = f" with the bound moved the best fit has {p.beyond:.3g};"
         yield (
-            f"{p.name} is at a bound of its prior {where}, the {p.side} one "
+            f"SA103 {p.name} is at a bound of its prior {where}, the {p.side} one "
             f"({p.bound:.6g});{beyond} move the bound, or say why"
         )
 
@@ -128,10 +129,10 @@ def of_outlying(tracing: Tracing) -> Iterator[str]:
     """Yield a sentence on each trial that was set aside where every model misses."""
     for trial in tracing.set_aside:
         yield (
-            f"trial {trial.name} is far outside what the other trials show: its error "
-            f"on the fit to them is {trial.times:.3g} times theirs; it is set aside, "
-            "and had no part in the verdict: check its record, its unit and its "
-            "set-up, then correct, withdraw or repeat it"
+            f"SA513 trial {trial.name} is far outside what the other trials show: its "
+            f"error on the fit to them is {trial.times:.3g} times theirs; it is set "
+            "aside, and had no part in the verdict: check its record, its unit and "
+            "its set-up, then correct, withdraw or repeat it"
         )
 
 
@@ -154,9 +155,9 @@ def of_missed(evaluation: Evaluation | None) -> Iterator[str]:
         if math.isinf(trial.size):
             how = "measured where the model is sure of no measurement"
         yield (
-            f"held-out trial {trial.name} is far outside what the verdict's model "
-            f"predicts, {how}: check its record and its unit, or the model is wrong "
-            "there"
+            f"SA514 held-out trial {trial.name} is far outside what the verdict's "
+            f"model predicts, {how}: check its record and its unit, or the model is "
+            "wrong there"
         )
 
 
@@ -180,11 +181,11 @@ def of_noise(detection: Detection | None) -> Iterator[str]:
     least, num = detection.least_chi_square, detection.degrees_of_freedom
     ratio = (least / num) ** 0.5
     yield (
-        "residuals are far smaller than the declared noise allows: their root mean "
-        f"square is {ratio:.2g} of its standard deviation (chi-square {least:.2g} "
-        f"on {num:.1f} degrees of freedom); declare the error of the measurement in "
-        "the unit of x, since noise that is too large hides effects and widens the "
-        "parameters"
+        "SA523 residuals are far smaller than the declared noise allows: their root "
+        f"mean square is {ratio:.2g} of its standard deviation (chi-square "
+        f"{least:.2g} on {num:.1f} degrees of freedom); declare the error of the "
+        "measurement in the unit of x, since noise that is too large hides effects "
+        "and widens the parameters"
     )
 
 

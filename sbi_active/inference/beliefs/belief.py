@@ -191,10 +191,10 @@ class ChainedBelief(Belief):
         else:
             self._resample(previous)
             warn(
-                f"only {acceptance:.2%} of the network's posterior lies within the "
-                "prior's support: the observation is unlike those simulated, or the "
-                "truth lies outside the prior. The belief is resampled from the one "
-                "before and is coarse.",
+                f"SA106 only {acceptance:.2%} of the network's posterior lies within "
+                "the prior's support: the observation is unlike those simulated, or "
+                "the truth lies outside the prior. The belief is resampled from the "
+                "one before and is coarse.",
                 stacklevel=4,
             )
 

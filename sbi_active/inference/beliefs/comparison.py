@@ -48,5 +48,5 @@ def compare(refined: Belief, chained: ChainedBelief) -> None:
         else f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
     )
     refined.diagnostics = refined.diagnostics.extended(
-        network_warnings=(f"the amortized network is {kind}",)
+        network_warnings=((f"SA122 the amortized network is {kind}"),)
     )

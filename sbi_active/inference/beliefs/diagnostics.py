@@ -10,7 +10,7 @@ from typing import Any
 from sbi_active.display.notebook import badge, card, facts, items
 from sbi_active.display.table import number
 from sbi_active.inference.beliefs.identifiability import Combinations
-from sbi_active.messages import explained, warn
+from sbi_active.messages import Message, warn
 
 VERDICTS = {
     True: ("good", "trustworthy"),
@@ -74,7 +74,7 @@ class Diagnostics:
 
     def __post_init__(self) -> None:
         for name in ("warnings", "network_warnings"):
-            texts = tuple(map(explained, getattr(self, name)))
+            texts = tuple(map(Message, getattr(self, name)))
             object.__setattr__(self, name, texts)
 
     def extended(self, **changes: Any) -> Diagnostics:
@@ -164,8 +164,7 @@ class Diagnostics:
 
     def _as_dict(self, used: str) -> dict[str, Any]:
         warn(
-            f"diagnostics{used} is deprecated; use an attribute, or to_dict()",
-            DeprecationWarning,
+            f"SA701 diagnostics{used} is deprecated; use an attribute, or to_dict()",
             stacklevel=3,
         )
         return self.to_dict()

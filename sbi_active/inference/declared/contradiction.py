@@ -67,10 +67,10 @@ class Contradiction:
     def noted(self, diagnostics: Diagnostics) -> Diagnostics:
         """Return diagnostics of the wider belief that say so first."""
         text = (
-            f"{self.trials}: the observations are unlike anything simulated (tail "
-            f"probability {self.probability:.1g}), so that the noise was inflated "
-            f"{self.inflation:.3g} times, to what the trials scatter; correct or "
-            "withdraw what is wrong, or criticize the simulator"
+            f"SA102 {self.trials}: the observations are unlike anything simulated "
+            f"(tail probability {self.probability:.1g}), so that the noise was "
+            f"inflated {self.inflation:.3g} times, to what the trials scatter; "
+            "correct or withdraw what is wrong, or criticize the simulator"
         )
         return diagnostics.extended(
             warnings=(),

@@ -75,31 +75,34 @@ def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
     needed = max(COARSE, dim * (dim + 3) / (4 * TOLERATED))
     found = {"enough_draws": Assumption(effective >= needed, effective)}
     words = {
-        "enough_draws": f"the belief rests on {effective:.0f} effective draws, fewer "
-        f"than the {needed:.0f} that {dim} parameters ask for, so that its log density "
-        f"is off by about {max(effective, 1e-9) ** -0.5:.2g} nats; raise num_histories"
+        "enough_draws": (
+            f"SA114 the belief rests on {effective:.0f} effective draws, fewer than "
+            f"the {needed:.0f} that {dim} parameters ask for, so that its log density "
+            f"is off by about {max(effective, 1e-9) ** -0.5:.2g} nats; raise "
+            "num_histories"
+        )
     }
     if fit.particles is None:
         shape = fit.tail_shape
         found["light_tails"] = Assumption(shape <= Settings().largest_shape, shape)
         words["light_tails"] = (
-            f"few draws outweigh all others (tail shape {shape:.2g}), so that the "
-            "belief may miss where they are from; raise num_histories"
+            f"SA116 few draws outweigh all others (tail shape {shape:.2g}), so that "
+            "the belief may miss where they are from; raise num_histories"
         )
     else:
         own = fit.particles
         moves = own.acceptance >= MOVING and own.memory <= REMEMBERED
         found["particles_move"] = Assumption(moves, own.acceptance)
         words["particles_move"] = (
-            f"{own.acceptance:.1%} of the moves of the particles were accepted, too "
-            "few for them to reach the posterior; raise num_histories"
+            f"SA117 {own.acceptance:.1%} of the moves of the particles were accepted, "
+            "too few for them to reach the posterior; raise num_histories"
         )
     if fit.found is not None and not fit.is_rough:
         twice = fit.found.num_found >= 2
         found["mode_found_twice"] = Assumption(twice, float(fit.found.num_found))
         words["mode_found_twice"] = (
-            f"the best mode was found by one of {fit.found.num_starts} searches, so "
-            "that a better one may be missed; check against another seed"
+            f"SA118 the best mode was found by one of {fit.found.num_starts} "
+            "searches, so that a better one may be missed; check against another seed"
         )
     return found, [words[name] for name, a in found.items() if not a.holds]
 
@@ -113,14 +116,14 @@ def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
     warnings = []
     if joint < RARE or min(tail) < RARE / len(tail):
         warnings.append(
-            f"the observations are unlike anything simulated (tail probability "
+            "SA102 the observations are unlike anything simulated (tail probability "
             f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
             "excludes the truth, or a measurement is wrong"
         )
     if edge_mass > EDGE:
         warnings.append(
-            f"{edge_mass:.0%} of the belief lies within 1 % of the prior's edge: the "
-            "prior may exclude the truth"
+            f"SA103 {edge_mass:.0%} of the belief lies within 1 % of the prior's "
+            "edge: the prior may exclude the truth"
         )
     return warnings
 

@@ -128,8 +128,8 @@ def refine_declared(
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
     if num_missing:
         warn(
-            f"{num_missing} of {num_simulations} simulations of the refinement are "
-            "missing, by faults of the simulator; their draws were left out",
+            f"SA301 {num_missing} of {num_simulations} simulations of the refinement "
+            "are missing, by faults of the simulator; their draws were left out",
             MissingRowsWarning,
             stacklevel=5,
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sbi_active.expected import require
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Number of parameters beyond which draws are more in proportion: a covariance of d
@@ -61,8 +62,5 @@ class RefinementOptions:
             value = getattr(self, name)
             if name == "num_draws" and value is None:
                 continue
-            if not low <= value <= high:
-                raise ValueError(
-                    f"expected {name} in [{low:g}, {high:g}]; got {value}; choose "
-                    "a value in this range"
-                )
+            where = f"{name} in [{low:g}, {high:g}]"
+            require(low <= value <= high, where, value, "choose a value in this range")

@@ -300,11 +300,11 @@ class PooledPosterior:
         )
         if error > LARGE:
             found = found.warned(
-                f"the belief is off by about {error:.2g} nats for want of simulations; "
-                "allow more of them"
+                f"SA105 the belief is off by about {error:.2g} nats for want of "
+                "simulations; allow more of them"
             )
         if effective < 100:
-            found = found.warned("few effective draws; allow more simulations")
+            found = found.warned("SA114 few effective draws; allow more simulations")
         belief.diagnostics = found
         return belief
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegressionCV
 from torch import Tensor
 
+from sbi_active.expected import require
+
 FEWEST = 2  # rows of each kind a fold
 
 
@@ -65,10 +67,8 @@ class LFIRE:
 
     def __post_init__(self) -> None:
         for name, low in (("num_marginal", 10), ("num_penalties", 1), ("num_folds", 2)):
-            if getattr(self, name) < low:
-                raise ValueError(
-                    f"expected {name} >= {low}; got {getattr(self, name)}; raise it"
-                )
+            value = getattr(self, name)
+            require(value >= low, f"{name} >= {low}", value, "raise it")
 
     def summaries(self, x: Tensor, center: Tensor, scale: Tensor) -> Tensor:
         """Return summaries, and whether there was a measurement, shape (n, q + 1).

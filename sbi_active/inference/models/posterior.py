@@ -203,8 +203,8 @@ class ActionPosterior:
             return direct, condition  # sbi says what is wrong
         if not network.knows(condition):
             warn(
-                "the network has never seen an outcome like this: no simulation it was "
-                "trained on lacks these numbers, so what it says is arbitrary",
+                "SA107 the network has never seen an outcome like this: no simulation "
+                "it was trained on lacks these numbers, so what it says is arbitrary",
                 stacklevel=3,
             )
         return at_conditions(direct, condition)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from sbi_active.expected import require
 from sbi_active.inference.networks.mixture_network import (
     ACTIVATIONS,
     MixtureDensityNetwork,
@@ -72,23 +73,18 @@ class MixtureDensity:
             "hidden_features": min(self.hidden_features, default=1),
         }
         for name, value in counts.items():
-            if value < 1:
-                raise ValueError(f"expected {name} >= 1; got {value}; raise it")
-        if not self.learning_rate > 0:
-            raise ValueError(
-                f"expected learning_rate > 0; got {self.learning_rate}; use 1e-3"
-            )
+            require(value >= 1, f"{name} >= 1", value, "raise it")
+        rate = self.learning_rate
+        require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
         choices = {
             "activation": (*ACTIVATIONS,),
             "scaling": ("action", "global"),
             "baseline": ("best", "none", "linear", "curved"),
         }
         for name, valid in choices.items():
-            if getattr(self, name) not in valid:
-                raise ValueError(
-                    f"expected {name} among {', '.join(map(repr, valid))}; got "
-                    f"{getattr(self, name)!r}; choose one of these"
-                )
+            among = f"{name} among {', '.join(map(repr, valid))}"
+            value = getattr(self, name)
+            require(value in valid, among, repr(value), "choose one of these")
 
     @classmethod
     def faithful(cls) -> MixtureDensity:

@@ -8,6 +8,7 @@ import torch
 from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor, nn
 
+from sbi_active.expected import require
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
     MAX_OUTCOMES,
@@ -47,12 +48,9 @@ class RatioClassifier:
         for name in ("batch_size", "num_iterations", "stop_after_epochs"):
             values[name] = getattr(self, name)
         for name, value in values.items():
-            if value < 1:
-                raise ValueError(f"expected {name} >= 1; got {value}; raise it")
-        if not self.learning_rate > 0:
-            raise ValueError(
-                f"expected learning_rate > 0; got {self.learning_rate}; use 1e-3"
-            )
+            require(value >= 1, f"{name} >= 1", value, "raise it")
+        rate = self.learning_rate
+        require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
 
 
 class RatioNetwork(RatioEstimator):

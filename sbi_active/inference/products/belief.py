@@ -57,6 +57,7 @@ def sample_product(
     )
     if effective < ENOUGH:
         belief.diagnostics = belief.diagnostics.warned(
-            f"the belief rests on {effective:.0f} effective draws; raise num_particles"
+            f"SA114 the belief rests on {effective:.0f} effective draws; raise "
+            "num_particles"
         )
     return belief

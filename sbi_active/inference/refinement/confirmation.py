@@ -63,7 +63,7 @@ class Confirmation:
         if self.holds:
             return known
         return known.warned(
-            f"fresh simulations do not confirm the belief: its mean is off by "
+            "SA101 fresh simulations do not confirm the belief: its mean is off by "
             f"{self.shift:.2g} standard deviations; raise num_histories"
         )
 

@@ -45,16 +45,17 @@ def check_outcomes(
     texts = []
     if not followed:
         texts.append(
-            "where simulations have a measurement and where they have none is followed "
-            f"coarsely ({blur:.0%} of repeated simulations would differ that do not), "
-            "so that the belief is too wide; raise num_histories"
+            "SA120 where simulations have a measurement and where they have none is "
+            f"followed coarsely ({blur:.0%} of repeated simulations would differ that "
+            "do not), so that the belief is too wide; raise num_histories"
         )
     unheard = [k for k, p in enumerate(probability) if p < UNHEARD]
     if unheard:
         texts.append(
-            f"trials {', '.join(map(str, unheard))} had a measurement, or none, where "
-            f"less than {UNHEARD:.0%} of the simulations near the belief do the same: "
-            "the simulator lacks a way to fail, or the status of the trial is wrong"
+            f"SA121 trials {', '.join(map(str, unheard))} had a measurement, or none, "
+            f"where less than {UNHEARD:.0%} of the simulations near the belief do the "
+            "same: the simulator lacks a way to fail, or the status of the trial is "
+            "wrong"
         )
     assumption = Assumption(followed, float(blur))
     return diagnostics.extended(

@@ -263,9 +263,9 @@ class Stages:
         belief.histories = histories.record()
         if histories.num_missing:
             warn(
-                f"{histories.num_missing} of {histories.num_simulations} simulations "
-                "of the refinement are missing, by faults of the simulator; the "
-                "histories they belong to were left out",
+                f"SA301 {histories.num_missing} of {histories.num_simulations} "
+                "simulations of the refinement are missing, by faults of the "
+                "simulator; the histories they belong to were left out",
                 MissingRowsWarning,
                 stacklevel=4,
             )

@@ -188,47 +188,49 @@ def diagnose(
         "gaussian_noise": (
             is_gaussian,
             negentropy,
-            "the noise is not Gaussian (it differs by {:.2g} nats a number), and the "
-            "belief, which takes it for Gaussian, may be too wide or too narrow; "
-            "check against a belief of a trained network",
+            "SA110 the noise is not Gaussian (it differs by {:.2g} nats a number), "
+            "and the belief, which takes it for Gaussian, may be too wide or too "
+            "narrow; check against a belief of a trained network",
         ),
         "few_modes": (
             effective >= MIN_EFFECTIVE,
             effective,
-            "at some stage only {:.1%} of the particles counted, as with many narrow "
-            "modes, and a mode may be lost; raise num_histories",
+            "SA111 at some stage only {:.1%} of the particles counted, as with "
+            "many narrow modes, and a mode may be lost; raise num_histories",
         ),
         "smooth_response": (
             roughness <= ROUGH,
             roughness,
-            "over the prior the outcomes have more turns than a cubic, which misses "
-            "{:.0%} of their variance, so that four or more narrow modes are possible "
-            "and one may be lost; check against another seed or a narrower prior",
+            "SA111 over the prior the outcomes have more turns than a cubic, which "
+            "misses {:.0%} of their variance, so that four or more narrow modes "
+            "are possible and one may be lost; check against another seed or a "
+            "narrower prior",
         ),
         "no_misfit": (
             last.excess <= SERIOUS_MISFIT,
             ratio,
-            "the residuals of the surrogate have {:.2g} times the variance of the "
-            "noise, so that the belief is too wide; raise num_histories",
+            "SA112 the residuals of the surrogate have {:.2g} times the variance "
+            "of the noise, so that the belief is too wide; raise num_histories",
         ),
         "settled": (
             len(course.stages) > 1 and course.divergence <= UNSETTLED * dim,
             course.divergence if len(course.stages) > 1 else -1.0,
-            "the last stage still changed the belief, by {:.2g} nats; raise "
+            "SA109 the last stage still changed the belief, by {:.2g} nats; raise "
             "num_histories",
         ),
         "independent_trials": (
             is_independent,
             correlation,
-            "simulated trials correlate at the same parameters ({:.2f}), yet the "
-            "likelihood is a product over trials; check how the simulator seeds "
+            "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
+            "the likelihood is a product over trials; check how the simulator seeds "
             "its noise",
         ),
         "small_error": (
             last.error <= UNTRUSTED,
             last.error,
-            "the belief is off by about {:.2g} nats, since its regressions rest on few "
-            "simulations for so many parameters and numbers; raise num_histories",
+            "SA105 the belief is off by about {:.2g} nats, since its regressions "
+            "rest on few simulations for so many parameters and numbers; raise "
+            "num_histories",
         ),
     }
     warnings = [

@@ -19,6 +19,8 @@ from sbi_active.support import within_support
 class UnexplainedOutcomeError(Explained, ValueError):
     """A trial gave a measurement where simulations give none."""
 
+    code = "SA119"
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -95,9 +97,9 @@ def round_rows(
     if not (exclude_invalid and bool(invalid.any())):
         return rows
     warn(
-        f"dropping {int(invalid.sum())} of {len(x)} simulations without a measurement: "
-        "information gain is then biased towards actions that fail. The default "
-        "MixtureDensity network keeps them.",
+        f"SA302 dropping {int(invalid.sum())} of {len(x)} simulations without a "
+        "measurement: information gain is then biased towards actions that fail. The "
+        "default MixtureDensity network keeps them.",
         stacklevel=4,
     )
     return RoundRows(theta[~invalid], x[~invalid], action[~invalid])

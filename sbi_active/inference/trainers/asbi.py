@@ -261,14 +261,14 @@ class ASBI(MixtureRounds, NPE_C):
             if not required:
                 return None
             warn(
-                f"the network has never seen an outcome like {trial.x.tolist()}: "
-                f"{fault}, so the belief is left unchanged. Refine with the simulator, "
-                "simulate such outcomes as NaN, or leave the trial out where a fault "
-                "caused them.",
+                f"{fault[0]} the network has never seen an outcome like "
+                f"{trial.x.tolist()}: {fault[1]}, so the belief is left unchanged. "
+                "Refine with the simulator, simulate such outcomes as NaN, or leave "
+                "the trial out where a fault caused them.",
                 stacklevel=5,
             )
             unchanged = UnchangedBelief(prior, previous)
-            unchanged.diagnostics = unchanged.diagnostics.warned(fault)
+            unchanged.diagnostics = unchanged.diagnostics.warned(" ".join(fault))
             return unchanged
         with warnings.catch_warnings():
             if not required:  # refinement repairs what the network misses
@@ -283,16 +283,17 @@ def _all_alike(condition: Tensor) -> Tensor:
 
 def _fault(
     network: ConditionalDensityEstimator, condition: Tensor, prior: Distribution
-) -> str:
-    """Return why a network cannot say anything at a condition, shape (1, c); or ""."""
+) -> tuple[str, str] | None:
+    """Return a code and why a network can say nothing at a condition, shape (1, c)."""
     if isinstance(network, MixtureDensityNetwork):
         knows = network.knows(condition)
     else:
         knows = bool(condition.isfinite().all())  # sbi's networks take no NaN
     if not knows:
-        return "no simulation it was trained on lacks these numbers"
+        return "SA107", "no simulation it was trained on lacks these numbers"
     with forked_generators(0), torch.no_grad():
         theta = prior.sample(torch.Size([NUM_PROBES])).to(condition)
         density = network.log_prob(theta[:, None], condition)
     # Beyond 1e19, float32 has no squares.
-    return "" if bool(density.isfinite().any()) else "its density is finite nowhere"
+    is_finite = bool(density.isfinite().any())
+    return None if is_finite else ("SA113", "its density is finite nowhere")

@@ -274,8 +274,9 @@ class ProductRounds(ActionRounds):
         num_lost = len(used) - len(counted)
         if num_lost:
             sampled.diagnostics = sampled.diagnostics.warned(
-                f"{num_lost} trials are left out, at which the network's density is "
-                "finite nowhere: a measurement is wrong, or the simulator lacks much"
+                f"SA113 {num_lost} trials are left out, at which the network's "
+                "density is finite nowhere: a measurement is wrong, or the simulator "
+                "lacks much"
             )
         return sampled
 

@@ -18,7 +18,7 @@ from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNe
 from sbi_active.inference.rounds.sbi_arguments import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
-from sbi_active.messages import warn
+from sbi_active.messages import ChangedWarning, warn
 
 HELD_OUT = 0.1  # share of the rows, sbi's default
 #: Keywords of SeqBED in the last version alone.
@@ -145,9 +145,8 @@ class SeqBED(AmortizedRounds, NRE_C):
         classifier = args[1] if len(args) > 1 else kwargs.get("classifier")
         if isinstance(classifier, LFIRE) or LFIRE_KEYWORDS & {*kwargs}:
             warn(
-                "sbi_active.SeqBED of logistic regressions goes in the next version: "
-                "use sbi_active.inference.SeqBED_LFIRE",
-                DeprecationWarning,
+                "SA701 sbi_active.SeqBED of logistic regressions goes in the next "
+                "version: use sbi_active.inference.SeqBED_LFIRE",
                 stacklevel=2,
             )
             return SeqBED_LFIRE(*args, **kwargs)  # pyright: ignore[reportReturnType]
@@ -159,11 +158,11 @@ class SeqBED(AmortizedRounds, NRE_C):
         """Return the draws as they are, see :meth:`.ActiveInference.arrange`."""
         if self._is_default:  # this method is what the class of that name asked for
             warn(
-                "SeqBED(prior) learns one ratio for all parameters, as SeqBED_C did in "
-                "the last version; for a logistic regression at each particle use "
-                "sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
+                "SA702 SeqBED(prior) learns one ratio for all parameters, as SeqBED_C "
+                "did in the last version; for a logistic regression at each particle "
+                "use sbi_active.inference.SeqBED_LFIRE(prior), and for this one pass "
                 "SeqBED(prior, RatioClassifier())",
-                FutureWarning,
+                ChangedWarning,
                 stacklevel=2,
             )
         return super().arrange(theta, action)

@@ -262,8 +262,9 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         action = model.nearest_action(trial.action)
         if not torch.equal(action, trial.action):
             warn(
-                f"the executed action {trial.action.tolist()} was not simulated; the "
-                f"ratios are those at {action.tolist()}. Pass a simulator to update().",
+                f"SA108 the executed action {trial.action.tolist()} was not "
+                f"simulated; the ratios are those at {action.tolist()}. Pass a "
+                "simulator to update().",
                 stacklevel=5,
             )
         n = len(particles)
@@ -279,12 +280,12 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         belief.diagnostics = belief.diagnostics.extended(num_particles=n, **spent)
         if says_nothing:
             belief.diagnostics = belief.diagnostics.warned(
-                "the ratios are finite nowhere at the last trial, which is left out: a "
-                "measurement is wrong, or the simulator lacks much"
+                "SA113 the ratios are finite nowhere at the last trial, which is left "
+                "out: a measurement is wrong, or the simulator lacks much"
             )
         if effective < 0.1 * n:
             belief.diagnostics = belief.diagnostics.warned(
-                f"{effective:.1f} of {n} particles are effective: the belief is as "
-                "wide as its kernels"
+                f"SA114 {effective:.1f} of {n} particles are effective: the belief is "
+                "as wide as its kernels"
             )
         return belief

@@ -26,6 +26,8 @@ class CorruptSegmentError(Explained, OSError):
         reason: What is wrong with it.
     """
 
+    code = "SA605"
+
     def __init__(self, path: Path, reason: str) -> None:
         self.path, self.reason = path, reason
         super().__init__(
@@ -41,6 +43,8 @@ class LockedError(Explained, OSError):
     Attributes:
         pid: Process that holds the lock, None where it did not say.
     """
+
+    code = "SA608"
 
     def __init__(self, folder: Path, pid: int | None, host: str) -> None:
         self.pid = pid

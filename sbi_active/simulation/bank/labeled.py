@@ -58,9 +58,9 @@ class LabeledStore:
             log_proposal = log_density(self._proposal, theta)
             if bool((log_proposal == -torch.inf).any()):
                 warn(
-                    f"{int((log_proposal == -torch.inf).sum())} of {len(theta)} rows "
-                    f"have density 0 under the proposal {self._label!r}: they were not "
-                    "drawn from it",
+                    f"SA305 {int((log_proposal == -torch.inf).sum())} of {len(theta)} "
+                    f"rows have density 0 under the proposal {self._label!r}: they "
+                    "were not drawn from it",
                     stacklevel=2,
                 )
         log_action = self._log_action.double()

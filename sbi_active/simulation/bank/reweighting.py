@@ -167,8 +167,9 @@ def reuse(
     )
     if result.effective_sample_size < FEW:
         warn(
-            f"{len(rows)} rows of the bank are worth {result.effective_sample_size:.1f}"
-            f" draws from the target, fewer than {FEW}: simulate more rows from it, "
+            f"SA304 {len(rows)} rows of the bank are worth "
+            f"{result.effective_sample_size:.1f} draws from the target, fewer than "
+            f"{FEW}: simulate more rows from it, "
             + ("or give proposals=" if proposals is None else "or from nearer to it"),
             stacklevel=2,
         )

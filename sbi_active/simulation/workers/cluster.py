@@ -161,9 +161,10 @@ class DaskPool(Pool):
             return
         self._last_seen = None
         warn(
-            f"no workers at {self._client.scheduler.address} for {self.PATIENCE:g} s: "
-            f"{len(self._waiting) + len(self._running)} calls of the simulator wait "
-            "for one; start workers there, or interrupt, which keeps what is finished",
+            f"SA306 no workers at {self._client.scheduler.address} for "
+            f"{self.PATIENCE:g} s: {len(self._waiting) + len(self._running)} calls of "
+            "the simulator wait for one; start workers there, or interrupt, which "
+            "keeps what is finished",
             stacklevel=2,
         )
 

@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 
 from sbi_active.arrays import own_tensor
 from sbi_active.messages import warn
+from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.model import takes_seeds
 from sbi_active.simulation.outcomes import (
@@ -27,7 +28,7 @@ from sbi_active.simulation.workers.meter import spend
 from sbi_active.simulation.workers.pace import pace_of
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
 from sbi_active.simulation.workers.schedule import Schedule
-from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
+from sbi_active.simulation.workers.settings import Workers
 from sbi_active.simulation.workers.store import (
     Recorder,
     RowStore,
@@ -36,17 +37,15 @@ from sbi_active.simulation.workers.store import (
 )
 
 
+@takes_loose(workers=Workers)
 def simulate(
     simulator: Callable[..., Any],
     theta: Tensor,
     action: Tensor,
     *,
     seed: int,
-    num_workers: int = 1,
+    workers: Workers | int | None = None,
     batch_size: int | None = None,
-    time_limit: float | None = None,
-    num_retries: int = 0,
-    workers: Workers | None = None,
     show_progress: bool = False,
     store: RowStore | None = None,
     check_noise: bool = False,
@@ -72,7 +71,7 @@ def simulate(
 
         client = distributed.Client("scheduler:8786")
         with joblib.parallel_config(backend="dask"):
-            simulate(simulator, theta, action, seed=0, num_workers=64)
+            simulate(simulator, theta, action, seed=0, workers=64)
 
     A lost Dask worker loses no rows. Ray is configured likewise, by
     ``ray.util.joblib.register_ray()`` and ``parallel_config(backend="ray")``, which is
@@ -84,17 +83,13 @@ def simulate(
         theta: Parameters, shape (n, theta_dim).
         action: Actions, shape (n, action_dim).
         seed: Seed of the whole set.
-        num_workers: Calls at a time; -1 means one a core. One worker without a time
-            limit is this process.
+        workers: Where the rows run and what one may cost, or the number of calls at a
+            time; None is this process.
         batch_size: Rows a call; None gives workers as many as take a quarter of a
             second. A simulator in this process is given all at once, or, after its
             first rows have shown that this would take long, as many as take about a
             second: an interrupt loses no more. One that takes no seeds is given whole
             blocks.
-        time_limit: Seconds a row, loading the simulator not counted; a batch may take
-            as much as its rows. None waits for ever.
-        num_retries: How often a missing row is tried again, with the same seed.
-        workers: All three of these as one value, instead of them.
         show_progress: Show a progress bar.
         store: Keeps finished rows, every half second, and gives those that it has;
             None takes that of the campaign whose directory this is called for, if any.
@@ -123,13 +118,7 @@ def simulate(
     require_rows(theta, action)
     if not len(theta):
         raise ValueError("expected at least one row; got none; pass theta of n >= 1")
-    single = Workers(num_workers, time_limit, num_retries)
-    if workers is not None and single != IN_PROCESS:
-        raise ValueError(
-            "expected workers=, or num_workers=, time_limit= and num_retries=; got "
-            f"{workers} and {single}; pass one of them"
-        )
-    workers = single if workers is None else workers
+    workers = Workers.of(workers)
     if batch_size is not None and batch_size < 1:
         raise ValueError(
             f"expected batch_size >= 1; got {batch_size}; use None to have it chosen"
@@ -227,9 +216,9 @@ def _warn(schedule: Schedule) -> None:
         row, text = min(schedule.tracebacks.items())
         last = text.strip().splitlines()[-1]
         warn(
-            f"{schedule.faults.total()} of {len(schedule.theta)} rows are missing: "
-            f"{counts}; the first is row {row}: {last}. All tracebacks are in "
-            "Simulations.tracebacks",
+            f"SA301 {schedule.faults.total()} of {len(schedule.theta)} rows are "
+            f"missing: {counts}; the first is row {row}: {last}. All tracebacks are "
+            "in Simulations.tracebacks",
             MissingRowsWarning,
             stacklevel=3,
         )

@@ -14,6 +14,8 @@ from sbi_active.messages import Explained
 class SimulationBudgetError(Explained, RuntimeError):
     """More simulations were asked for than are left; none of them was run."""
 
+    code = "SA309"
+
 
 @dataclass
 class Meter:

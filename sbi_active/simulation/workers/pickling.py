@@ -27,7 +27,7 @@ def pickled(simulator: Callable[..., Any]) -> bytes:
         raise TypeError(
             "expected a simulator that can travel to another process; got "
             f"{type(error).__name__}: {error}; open files and engines in the setup "
-            "of a SimulatorModel, or run it here with num_workers=1 and no time_limit"
+            "of a SimulatorModel, or run it here without workers="
         ) from error
     return buffer.getvalue()
 

@@ -199,7 +199,7 @@ class Schedule:
             raise SimulationError(
                 "expected a simulator that a worker process can load; got\n"
                 f"{reply.traceback}\nmake its module importable there, or simulate "
-                "with num_workers=1 and no time_limit"
+                "without workers="
             )
         if call.is_probe:
             assert self._num_probing is not None

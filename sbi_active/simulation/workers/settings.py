@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sbi_active.expected import require
+
 
 @dataclass(frozen=True)
 class Workers:
@@ -26,20 +28,31 @@ class Workers:
     num_retries: int = 0
 
     def __post_init__(self) -> None:
-        if self.num_workers < 1 and self.num_workers != -1:
-            raise ValueError(
-                "expected num_workers >= 1, or -1 for one a core; got "
-                f"{self.num_workers}; use 1 to simulate in this process"
-            )
-        if self.time_limit is not None and not self.time_limit > 0:
-            raise ValueError(
-                f"expected time_limit > 0 s a row; got {self.time_limit}; use None to "
-                "wait for ever"
-            )
-        if self.num_retries < 0:
-            raise ValueError(
-                f"expected num_retries >= 0; got {self.num_retries}; use 0 to try once"
-            )
+        require(
+            self.num_workers >= 1 or self.num_workers == -1,
+            "num_workers >= 1, or -1 for one a core",
+            self.num_workers,
+            "use 1 to simulate in this process",
+        )
+        require(
+            self.time_limit is None or self.time_limit > 0,
+            "time_limit > 0 s a row",
+            self.time_limit,
+            "use None to wait for ever",
+        )
+        require(
+            self.num_retries >= 0,
+            "num_retries >= 0",
+            self.num_retries,
+            "use 0 to try once",
+        )
+
+    @classmethod
+    def of(cls, workers: Workers | int | None) -> Workers:
+        """Return workers as they are, or so many of them; None is this process."""
+        if isinstance(workers, cls):
+            return workers
+        return cls(1 if workers is None else workers)  # pyright: ignore
 
 
 #: Without other processes, whose death would cost a row.

@@ -15,6 +15,7 @@ from sbi_active import (
     MixtureDensity,
     SimulatorModel,
 )
+from sbi_active.campaign.options import CampaignDetails
 from tests.campaign.learning.test_revision import ACTIONS as SIDES
 from tests.campaign.learning.test_revision import BIAS, OPTIONS
 from tests.campaign.learning.test_revision import MODEL as REVISED
@@ -26,7 +27,7 @@ ACTIONS = DiscreteActions([0.1, 1.0, 2.0, 3.0], names=["speed"], units=["m/s"])
 SMALL = CampaignOptions(
     num_simulations=400,
     num_samples=100,
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
     density_estimator=MixtureDensity(
         hidden_features=(16,), num_components=2, num_iterations=100
     ),
@@ -76,7 +77,11 @@ def test_a_constraint_is_kept_in_a_box():
 
 
 def test_a_constraint_and_no_repeats_are_kept_by_checks():
-    c = campaign(limits={"constraint": below(2.5)}, check_every=2, repeat=False)
+    c = campaign(
+        limits={"constraint": below(2.5)},
+        check_every=2,
+        details=replace(SMALL.details, repeat=False),
+    )
     c.run(measured, num_rounds=2)
     assert c.history[1].target == "check"
     # Of those below 2.5 the one farthest from the first, 2.0.
@@ -104,7 +109,7 @@ def test_information_is_weighed_against_its_cost():
 
 
 def test_no_action_comes_twice_without_repeats():
-    c = campaign("nsbi", repeat=False)
+    c = campaign("nsbi", details=replace(SMALL.details, repeat=False))
     c.run(measured, num_rounds=4)
     assert sorted(float(t.action) for t in c.history) == pytest.approx([0.1, 1, 2, 3])
     with pytest.raises(ValueError, match="expected a permitted action; got none of 4"):
@@ -117,13 +122,19 @@ def test_actions_that_hardly_give_a_measurement_are_left_out():
 
     model = SimulatorModel(breaks, noise=GaussianNoise(0.1))
     for method in ("asbi", "nsbi"):
-        c = campaign(method, simulator=model, min_probability_valid=0.5)
+        c = campaign(
+            method,
+            simulator=model,
+            details=replace(SMALL.details, min_probability_valid=0.5),
+        )
         assert float(c.ask().action) <= 2.5
         assert float(c.pending.design.probability_valid[-1]) == 0.0
 
 
 def test_a_design_by_the_simulations_of_the_training_costs_none():
-    trained = campaign(design_on="training", num_simulations=2_000).ask()
+    trained = campaign(
+        details=replace(SMALL.details, design_on="training"), num_simulations=2_000
+    ).ask()
     assert trained.num_simulations == 2_000
     assert trained.design.num_simulations == 0
     assert trained.design.stopped == "simulations given"
@@ -148,4 +159,4 @@ def test_wrong_limits_are_an_error_at_once(limits, message):
 
 def test_an_unknown_source_of_designs_is_an_error():
     with pytest.raises(ValueError, match="expected design_on 'fresh' or 'training'"):
-        replace(SMALL, design_on="stored")
+        replace(SMALL, details=CampaignDetails(design_on="stored"))

@@ -16,6 +16,7 @@ from sbi_active import (
     MixtureDensity,
 )
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.inference import LFIRE, RatioClassifier
 from tests.campaign.sizes import REFINEMENT
 
@@ -26,7 +27,7 @@ CLASSIFIER = RatioClassifier(hidden_features=(16,), num_iterations=50)
 SMALL = CampaignOptions(
     num_simulations=600,
     num_samples=100,
-    num_scored=200,
+    details=CampaignDetails(num_scored=200),
     refinement=REFINEMENT,
 )
 TRAINED = {
@@ -140,4 +141,4 @@ def test_errors():
     with pytest.raises(ValueError, match=re.escape(valid)):
         Campaign(simulator, PRIOR, ACTIONS, method="nre")
     with pytest.raises(ValueError, match="expected posterior 'importance' for ASBI"):
-        campaign("asbi", posterior="kde")
+        campaign("asbi", details=CampaignDetails(posterior="kde"))

@@ -16,6 +16,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.campaign.checks import most_unlike
+from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Effect
 from tests.campaign.sizes import REFINEMENT
 
@@ -29,7 +30,7 @@ MODEL = SimulatorModel(
 OPTIONS = CampaignOptions(
     num_simulations=400,
     num_samples=100,
-    num_scored=400,
+    details=CampaignDetails(num_scored=400),
     density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
     refinement=REFINEMENT,
 )
@@ -200,6 +201,6 @@ def test_every_second_trial_may_go_where_none_was():
 
 def test_options_are_checked():
     with pytest.raises(ValueError, match="expected num_scored >= 100; got 5"):
-        CampaignOptions(num_scored=5)
+        CampaignOptions(details=CampaignDetails(num_scored=5))
     with pytest.raises(ValueError, match="expected check_every >= 1 or None; got 0"):
         CampaignOptions(check_every=0)

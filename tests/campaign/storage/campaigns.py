@@ -11,6 +11,7 @@ from sbi_active import (
     MixtureDensity,
     SimulatorModel,
 )
+from sbi_active.campaign.options import CampaignDetails
 from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
@@ -18,7 +19,7 @@ ACTIONS = BoxActions([0.5], [2.0], names=["speed"], units=["m/s"])
 OPTIONS = CampaignOptions(
     num_simulations=200,
     num_samples=100,
-    num_scored=100,
+    details=CampaignDetails(num_scored=100),
     density_estimator=MixtureDensity(hidden_features=(8,), num_iterations=10),
     refinement=REFINEMENT,
 )

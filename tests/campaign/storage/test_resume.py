@@ -11,6 +11,7 @@ from torch.distributions import Normal
 
 from sbi_active import BoxActions, Campaign
 from sbi_active.criticism import Effect
+from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import Bank, LockedError
 from tests.campaign.storage.campaigns import (
     ACTIONS,
@@ -357,11 +358,12 @@ def test_a_pickled_copy_lives_in_memory(tmp_path):
 
 def test_called_back_in_order(tmp_path):
     seen = []
-    campaign = new(
-        tmp_path / "c",
-        on_trial=lambda t: seen.append(("told", t.index, t.surprise)),
-        on_update=lambda t: seen.append(("updated", t.index, t.surprise is None)),
-    )
+    with pytest.warns(RenamedWarning, match="set .on_trial"):
+        campaign = new(
+            tmp_path / "c",
+            on_trial=lambda t: seen.append(("told", t.index, t.surprise)),
+        )
+    campaign.on_update = lambda t: seen.append(("updated", t.index, t.surprise is None))
     go_on(campaign, 2)
     assert seen == [
         ("told", 0, None),

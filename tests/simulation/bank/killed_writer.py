@@ -51,7 +51,7 @@ def run(store=None, num_workers=1):
         theta,
         action,
         seed=7,
-        num_workers=num_workers,
+        workers=num_workers,
         batch_size=BATCH,
         store=store,
     )

@@ -14,7 +14,7 @@ import torch
 
 from sbi_active import GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import Outcome, SimulationInterrupted
+from sbi_active.simulation import Outcome, SimulationInterrupted, Workers
 from sbi_active.simulation.workers import Pace, run_digest
 
 # A worker cannot import a test module.
@@ -89,9 +89,7 @@ def test_x_depends_on_neither_workers_nor_batches(simulator, rows):
     ):
         x = simulate(simulator, *rows, seed=3, **options).x
         assert torch.equal(x, expected), options
-    assert not torch.equal(
-        simulate(simulator, *rows, seed=4, num_workers=2).x, expected
-    )
+    assert not torch.equal(simulate(simulator, *rows, seed=4, workers=2).x, expected)
 
 
 def test_a_batch_has_the_rows_that_were_asked_for(rows, monkeypatch):
@@ -112,7 +110,7 @@ def test_other_executors_of_joblib_give_the_same_x(backend, rows):
     for simulator in (seeded, global_torch):
         expected = simulate(simulator, *rows, seed=3).x
         with joblib.parallel_config(backend=backend):
-            x = simulate(simulator, *rows, seed=3, num_workers=2, batch_size=90).x
+            x = simulate(simulator, *rows, seed=3, workers=2, batch_size=90).x
         assert torch.equal(x, expected)
 
 
@@ -121,7 +119,7 @@ def test_time_limits_need_processes(rows):
         joblib.parallel_config(backend="threading"),
         pytest.raises(ValueError, match="expected the processes of this machine"),
     ):
-        simulate(seeded, *rows, seed=0, num_workers=2, time_limit=1.0)
+        simulate(seeded, *rows, seed=0, workers=Workers(num_workers=2, time_limit=1.0))
 
 
 def test_workers_use_one_thread_and_the_folder_of_the_caller(tmp_path, monkeypatch):
@@ -130,11 +128,11 @@ def test_workers_use_one_thread_and_the_folder_of_the_caller(tmp_path, monkeypat
         number = torch.get_num_threads() + (0 if same else 100)
         return torch.full((len(theta), 1), float(number))
 
-    simulate(seeded, torch.rand(2, 1), torch.rand(2, 1), seed=0, num_workers=2)
+    simulate(seeded, torch.rand(2, 1), torch.rand(2, 1), seed=0, workers=2)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("EXPECTED_FOLDER", str(tmp_path))
     theta = torch.rand(2, 1)
-    assert (simulate(simulator, theta, theta, seed=0, num_workers=2).x == 1).all()
+    assert (simulate(simulator, theta, theta, seed=0, workers=2).x == 1).all()
 
 
 def test_setup_is_no_part_of_the_time_limit():
@@ -147,7 +145,7 @@ def test_setup_is_no_part_of_the_time_limit():
 
     model = SimulatorModel(fn, setup=slow_setup, noise=GaussianNoise(0.0))
     theta = torch.rand(3, 1)
-    x = simulate(model, theta, theta, seed=0, time_limit=0.1).x
+    x = simulate(model, theta, theta, seed=0, workers=Workers(time_limit=0.1)).x
     assert torch.equal(x, theta * 2)
 
 
@@ -194,7 +192,7 @@ def test_a_store_is_read_before_anything_is_simulated(rows):
         # Any part of them may be lacking.
         for row in (0, 5, 256, 300, 301, 699):
             del store.rows[run][row]
-        some = simulate(simulator, *rows, seed=3, store=store, num_workers=2)
+        some = simulate(simulator, *rows, seed=3, store=store, workers=2)
         assert torch.equal(some.x, expected)
         assert len(store.rows[run]) == 700
 
@@ -251,7 +249,7 @@ def test_an_interrupt_ends_the_workers(rows):
     threading.Timer(1.0, os.kill, (process, signal.SIGINT)).start()
     start = time.monotonic()
     with pytest.raises(SimulationInterrupted) as caught:
-        simulate(simulator, *rows, seed=3, num_workers=2, batch_size=1)
+        simulate(simulator, *rows, seed=3, workers=2, batch_size=1)
     assert time.monotonic() - start < 10
     kept = caught.value.simulations
     assert kept.valid.any()
@@ -297,4 +295,4 @@ def test_a_simulator_must_travel():
 
     theta = torch.rand(3, 1)
     with pytest.raises(TypeError, match="expected a simulator that can travel"):
-        simulate(simulator, theta, theta, seed=0, num_workers=2)
+        simulate(simulator, theta, theta, seed=0, workers=2)

@@ -105,9 +105,7 @@ def test_a_worker_killed_in_the_middle_loses_nothing(
     killer = threading.Thread(target=kill_at_work, args=(tmp_path, killed), daemon=True)
     killer.start()
     with joblib.parallel_config(backend="dask"):
-        result = simulate(
-            reporting(tmp_path), *rows, seed=0, num_workers=2, batch_size=10
-        )
+        result = simulate(reporting(tmp_path), *rows, seed=0, workers=2, batch_size=10)
     killer.join(timeout=0)
     assert not killer.is_alive()  # it was killed before the end
     assert result.tracebacks == {}
@@ -131,7 +129,7 @@ def test_faults_on_the_cluster_cost_their_rows(client, rows):
         joblib.parallel_config(backend="dask"),
         pytest.warns(MissingRowsWarning, match="2 of 600 rows are missing: 2 raised"),
     ):
-        result = simulate(faulty, theta, action, seed=0, num_workers=-1)
+        result = simulate(faulty, theta, action, seed=0, workers=-1)
     assert result.tracebacks.keys() == {7, 300}
     assert torch.equal(result.x[result.valid], clean[result.valid])
 
@@ -147,7 +145,7 @@ def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
     action[2] = 3
     with joblib.parallel_config(backend="dask"), warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingRowsWarning)
-        result = simulate(killer, theta, action, seed=0, num_workers=2, batch_size=2)
+        result = simulate(killer, theta, action, seed=0, workers=2, batch_size=2)
     assert result.tracebacks.keys() == {2}
     assert "ended by signal 9" in result.tracebacks[2]
     assert torch.equal(result.x[result.valid], theta[result.valid])
@@ -168,7 +166,7 @@ def test_all_workers_killed_at_once_lose_nothing(client, rows, tmp_path):
     killer.start()
     with joblib.parallel_config(backend="dask"):
         result = simulate(
-            ReportingSeeded(tmp_path), *rows, seed=0, num_workers=2, batch_size=10
+            ReportingSeeded(tmp_path), *rows, seed=0, workers=2, batch_size=10
         )
     killer.join(timeout=0)
     assert not killer.is_alive()
@@ -183,7 +181,7 @@ def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch)
 
     def run():
         with joblib.parallel_config(backend="dask"):
-            results.append(simulate(seeded, theta, action, seed=0, num_workers=2))
+            results.append(simulate(seeded, theta, action, seed=0, workers=2))
 
     async def give_up(cluster):  # as it does where one is not back after 15 s
         for name in [*cluster.workers]:

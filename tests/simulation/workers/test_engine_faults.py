@@ -12,7 +12,7 @@ import torch
 
 from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import MissingRowsWarning, Outcome, SimulationError
+from sbi_active.simulation import MissingRowsWarning, Outcome, SimulationError, Workers
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -64,8 +64,7 @@ def check_faults(n, num_workers, time_limit, killer):
             theta,
             action,
             seed=7,
-            num_workers=num_workers,
-            time_limit=time_limit,
+            workers=Workers(num_workers=num_workers, time_limit=time_limit),
         )
     index = torch.arange(n)
     raised, hung = index % 20 == 3, index % 100 == 57
@@ -139,12 +138,12 @@ def test_blocks_without_faults_are_what_they_would_have_been(num_workers):
 
     theta, action = index_rows(600)
     expected = simulate(clean, theta, action, seed=0).x
-    rows = quietly(simulator, theta, action, seed=0, num_workers=num_workers)
+    rows = quietly(simulator, theta, action, seed=0, workers=num_workers)
     assert rows.tracebacks.keys() == {300}
     others = torch.cat([torch.arange(256), torch.arange(512, 600)])
     assert torch.equal(rows.x[others], expected[others])
     # Rows of the block that failed have streams of their own.
-    again = quietly(simulator, theta, action, seed=0, num_workers=2, batch_size=1)
+    again = quietly(simulator, theta, action, seed=0, workers=2, batch_size=1)
     assert torch.equal(rows.x[rows.valid], again.x[again.valid])
     assert rows.valid[256:512].sum() == 255
     assert not torch.equal(rows.x[256:300], expected[256:300])
@@ -160,7 +159,7 @@ def test_an_accident_does_not_change_x_of_a_block(tmp_path):
         return theta + torch.randn_like(theta)
 
     rows = index_rows(300)
-    x = simulate(simulator, *rows, seed=0, num_workers=2).x
+    x = simulate(simulator, *rows, seed=0, workers=2).x
     assert marker.exists()
     assert torch.equal(x, simulate(simulator, *rows, seed=0).x)
 
@@ -169,11 +168,15 @@ def test_missing_rows_are_tried_again(tmp_path):
     rows = index_rows(3)
     clean = simulate(seeded, *rows, seed=0).x
     simulator = Faulty(1, str(tmp_path / "once"))
-    once = quietly(simulator, *rows, seed=0, num_workers=2, batch_size=1)
+    once = quietly(simulator, *rows, seed=0, workers=2, batch_size=1)
     assert once.tracebacks.keys() == {1}
     simulator = Faulty(1, str(tmp_path / "twice"))
     twice = simulate(
-        simulator, *rows, seed=0, num_workers=2, batch_size=1, num_retries=1
+        simulator,
+        *rows,
+        seed=0,
+        workers=Workers(num_workers=2, num_retries=1),
+        batch_size=1,
     )
     assert twice.tracebacks == {}
     assert torch.equal(twice.x, clean)
@@ -185,7 +188,7 @@ def test_the_exit_code_is_told():
             os._exit(3)
         return theta
 
-    rows = quietly(simulator, *index_rows(3), seed=0, num_workers=2)
+    rows = quietly(simulator, *index_rows(3), seed=0, workers=2)
     assert "ended with code 3 during the call" in rows.tracebacks[1]
 
 
@@ -200,7 +203,7 @@ def test_a_simulator_that_always_raises_is_an_error(n, num_workers):
 
     text = "(?s)expected a simulator that can simulate.*no engine for"
     with pytest.raises(SimulationError, match=text):
-        simulate(simulator, *index_rows(n), seed=0, num_workers=num_workers)
+        simulate(simulator, *index_rows(n), seed=0, workers=num_workers)
     assert len(calls) < 100  # the rest of a long run is not tried
 
 
@@ -222,13 +225,13 @@ def test_wrong_shapes_are_no_fault_of_a_row(num_workers):
     theta, action = index_rows(30)
     for simulator in (lambda t, a, seeds: t[:1], lambda t, a: t[:1]):
         with pytest.raises(ValueError, match="with one row a parameter set"):
-            simulate(simulator, theta, action, seed=0, num_workers=num_workers)
+            simulate(simulator, theta, action, seed=0, workers=num_workers)
 
     def ragged(theta, action, seeds):
         return torch.zeros(len(theta), 2 if theta[0] > 15 else 1)
 
     with pytest.raises(ValueError, match="expected x of one shape a row"):
-        simulate(ragged, theta, action, seed=0, num_workers=num_workers, batch_size=10)
+        simulate(ragged, theta, action, seed=0, workers=num_workers, batch_size=10)
 
 
 def test_a_simulator_that_takes_no_action_is_no_fault_of_a_row():
@@ -247,7 +250,7 @@ def test_whatever_is_raised_in_a_worker_has_its_traceback(kind):
             raise kind("the reason")
         return seeded(theta, action, seeds)
 
-    rows = quietly(simulator, *index_rows(8), seed=0, num_workers=2)
+    rows = quietly(simulator, *index_rows(8), seed=0, workers=2)
     assert rows.tracebacks.keys() == {1}
     assert 'raise kind("the reason")' in rows.tracebacks[1]
     assert rows.tracebacks[1].strip().endswith("the reason")
@@ -265,7 +268,7 @@ def test_whatever_ends_the_loading_has_its_traceback(kind):
 
     model = SimulatorModel(fn, setup=setup)
     with pytest.raises(SimulationError, match=r"(?s)can load; got.*no licence"):
-        simulate(model, *index_rows(3), seed=0, num_workers=2)
+        simulate(model, *index_rows(3), seed=0, workers=2)
 
 
 def test_a_simulator_that_cannot_be_loaded():
@@ -277,4 +280,4 @@ def test_a_simulator_that_cannot_be_loaded():
             return int, ("no number",)
 
     with pytest.raises(SimulationError, match="(?s)can load; got.*invalid literal"):
-        simulate(Unloadable(), *index_rows(3), seed=0, num_workers=2)
+        simulate(Unloadable(), *index_rows(3), seed=0, workers=2)

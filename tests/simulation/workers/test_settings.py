@@ -1,9 +1,16 @@
 """The workers as one value."""
 
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
 import pytest
 import torch
 
 from sbi_active import CampaignOptions, RefinementOptions, simulate
+from sbi_active.campaign.options import CampaignDetails
+from sbi_active.campaign.storage.described import describe_options, options_from
+from sbi_active.messages import RenamedWarning
 from sbi_active.simulation import Workers
 
 
@@ -21,28 +28,56 @@ def test_what_makes_no_sense_is_refused_where_it_is_said(wrong):
     (name,) = wrong
     with pytest.raises(ValueError, match=f"expected {name}"):
         Workers(**wrong)
-    with pytest.raises(ValueError, match=f"expected {name}"):
-        CampaignOptions(**wrong)
 
 
-def test_a_simulation_takes_one_value_or_its_parts():
-    attempts = []
+ROWS = torch.ones(1, 1), torch.ones(1, 1)
 
-    def fails_twice(theta, action):
-        attempts.append(len(theta))
-        if len(attempts) <= 2:
-            raise RuntimeError("licence server")
-        return theta + action
 
-    rows = torch.ones(1, 1), torch.ones(1, 1)
-    kept = simulate(fails_twice, *rows, seed=0, workers=Workers(num_retries=2))
-    assert kept.counts["ok"] == 1
-    with pytest.raises(ValueError, match="pass one of them"):
-        simulate(fails_twice, *rows, seed=0, workers=Workers(2), num_retries=1)
+def fails(theta, action, *, times, attempts):
+    attempts.append(len(theta))
+    if len(attempts) <= times:
+        raise RuntimeError("licence server")
+    return theta + action
+
+
+def test_a_simulation_takes_them_as_one_value_or_their_number():
+    simulator = partial(fails, times=2, attempts=[])
+    assert simulate(simulator, *ROWS, seed=0, workers=Workers(1, None, 2)).x == 2
+    assert simulate(torch.add, *ROWS, seed=0, workers=1).x == 2
+    assert CampaignOptions(workers=2).workers == Workers(2)  # pyright: ignore
+
+
+def test_their_numbers_alone_are_taken_for_one_version():
+    simulator = partial(fails, times=2, attempts=[])
+    with pytest.warns(RenamedWarning, match=r"use workers=Workers\(num_retries=\)"):
+        assert simulate(simulator, *ROWS, seed=0, workers=1, num_retries=2).x == 2
+
+
+def test_former_options_of_a_campaign_are_taken_for_one_version():
+    former: Any = {"num_workers": 2, "time_limit": 9.0, "num_scored": 200}
+    with pytest.warns(RenamedWarning) as noted:
+        options = CampaignOptions(**former, num_samples=10)
+    assert {note.message.code for note in noted} == {"SA701"}
+    assert {note.filename for note in noted} == {__file__}
+    assert options.workers == Workers(2, 9.0)
+    assert options.details == CampaignDetails(num_scored=200)
+    assert CampaignOptions.of({**former, "num_samples": 10}) == options
+    assert replace(options, eliminate=False).details.num_scored == 200
+    assert options.num_scored == 200
+    with pytest.raises(AttributeError, match="num_rows"):
+        _ = options.num_rows
+    stored = {"settings": "CampaignOptions", **former, "num_samples": 10}
+    assert options_from(stored) == options
+    assert options_from(describe_options(options)) == options
+    state = options.__getstate__()
+    del state["workers"], state["details"]
+    loaded = object.__new__(CampaignOptions)
+    loaded.__setstate__({**state, **former})
+    assert loaded == options
 
 
 def test_a_campaign_does_not_overwrite_workers_of_its_refinement_silently():
     own = RefinementOptions(workers=Workers(num_workers=3))
     with pytest.raises(ValueError, match="to CampaignOptions alone"):
-        CampaignOptions(num_workers=2, refinement=own)
-    assert CampaignOptions(num_workers=3, refinement=own).workers == own.workers
+        CampaignOptions(workers=Workers(2), refinement=own)
+    assert CampaignOptions(workers=Workers(3), refinement=own).workers == own.workers

@@ -14,7 +14,7 @@ import torch
 
 from sbi_active import simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import MissingRowsWarning
+from sbi_active.simulation import MissingRowsWarning, Workers
 from sbi_active.simulation.workers import IDLE
 
 # A worker cannot import a test module.
@@ -41,7 +41,7 @@ def seeded(theta, action, seeds):
 
 
 def workers_of(simulator, num_workers=2):
-    rows = simulate(simulator, *ROWS, seed=0, num_workers=num_workers, batch_size=1)
+    rows = simulate(simulator, *ROWS, seed=0, workers=num_workers, batch_size=1)
     return set(rows.x.flatten().int().tolist())
 
 
@@ -114,7 +114,7 @@ def test_x_of_kept_workers_is_that_of_new_ones():
         expected = simulate(simulator, *ROWS, seed=5).x
         for _ in range(3):
             assert torch.equal(
-                simulate(simulator, *ROWS, seed=5, num_workers=2).x, expected
+                simulate(simulator, *ROWS, seed=5, workers=2).x, expected
             )
 
 
@@ -138,7 +138,7 @@ def test_what_a_worker_started_ends_with_it(tmp_path):
 
     few = [rows[:3] for rows in ROWS]
     with pytest.warns(MissingRowsWarning, match="1 of 3 rows are missing: 1 timed out"):
-        simulate(simulator, *few, seed=0, time_limit=0.3, batch_size=1)
+        simulate(simulator, *few, seed=0, workers=Workers(time_limit=0.3), batch_size=1)
 
     def pids_of(row):
         return {*map(int, (tmp_path / f"{row}").read_text().split())}
@@ -168,7 +168,7 @@ if __name__ == "__main__":
                 os._exit(0)
         threading.Timer(1.0, fork).start()
     theta = torch.rand(6, 1)
-    simulate(simulator, theta, theta, seed=0, num_workers=2, batch_size=1)
+    simulate(simulator, theta, theta, seed=0, workers=2, batch_size=1)
 """
 
 

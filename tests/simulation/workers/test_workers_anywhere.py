@@ -18,10 +18,10 @@ def simulator(theta, action, seeds):
     return theta * scale
 
 def go(shift=0.0):
-    x = simulate(simulator, theta, theta, seed=0, num_workers=2).x
+    x = simulate(simulator, theta, theta, seed=0, workers=2).x
     assert torch.equal(x, theta * 2)
     shifted = lambda theta, action, seeds: theta + shift
-    x = simulate(shifted, theta, theta, seed=0, num_workers=2).x
+    x = simulate(shifted, theta, theta, seed=0, workers=2).x
     assert torch.equal(x, theta + shift)
 
 go()
@@ -51,9 +51,9 @@ go()
 
 NESTED = """
 def outer(theta, action, seeds):
-    return simulate(simulator, theta, theta, seed=0, num_workers=2).x
+    return simulate(simulator, theta, theta, seed=0, workers=2).x
 
-x = simulate(outer, theta, theta, seed=0, num_workers=2, batch_size=10).x
+x = simulate(outer, theta, theta, seed=0, workers=2, batch_size=10).x
 assert torch.equal(x, theta * 2)
 """
 
@@ -61,7 +61,7 @@ LEFT = """
 def endless(theta, action, seeds):
     time.sleep(60)
 
-work = lambda: simulate(endless, theta, theta, seed=0, num_workers=2)
+work = lambda: simulate(endless, theta, theta, seed=0, workers=2)
 threading.Thread(target=work, daemon=True).start()
 time.sleep(0.5)
 """
