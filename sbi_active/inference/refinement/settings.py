@@ -1,4 +1,4 @@
-"""What a refinement by regression decides by."""
+"""What the loop behind a learned likelihood decides by."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class StageSettings:
-    """Settings of the stages: propose, simulate, regress, sample, judge.
+    """Settings of the stages: propose, simulate, fit, sample, judge.
 
     Attributes:
         first_share: Share of the budget for the first stage, over the whole prior. It
@@ -23,6 +23,9 @@ class StageSettings:
         max_forced: Number of ellipsoids that split misfit, at most.
         small: Nats by which the belief is off for want of simulations that need no
             further stage.
+        settled: Nats a dimension that the last stage may have changed for there to be
+            no further one; infinite asks nothing, where the error is known better.
+        untrusted: Nats off, by the number of simulations, that call for a warning.
         checked_share: Share of the budget that is simulated beyond it, to compare a
             learned belief with simulations that it was not fitted to. A mean is then
             known to about .06 standard deviations at 3,000 histories; with half the
@@ -41,5 +44,7 @@ class StageSettings:
     max_regions: int = 8
     max_forced: int = 32
     small: float = 0.01
+    settled: float = 0.03
+    untrusted: float = 0.1
     checked_share: float = 0.1
     largest_shift: float = 0.2

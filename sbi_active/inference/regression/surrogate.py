@@ -113,6 +113,11 @@ class LocalRegression:
     covariance: ResidualCovariance
     leverage: Array
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Residuals have served the diagnostics and would only weigh on a pickle.
+        empty = np.zeros((0, len(self.used)))
+        return {**vars(self), "residual": empty, "standardized": empty}
+
     @property
     def has_misfit(self) -> bool:
         """Whether the residuals are larger than the noise."""
