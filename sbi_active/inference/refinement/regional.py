@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.refinement.course import Stage
+from sbi_active.inference.refinement.course import UNSETTLED, Stage
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.outcome_checks import check_outcomes
 from sbi_active.inference.refinement.regression_error import expected_error, widened
@@ -39,6 +39,7 @@ from sbi_active.simulation.outcomes import MissingRowsWarning
 Array = NDArray[Any]
 
 ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
+LARGEST = 2.4  # deviations that the largest of three errors exceeds once in twenty
 SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 
 
@@ -99,7 +100,7 @@ class Regions(Stages):
             near.append(z[self.coordinates.inside(z)])
             self.regions.append(around(near[-1]))
         self.near = np.concatenate(near) if near else None
-        self.num_forced = 1
+        self.num_forced, self.is_shaped, self.change = 1, False, 0.0
         self.least = max(self.own.fewest, 2 * fewest_rows(self.coordinates.dim))
 
     def spent(self) -> tuple[int, int]:
@@ -209,6 +210,20 @@ class Regions(Stages):
             self.histories, stage.surrogate, stage.error, stage.draws, self.rng
         )
 
+    def last(self, stage: Stage) -> Stage:
+        """Return the stage with noise that is not Gaussian, where it is not."""
+        own, c = self.own.shapes, self.coordinates
+        fits = [
+            self.histories.regress(f.region, own) for f in stage.surrogate.regressions
+        ]
+        shaped = [fit for fit in fits if fit is not None]
+        if all(fit.shape is None for fit in shaped):
+            return stage
+        other = self.sample(Surrogate(c, shaped), stage.draws)
+        change = other.log_prob(other.draws) - stage.log_prob(other.draws)
+        self.is_shaped, self.change = True, float(change.mean())
+        return replace(other, fitted=stage.fitted, error=max(stage.error, other.error))
+
     def tails(self, stage: Stage) -> tuple[list[float], float]:
         """Return tail probabilities of the trials and of all together."""
         num_trials = len(self.task.action)
@@ -222,6 +237,10 @@ class Regions(Stages):
         roughness = course.stages[0].surrogate.regressions[0].roughness
         negentropy, is_gaussian = noise_shape(live, self.rng)
         is_gaussian &= not has_hard_edges(course.stages)
+        dim = self.coordinates.dim
+        # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
+        allowed = 0.5 * dim * (self.own.visible / LARGEST) ** 2
+        known = last.error / allowed, self.change / (UNSETTLED * dim)
         correlation, is_independent = trial_correlation(live, len(self.task.action))
         return {
             "gaussian_noise": (
@@ -230,6 +249,13 @@ class Regions(Stages):
                 "the noise is not Gaussian (it differs by {:.2g} nats a number), and "
                 "the belief, which takes it for Gaussian, may be too wide or too "
                 "narrow; check against a belief of a trained network",
+            ),
+            "noise_known": (
+                not self.is_shaped or max(known) <= 1,
+                max(known) if self.is_shaped else 0.0,
+                "the noise is not Gaussian, and the simulations are too few to tell "
+                "what it is ({:.2g} times the error that is allowed for); raise "
+                "num_histories",
             ),
             "smooth_response": (
                 roughness <= ROUGH,

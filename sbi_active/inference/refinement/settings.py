@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from sbi_active.inference.regression.noise_shape import ShapeSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +36,11 @@ class StageSettings:
             which it is not trusted, or three standard errors of the check where these
             are more. Less than the .3 that a user may see, by two standard errors at
             3,000 histories.
+        visible: Error of a mean, in standard deviations, that a user may see. Beliefs
+            under noise that is not Gaussian are not trusted where so few simulations
+            may leave it. Half trusts none of 3,000 histories, twice nearly all of 500,
+            of which half are off by more than .3.
+        shapes: Settings of noise that is not Gaussian.
     """
 
     first_share: float = 0.25
@@ -48,3 +55,5 @@ class StageSettings:
     untrusted: float = 0.1
     checked_share: float = 0.1
     largest_shift: float = 0.2
+    visible: float = 0.3
+    shapes: ShapeSettings = field(default_factory=ShapeSettings)

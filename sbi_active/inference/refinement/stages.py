@@ -87,6 +87,10 @@ class Stages(ABC):
         """Return a likelihood of more simulations, and what it may err beyond."""
         return stage.surrogate, 0.0
 
+    def last(self, stage: Stage) -> Stage:
+        """Return the last stage, with what is worth its cost there alone."""
+        return stage
+
     def run(self) -> LearnedBelief:
         """Return the belief of the last stage, or of one before that errs less.
 
@@ -101,7 +105,7 @@ class Stages(ABC):
             is_last = size < self.least
             surrogate = self.fit(near, is_last=is_last)
             try:
-                stage = self._sample(surrogate, near)
+                stage = self.sample(surrogate, near)
             except UnexplainedOutcomeError:
                 if not course.stages:
                     raise
@@ -109,14 +113,14 @@ class Stages(ABC):
             if stage.error > self.own.small and course.stages:
                 wider, bias = self.with_more(stage)
                 if wider is not surrogate:
-                    wide = self._sample(wider, stage.draws)
+                    wide = self.sample(wider, stage.draws)
                     stage = replace(wide, fitted=surrogate, error=wide.error + bias)
             course.append(stage)
             if is_last or course.is_settled:
                 break
             near = stage.draws
         course.end_at_best()
-        stage = course.stages[-1]
+        stage = course.stages[-1] = self.last(course.stages[-1])
         belief = LearnedBelief(self.prior, stage.fit, defensive=self.settings.defensive)
         belief.diagnostics = diagnose(
             course,
@@ -136,7 +140,7 @@ class Stages(ABC):
         # A remainder too small for a stage of its own goes to the one before.
         return left if left < size + self.least else size
 
-    def _sample(self, surrogate: LearnedLikelihood, near: Array | None) -> Stage:
+    def sample(self, surrogate: LearnedLikelihood, near: Array | None) -> Stage:
         """Return the stage of a likelihood, its density sampled."""
         num = self.own.oversampling * self.settings.effective_of(self.coordinates.dim)
         fit = learned_fit(surrogate, self.rng, near=near, num_effective=num)

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.inference.regression.noise_shape import ShapeSettings
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
 from sbi_active.inference.regression.surrogate import (
@@ -345,8 +346,13 @@ class Histories:
         present = self.present.reshape(len(self), *self._seen.shape)
         return float((~present.any(2)).mean()) if len(self) else 0.0
 
-    def regress(self, region: Region) -> LocalRegression | None:
-        """Regress the histories in a region, or the nearest where it holds few."""
+    def regress(
+        self, region: Region, shapes: ShapeSettings | None = None
+    ) -> LocalRegression | None:
+        """Regress the histories in a region, or the nearest where it holds few.
+
+        With settings of noise that is not Gaussian its shape is looked at too.
+        """
         distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
         needed = 2 * fewest_rows(self.coordinates.dim)
         rows = _nearest(np.where(valid, distance, np.inf), needed)
@@ -380,6 +386,8 @@ class Histories:
                 mixed.tolist(),
             ),
             used=self.used,
+            observed=self.observed,
+            shapes=shapes,
         )
 
 
