@@ -39,7 +39,6 @@ from sbi_active.simulation.outcomes import MissingRowsWarning
 Array = NDArray[Any]
 
 ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
-LARGEST = 2.4  # deviations that the largest of three errors exceeds once in twenty
 SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 
 
@@ -235,11 +234,11 @@ class Regions(Stages):
         fits = last.surrogate.regressions
         live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
         roughness = course.stages[0].surrogate.regressions[0].roughness
-        negentropy, is_gaussian = noise_shape(live, self.rng)
+        negentropy, is_gaussian = noise_shape(live, self.own.shapes.left, self.rng)
         is_gaussian &= not has_hard_edges(course.stages)
         dim = self.coordinates.dim
         # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
-        allowed = 0.5 * dim * (self.own.visible / LARGEST) ** 2
+        allowed = 0.5 * dim * self.own.known**2
         known = last.error / allowed, self.change / (UNSETTLED * dim)
         correlation, is_independent = trial_correlation(live, len(self.task.action))
         return {

@@ -15,13 +15,12 @@ from sbi_active.inference.regression.surrogate import LocalRegression
 Array = NDArray[Any]
 
 HARD_NOISE = 0.03  # nats a number that a Gaussian loses on the noise
-LEFT = 0.05  # the same of one mixture for all numbers, which had lost .1 to .25
 LIGHT_TAILS = -0.3  # excess kurtosis; -1.2 for uniform noise, 0 for Gaussian
 CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
 
 
 def noise_shape(
-    fits: list[LocalRegression], rng: np.random.Generator
+    fits: list[LocalRegression], left: float, rng: np.random.Generator
 ) -> tuple[float, bool]:
     r"""Return the negentropy of the residuals, nats a number, and whether it is chance.
 
@@ -30,7 +29,8 @@ def noise_shape(
 
     with H from the spacings of the sorted residuals, calibrated on Gaussian numbers,
     for each outcome and for all together: .18 for uniform noise, .42 for exponential.
-    Of noise that is taken for a mixture it is that of the residuals' normal scores.
+    Of noise that is taken for a mixture it is that of the residuals' normal scores,
+    which may have ``left`` so much.
 
     References:
         Vasicek, J. R. Stat. Soc. B 1976.
@@ -57,7 +57,7 @@ def noise_shape(
     if any(fit.shape is not None for fit in fits):
         # One mixture serves all numbers: what counts is what they lose together.
         mean = max(float(np.mean(excess)), 0.0)
-        return mean, mean <= LEFT
+        return mean, mean <= left
     return float(max(*excess, 0.0)), not any(clear)
 
 

@@ -36,10 +36,11 @@ class StageSettings:
             which it is not trusted, or three standard errors of the check where these
             are more. Less than the .3 that a user may see, by two standard errors at
             3,000 histories.
-        visible: Error of a mean, in standard deviations, that a user may see. Beliefs
-            under noise that is not Gaussian are not trusted where so few simulations
-            may leave it. Half trusts none of 3,000 histories, twice nearly all of 500,
-            of which half are off by more than .3.
+        known: Error of a mean by the number of simulations, in standard deviations,
+            root mean square, beyond which a belief under noise that is not Gaussian is
+            not trusted: the largest of three means is then off by more than .3 once in
+            twenty times. Half trusts none of 3,000 histories of ``dear.skewed``, twice
+            nearly all of 500, of which half are off by more.
         shapes: Settings of noise that is not Gaussian.
     """
 
@@ -55,5 +56,5 @@ class StageSettings:
     untrusted: float = 0.1
     checked_share: float = 0.1
     largest_shift: float = 0.2
-    visible: float = 0.3
+    known: float = 0.125
     shapes: ShapeSettings = field(default_factory=ShapeSettings)
