@@ -274,8 +274,8 @@ class Regions(Stages):
                 is_independent,
                 correlation,
                 "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
-                "the likelihood is a product over trials; check how the simulator seeds "
-                "its noise",
+                "the likelihood is a product over trials; check how the simulator "
+                "seeds its noise",
             ),
         }
 
