@@ -30,6 +30,7 @@ from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.missed import beside_misfit
 from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.stand_ins import judged
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit, without
 from sbi_active.criticism.next_trial.next_action import choose_action
@@ -70,12 +71,11 @@ class Criticism:
         model: The simulator, with its measurement noise. A random one without noise is
             the draw itself, and has a synthetic likelihood; the noise of a
             deterministic one without is estimated from repeated trials.
-        prior: Of its parameters.
+        prior: Prior of its parameters.
         trials: Measured trials.
-        effects: What the simulator may lack; those of the order of the trials are left
-            out where that is unknown.
-        actions: The permitted actions, for what no action separates and for the next
-            one; None leaves both to the trials at hand.
+        effects: Effects that the simulator may lack. Those of the order of the trials
+            are left out where the order is unknown.
+        actions: Permitted actions; None takes those of the trials.
         summaries: Compare at most this many summaries of x in place of all its numbers,
             0 for none; None takes 20 where a trial has more than 500 numbers without a
             time axis, with independent noise.
@@ -84,10 +84,10 @@ class Criticism:
             "trial"), and is not scored; 0 draws them from their priors.
         thin: Leave out samples of trajectories that say again what others say, as the
             bare model's fit shows, where the sensor's error is declared by
-            ``measurement_sd``. What the simulator is given stays as it is.
-        seed: Of all draws.
-        show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
-            of all that takes 2 s anyway.
+            ``measurement_sd``.
+        rule: Thresholds of what helps and what is named where every model misses.
+        seed: Seed of all draws.
+        show_progress: Whether to draw a progress bar.
 
     Raises:
         ValueError: If fewer than two trials can be fitted, shapes differ, an effect
@@ -123,10 +123,11 @@ class Criticism:
         summaries: int | None = None,
         warm_up: float = 0.0,
         thin: bool = True,
+        rule: Rule = Rule(),  # noqa: B008  (frozen)
         seed: int = 0,
         show_progress: bool = False,
     ) -> None:
-        self.show_progress = show_progress
+        self.show_progress, self.rule = show_progress, rule
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.seed = model, prior, seed
@@ -138,7 +139,7 @@ class Criticism:
         if actions is not None:
             actions = with_known_inputs(model, trials.fit, actions)
         self.actions = actions
-        #: What was found of the sampling of trajectories; None where nobody looked.
+        #: Sampling of the trajectories; None where nobody looked.
         self.sampling: Sampling | None = None
         if thin:
             with stage("rate of sampling", show_progress=show_progress):
@@ -196,7 +197,7 @@ class Criticism:
         """
         if not self._is_searched:
             groups = self.equivalent()
-            self._misfit = find_misfit(self._linear, groups)
+            self._misfit = find_misfit(self._linear, groups, rule=self.rule)
             if self._misfit is not None and not self.set_aside:
                 self.set_aside = found = self._misfit.outlying()
                 if found:  # they are not to decide what the others say
@@ -260,7 +261,7 @@ class Criticism:
                     actions=None if self._is_large else self.actions,
                     near=not self._is_large,
                 )
-            given = self.rivals, groups, self._scored, self._linear
+            given = self.rivals, groups, self._scored, self._linear, self.rule
             tracing, self._misfit = beside_misfit(tracing, detection, *given)
             if self._misfit is not None:
                 self._residuals = None
