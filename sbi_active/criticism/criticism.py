@@ -132,7 +132,7 @@ class Criticism:
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.seed = model, prior, seed
         unordered = trials.order == "unknown"
-        #: Names of effects of the order of the trials where that is unknown.
+        #: Effects of the order of the trials where that is unknown.
         self.left_out = [e.name for e in effects if unordered and e.needs_order]
         self.effects = [e for e in effects if e.name not in self.left_out]
         require_fitting(model, prior, trials, self.effects, actions)
@@ -183,7 +183,6 @@ class Criticism:
             self.rivals.warm_up = self._warm_up
             #: Effects that linear evidence set aside; None where all are fitted.
             self._linear, self.screening = linear_models(self.rivals)
-        # Effects of a large library, told by linear models, are compared no further.
         self._is_large = self._linear is not None and is_large(self.rivals.library)
         self._fewer = {"num_draws": FEW_DRAWS} if self._is_large else {}
         # Each model's held-out errors would take as much as the verdict.
