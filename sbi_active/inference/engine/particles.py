@@ -104,15 +104,18 @@ def led_particles(
     else:
         low, high = c.low[axes], c.high[axes]
         response = LinearResponse(potential, found, axes)
-        moved = led_between(
-            log_prior,
-            log_likelihood,
-            response,
-            LineMoves(response, low, high, c.precision[axes]),
-            np.clip(potential.sample_prior(num, rng)[:, axes], low, high),
-            rng,
-            most=most,
-        )
+        moved = None
+        # Far from what is linear the rows may suffice for fewer.
+        for few in dict.fromkeys((num, max(num // 4, settings.fewest_particles))):
+            moved = moved or led_between(
+                log_prior,
+                log_likelihood,
+                response,
+                LineMoves(response, low, high, c.precision[axes]),
+                np.clip(potential.sample_prior(few, rng)[:, axes], low, high),
+                rng,
+                most=most,
+            )
     if moved is None:
         return None
     u = moved.u

@@ -116,7 +116,8 @@ class MeanEmulator:
 def whitening(theta: Tensor) -> tuple[Tensor, Tensor]:
     """Return the center of parameters and what whitens them, shapes (d,) and (d, d)."""
     d = theta.shape[1]
-    spread = theta.std(0).clamp_min(1e-30)
+    size = theta.abs().amax(0).clamp_min(1e-30)
+    spread = torch.maximum(theta.std(0), 1e-9 * size)  # of draws that are all alike
     covariance = torch.cov((theta / spread).T).reshape(d, d) + 1e-8 * torch.eye(d)
     factor = torch.linalg.cholesky(covariance)
     return theta.mean(0), torch.linalg.inv(factor).T / spread[:, None]

@@ -209,3 +209,38 @@ def test_bounds_cut_a_posterior_along_thirty_axes():
     assert isinstance(belief, SimulatedBelief)
     assert belief.log_evidence == pytest.approx(log_evidence, abs=1.5)
     assert len(np.unique(theta[:, 0])) > 500
+
+
+@pytest.mark.slow
+def test_a_curved_response_between_the_bounds_of_forty_parameters():
+    # Each pair of parameters has two numbers of its own, whose evidence is a sum.
+    pairs, sd = 20, 0.02
+    action = torch.tensor([[0.5], [2.0]])
+
+    def curved(theta, action):
+        return torch.exp(-3 * theta[:, ::2] * action) * (1 + theta[:, 1::2])
+
+    prior = BoxUniform(torch.zeros(2 * pairs), torch.ones(2 * pairs))
+    simulator = SimulatorModel(curved, noise=GaussianNoise(sd))
+    with forked_generators(1):
+        x = simulator(prior.sample((1,)).expand(2, -1), action)
+    belief = refine(simulator, prior, action, x, seed=0)
+    with forked_generators(0):
+        theta = belief.sample((4_000,)).double().numpy()
+    one = (np.arange(300) + 0.5) / 300
+    a, b = np.meshgrid(one, one)
+    log_evidence = 0.0
+    for j in range(pairs):
+        log_p = sum(
+            norm.logpdf(float(x[k, j]), np.exp(-3 * a * float(action[k])) * (1 + b), sd)
+            for k in range(2)
+        )
+        log_evidence += np.log(np.exp(log_p - log_p.max()).mean()) + log_p.max()
+        weight = np.exp(log_p - log_p.max()) / np.exp(log_p - log_p.max()).sum()
+        mean = (weight * a).sum()
+        width = np.sqrt((weight * (a - mean) ** 2).sum())
+        assert abs(theta[:, 2 * j].mean() - mean) < 0.5 * width
+    assert isinstance(belief, SimulatedBelief)
+    assert belief.log_evidence == pytest.approx(log_evidence, abs=1.5)
+    assert not belief.diagnostics.trustworthy
+    assert not belief.diagnostics.assumptions["enough_draws"].holds
