@@ -55,17 +55,17 @@ class Campaign(CampaignTrials):
     Args:
         simulator: ``simulator(theta, action)``, shapes (n, theta_dim) and
             (n, action_dim), giving x of shape (n, *x_shape).
-        prior: Over the parameters, with a support.
+        prior: Prior of the parameters, with a support.
         actions: What the robot may do: a space, or a list of actions.
         method: "asbi", "alhi" (a surrogate likelihood) and "seqbed" (ratios) design
             actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
         effects: What the simulator may lack, see :class:`.Effect`.
             With them, actions are also chosen to tell whether it does.
-        cost: Of actions (n, action_dim), shape (n,), positive; or one number an action
-            of a list. Actions are then chosen for their information by cost.
+        cost: Cost of actions (n, action_dim), shape (n,), positive; or one number an
+            action of a list. Actions are then chosen for their information by cost.
         constraint: Which of actions (n, action_dim) the robot may execute now, shape
             (n,), bool. The network learns about the others as well.
-        seed: Of everything random; the same seed and outcomes give the same campaign.
+        seed: Seed of all draws; the same seed and outcomes give the same campaign.
         options: Sizes and estimators; or fields of them in a dict.
         directory: New or empty folder to keep the campaign in, as it happens: whatever
             ends the process, :meth:`load` goes on. None keeps it in memory alone.
@@ -167,20 +167,22 @@ class Campaign(CampaignTrials):
         beliefs, to the last bit. Nothing in the directory is executed.
 
         Args:
-            directory: As given to the constructor.
-            simulator: As given there. Without it the campaign can be read, told and
-                corrected, and neither :meth:`ask` nor :meth:`update` compute.
+            directory: Directory of the campaign, as given to the constructor.
+            simulator: Simulator that the campaign was made with. Without it the
+                campaign can be read, told and corrected, and neither :meth:`ask` nor
+                :meth:`update` compute.
             prior: Needed where it is a class of your own; else None takes the
                 directory's.
-            actions: Likewise; a space, or a list of actions, as there.
-            effects: As given to the constructor, and those that were adopted since:
-                functions are not stored.
-            cost: As given to the constructor.
-            constraint: As given to the constructor.
+            actions: Action space or list of actions; None takes the directory's, as
+                above.
+            effects: Effects given to the constructor, and those that were adopted
+                since: functions are not stored.
+            cost: Cost of actions, as given to the constructor.
+            constraint: Constraint of actions, as given to the constructor.
             options: None takes the directory's; needed where an estimator is of your
                 own. Others than before hold for this process, with a warning. A dict
                 gives all that are not default, as in the constructor.
-            show_progress: As in the constructor.
+            show_progress: Whether to draw a progress bar, as in the constructor.
             simulator_changed: Take another simulator than the campaign was made with,
                 and compute everything again with it.
             repair: Give up what is damaged. The files before are kept beside, and a
@@ -350,7 +352,8 @@ class Campaign(CampaignTrials):
             effects: What the simulator may lack, None takes the campaign's; those
                 already adopted are left out. The first library of a model counts as
                 frozen: with another one, or other priors, the report is "exploratory".
-            evaluate: As in :func:`.close_loop`.
+            evaluate: Whether to report the error before and after, see
+                :func:`.close_loop`.
 
         Returns:
             The report; :meth:`adopt` takes it.
@@ -378,7 +381,7 @@ class Campaign(CampaignTrials):
         effects. A pending trial stays; surprises and health start anew.
 
         Args:
-            report: Of :meth:`criticize`, whose verdict names effects.
+            report: Report of :meth:`criticize`, whose verdict names effects.
 
         Returns:
             The belief over (theta, phi).

@@ -72,7 +72,7 @@ class CampaignOptions:
         density_estimator: What is learned: as in :class:`.ASBI` and
             :class:`.ALHI`; for "seqbed" a classifier as in
             :class:`.SeqBED`, or :class:`.LFIRE`.
-        estimator: Of the expected information gain, as in
+        estimator: Estimator of the expected information gain, as in
             :class:`.InformationGainDesigner`; "posterior" is the paper's.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
@@ -89,8 +89,8 @@ class CampaignOptions:
             any simulator fits, and nothing tells that it is wrong. None never checks.
             A campaign that is given effects turns to the model by itself.
         stop: When :meth:`.Campaign.run` ends before its last round.
-        max_simulations: Of the whole campaign, which never simulates more: belief,
-            designs and scores then share one pool of rows
+        max_simulations: Simulations of the whole campaign, which never simulates more:
+            belief, designs and scores then share one pool of rows
             (:mod:`sbi_active.inference.emulation`), and no network is trained. When
             they are used up, :meth:`.Campaign.run` ends, :meth:`.Campaign.ask` says so
             and the last belief stands. ``Campaign.state.meter`` has what was spent.

@@ -112,8 +112,8 @@ class ModelVersion:
         number: From 0, the simulator that the campaign started with.
         effects: All that were adopted so far, in the order of their parameters.
         digest: Hash of noise, library and priors behind the adoption; "" at first.
-        num_trials: Told before it was adopted.
-        misfit: As in :class:`Trial`, of the trials that the version was given.
+        num_trials: Number of trials told before it was adopted.
+        misfit: Misfit of the trials that the version was given, as in :class:`Trial`.
         examined: Digests of the comparisons of this version with trials, in order.
         trials: Indices of those told before it was adopted, which it was given at once.
     """
@@ -153,7 +153,7 @@ class CampaignState:
 
     Attributes:
         method: Name of the method.
-        seed: Of everything random.
+        seed: Seed of all draws.
         options: Sizes and estimators.
         trials: In the order in which they were asked for or told.
         processed: Indices of trials that the belief contains, in order of use.
@@ -212,7 +212,7 @@ class CampaignState:
         """Note that the current model was compared with the trials.
 
         Args:
-            digest: Of the comparison.
+            digest: Digest of the comparison.
         """
         examined = (*self.version.examined, digest)
         self.versions[-1] = replace(self.version, examined=examined)

@@ -59,9 +59,9 @@ class StopRules:
         """Return why to stop, or None.
 
         Args:
-            belief: After all trials.
-            design: Of the next trial, if there is one.
-            seed: Of the belief's draws.
+            belief: Belief after all trials.
+            design: Design of the next trial, if there is one.
+            seed: Seed of the belief's draws.
 
         Raises:
             ValueError: If ``max_sd`` has neither one number nor one a parameter.

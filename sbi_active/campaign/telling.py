@@ -35,13 +35,14 @@ def told_trial(
     """Return the record of a trial as told; the recorded one where nothing is new.
 
     Args:
-        state: Of the campaign.
+        state: State of the campaign.
         x: The outcome.
         trial: The trial, its index, or None for the pending one.
         action: The executed one; None is the one asked for.
-        status: As told.
-        x_shape: Of an outcome.
-        actions: Of the campaign; one executed outside of it is warned of.
+        status: Status of the trial, as told.
+        x_shape: Shape of an outcome.
+        actions: Action space of the campaign; an action executed outside of it is
+            warned of.
 
     Raises:
         ValueError: If there is no such trial, or numbers or shapes do not fit.
@@ -102,7 +103,7 @@ def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
     What was found about it stays where it is the same trial as before.
 
     Args:
-        state: Of the campaign.
+        state: State of the campaign.
         facts: Fields of :class:`.Trial`, its index among them.
 
     """

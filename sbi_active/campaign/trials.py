@@ -84,11 +84,11 @@ class CampaignTrials(CampaignView):
 
         Args:
             action: The executed one, shape (action_dim,).
-            x: As in :meth:`tell`.
-            status: As in :meth:`tell`.
+            x: Outcome, as in :meth:`tell`.
+            status: Status of the trial, as in :meth:`tell`.
 
         Raises:
-            ValueError: As in :meth:`tell`.
+            ValueError: If :meth:`tell` would refuse the trial.
         """
         new = new_trial(self.state)
         told = self._checked(x, trial=new, action=action, status=status)
@@ -111,13 +111,13 @@ class CampaignTrials(CampaignView):
 
         Args:
             trial: The trial or its index.
-            x: As in :meth:`tell`; None keeps the outcome where there is one.
-            action: As in :meth:`tell`.
-            status: As in :meth:`tell`.
+            x: Outcome, as in :meth:`tell`; None keeps the outcome where there is one.
+            action: Executed action, as in :meth:`tell`.
+            status: Status of the trial, as in :meth:`tell`.
             reason: Kept with the trial.
 
         Raises:
-            ValueError: As in :meth:`tell`, or if the trial was not told yet.
+            ValueError: If :meth:`tell` would refuse the trial, or it was not told yet.
         """
         found = find_trial(self.state, trial)
         if found.status == "pending":

@@ -16,7 +16,7 @@ def calibration_lost(campaign: Any) -> str | None:
     network is checked that has the next word.
 
     Args:
-        campaign: Of a method with a posterior, or with refined beliefs.
+        campaign: Campaign of a method with a posterior, or with refined beliefs.
     """
     state = campaign.state
     if not state.explained:

@@ -30,8 +30,8 @@ class Score:
     Attributes:
         surprise: Tail probability, in (0, 1].
         log_score: Log density, nats.
-        num_simulations: Spent.
-        num_missing: Of them lost to faults of the simulator.
+        num_simulations: Number of simulations spent.
+        num_missing: Number of those simulations lost to faults of the simulator.
     """
 
     surprise: float
@@ -77,11 +77,11 @@ def score_outcome(
         x: The outcome, shape x_shape; NaN where nothing was measured.
         action: The executed one, shape (action_dim,).
         simulator: ``simulator(theta, action)``.
-        belief: Before the trial.
+        belief: Belief before the trial.
         num_samples: n, fewer of outcomes with more than 2,000 numbers: as many as have
             4 million together, and at least 400.
-        seed: Of the simulations.
-        workers: Of the simulations.
+        seed: Seed of the simulations.
+        workers: Workers that run the simulations.
 
     References:
         Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &

@@ -42,10 +42,10 @@ def simulate_prior(
     Args:
         trial: Gives the action.
         simulator: ``simulator(theta, action)``.
-        prior: Of theta.
-        num_samples: Rows.
-        seed: Of the simulations.
-        workers: Of the simulations.
+        prior: Prior of theta.
+        num_samples: Number of rows.
+        seed: Seed of the simulations.
+        workers: Workers that run the simulations.
     """
     with forked_generators(seed, "theta"):
         theta = prior.sample(torch.Size([num_samples]))
@@ -104,7 +104,7 @@ def in_doubt(
     """Return the same belief, marked untrustworthy for reasons; itself without any.
 
     Args:
-        belief: Of the trials that are explained; the prior before any.
+        belief: Belief from the trials that are explained; the prior before any.
         prior: The original prior.
         texts: From :func:`doubts`.
     """

@@ -44,9 +44,9 @@ def plot_campaign(
     """Return the figure of :meth:`.CampaignView.plot`.
 
     Args:
-        state: Of the campaign.
+        state: State of the campaign.
         simulator: That of a trial, by its index; None where there is none.
-        prior: Over the current parameters.
+        prior: Prior of the current parameters.
         parameter_names: One a parameter.
         theta_true: Shape (theta_dim,), where known.
         num_predicted: Simulations of each trial.

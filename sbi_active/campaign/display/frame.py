@@ -40,8 +40,8 @@ def to_dataframe(
     """Return the trials as a table, see :meth:`.CampaignView.to_dataframe`.
 
     Args:
-        state: Of the campaign.
-        actions: Of the campaign.
+        state: State of the campaign.
+        actions: Action space of the campaign.
         parameter_names: One a parameter.
         channel_names: One an entry of x's last axis, where known.
     """
@@ -107,7 +107,7 @@ def outcome_labels(
     """Return a name for each number of an outcome, none where they are many.
 
     Args:
-        shape: Of the outcome.
+        shape: Shape of the outcome.
         channel_names: One an entry of the last axis, where known.
 
     Example:

@@ -26,8 +26,9 @@ class StageWatch:
         """Tell of the block.
 
         Args:
-            state: Of the campaign.
-            index: Of the trial that it is for; of the next one where it is for none.
+            state: State of the campaign.
+            index: Index of the trial that the work is for; of the next one where it is
+                for none.
             name: What it does.
         """
         if not is_asked_for(self.show_progress):

@@ -20,7 +20,7 @@ def at_index(simulator: Any, index: int) -> Any:
 
     Args:
         simulator: One with a ``next_index``; any other is returned as it is.
-        index: Of the trial.
+        index: Index of the trial.
     """
     if getattr(simulator, "next_index", index) == index:
         return simulator

@@ -51,13 +51,13 @@ class Learner:
     Args:
         simulator: ``simulator(theta, action)``. One with a ``next_index`` that matters
             is simulated at the index of each trial.
-        prior: Over its parameters.
-        actions: Of the campaign.
-        state: Of the campaign.
-        x_shape: Of an outcome; None finds it by a few simulations.
+        prior: Prior of its parameters.
+        actions: Action space of the campaign.
+        state: State of the campaign.
+        x_shape: Shape of an outcome; None finds it by a few simulations.
 
     Attributes:
-        x_shape: Of an outcome.
+        x_shape: Shape of an outcome.
         simulations: Those that the last training was on, where the design is to rest on
             them; else None.
 
@@ -305,7 +305,7 @@ class Learner:
         """Return what a design asks, trained now or on demand.
 
         Args:
-            index: Of the trial that is designed.
+            index: Index of the trial that is designed.
         """
         if Enumeration.of(self.prior) is not None:
             return RoundModel(None)
@@ -320,7 +320,7 @@ class Learner:
         """Return the model of this round where it is a posterior.
 
         Args:
-            index: Of the trial that the round is for.
+            index: Index of the trial that the round is for.
 
         Raises:
             ValueError: If it is another one.
@@ -338,7 +338,7 @@ class Learner:
         """Return the posterior trained under the current belief, training if needed.
 
         Args:
-            index: Of the trial that the work is for.
+            index: Index of the trial that the work is for.
         """
         state = self._state
         if not self._round_ready:

@@ -120,6 +120,6 @@ def faithful_options(name: str) -> CampaignOptions:
     of simulations.
 
     Args:
-        name: Of the method.
+        name: Name of the method.
     """
     return replace(CampaignOptions.faithful(), **find_method(name).faithful)

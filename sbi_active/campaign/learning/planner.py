@@ -32,11 +32,11 @@ class Planner:
 
     Args:
         limits: The action space, what of it is permitted, and its cost.
-        state: Of the campaign.
+        state: State of the campaign.
         effects: What its simulator may lack.
 
     Attributes:
-        effects: As given.
+        effects: Effects that the simulator may lack.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Planner:
         """Return the comparison of the current simulator with trials.
 
         Args:
-            learner: Of the current simulator.
+            learner: Learner of the current simulator.
             trials: That gave a measurement, or none.
             effects: What it may lack; None takes the campaign's.
         """
@@ -116,9 +116,9 @@ class Planner:
         """Return the design of a trial and what it is for.
 
         Args:
-            index: Of the trial.
-            target: As in :meth:`.Campaign.ask`.
-            learner: Of the current simulator.
+            index: Index of the trial.
+            target: Target of the design, see :meth:`.Campaign.ask`.
+            learner: Learner of the current simulator.
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.
         """
@@ -201,7 +201,7 @@ def _model_design(
     """Return the design that tells most about which rival is right.
 
     Args:
-        criticism: Of all trials so far.
+        criticism: Comparison of the model with all trials so far.
         limits: What is permitted, and its cost.
         exclude: Actions not to repeat, shape (t, action_dim).
 

@@ -90,7 +90,7 @@ def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
 
     Args:
         content: The bytes.
-        known: As given to :func:`encode`, by the same names.
+        known: Objects that were given to :func:`encode`, by the same names.
 
     Raises:
         ValueError: If the content is nothing that :func:`encode` writes.

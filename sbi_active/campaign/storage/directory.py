@@ -115,7 +115,7 @@ class CampaignDirectory:
         A belief that cannot be stored is computed again after :meth:`restore`.
 
         Args:
-            state: Of the campaign.
+            state: State of the campaign.
             belief: After ``state.processed``; None where that is the prior.
             known: What the reader has too, see :func:`.encode`.
         """

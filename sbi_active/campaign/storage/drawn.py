@@ -29,8 +29,8 @@ def draws_of(thing: Distribution | ActionSpace, *, seed: int) -> dict[str, Any]:
     """Return as JSON what readers need of a prior or of an action space.
 
     Args:
-        thing: Either.
-        seed: Of the draws.
+        thing: Prior or action space.
+        seed: Seed of the draws.
     """
     if isinstance(thing, ActionSpace):
         draws = thing.sample((NUM_DRAWS,), seed=seed)
@@ -92,9 +92,9 @@ class DrawnBelief(Belief):
     """Stands for a belief under such a prior, by the draws that a campaign keeps.
 
     Args:
-        belief: As it was read.
+        belief: Belief as it was read.
         prior: The prior.
-        draws: Of the belief, shape (n, theta_dim).
+        draws: Draws of the belief, shape (n, theta_dim).
     """
 
     def __init__(self, belief: Any, prior: DrawnPrior, draws: Tensor) -> None:
@@ -149,9 +149,9 @@ def stood_for(
     """Return a belief that was read; its draws where there is no density of the prior.
 
     Args:
-        belief: As it was read.
-        prior: That the campaign began with.
-        state: Of the campaign.
+        belief: Belief as it was read.
+        prior: Prior that the campaign began with.
+        state: State of the campaign.
     """
     kept = [state.draws[i] for i in state.processed if i in state.draws]
     if not isinstance(prior, DrawnPrior) or not kept:

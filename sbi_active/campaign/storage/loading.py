@@ -51,15 +51,15 @@ class StoredLearner:
     """What is known of a campaign without its simulator.
 
     Args:
-        prior: That the campaign began with.
-        x_shape: Of an outcome.
-        state: Of the campaign.
+        prior: Prior that the campaign began with.
+        x_shape: Shape of an outcome.
+        state: State of the campaign.
         belief: Returns the belief, read when it is first asked for; None for none.
-        parameter_names: Of the parameters, if they have names.
+        parameter_names: Names of the parameters, if they have any.
 
     Attributes:
-        first_prior: As given.
-        x_shape: As given.
+        first_prior: Prior that the campaign began with.
+        x_shape: Shape of an outcome.
     """
 
     simulator = None

@@ -51,14 +51,15 @@ def new_manifest(
     """Return the description of a new campaign.
 
     Args:
-        state: Of the campaign.
-        simulator: As given.
-        prior: As given.
-        actions: As given.
-        x_shape: Of an outcome.
+        state: State of the campaign.
+        simulator: Simulator of the campaign.
+        prior: Prior of the campaign.
+        actions: Action space of the campaign.
+        x_shape: Shape of an outcome.
         effects: Names of those that the simulator may lack.
         has_cost: Whether actions have a cost, which the reader must give again.
-        has_constraint: Likewise.
+        has_constraint: Whether actions have a constraint, which the reader must give
+            again.
     """
     names = getattr(simulator, "parameter_names", None)
     channels = getattr(simulator, "channel_names", None)
@@ -128,7 +129,7 @@ def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
     """Return a manifest.
 
     Args:
-        store: Of the campaign.
+        store: Store of the campaign.
         repair: Take the copy where the manifest is damaged, and write it again.
 
     Raises:

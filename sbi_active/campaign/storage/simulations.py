@@ -38,7 +38,8 @@ class CampaignBanks:
 
     Args:
         place: The file that they are in, or its folder, made when it is needed.
-        suffix: Of their names, after another simulator took the place of the first.
+        suffix: Suffix of the banks' names, after another simulator took the place of
+            the first.
     """
 
     def __init__(self, place: Store | Path, suffix: str = "") -> None:
