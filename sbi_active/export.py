@@ -52,8 +52,8 @@ def to_inference_data(
             remember, else theta_1, ...
         num_samples: Draws of all chains together.
         num_chains: Chains; draws that do not fill all are left out.
-        model: Of a report: a name among ``report.tracing.evidences``.
-        seed: Of the draws.
+        model: Model of a report, by a name among ``report.tracing.evidences``.
+        seed: Seed of the draws.
 
     Returns:
         ``InferenceData`` of ArviZ 0.x, ``DataTree`` of 1.x.
@@ -88,12 +88,13 @@ def to_datatree(
     ``to_netcdf``, or ``to_zarr``.
 
     Args:
-        source: As in :func:`to_inference_data`, with what follows.
+        source: Belief, campaign, report or dict of arrays, as for
+            :func:`to_inference_data`.
         parameter_names: One a parameter.
         num_samples: Draws of all chains together.
         num_chains: Chains.
-        model: Of a report.
-        seed: Of the draws.
+        model: Model of a report, by its name.
+        seed: Seed of the draws.
     """
     return data_tree(
         _groups(source, parameter_names, num_samples, num_chains, model, seed)

@@ -26,7 +26,8 @@ def former_names(
     Args:
         package: Name of the package.
         names: Former name: where it is now, as ``"package:Name"``.
-        stacklevel: Of the warning; 2 where the function is ``__getattr__`` itself.
+        stacklevel: Stack level of the warning; 2 where the function is ``__getattr__``
+            itself.
 
     Returns:
         A function of a name. It raises AttributeError for names that never were.

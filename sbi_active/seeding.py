@@ -58,7 +58,7 @@ def forked_generators(seed: int | None, *key: int | str) -> Iterator[None]:
 
     Args:
         seed: The user's seed; None leaves the generators as they are.
-        key: As in :func:`derive_seed`.
+        key: Purpose of the seed, as in :func:`derive_seed`.
     """
     if seed is None:
         yield

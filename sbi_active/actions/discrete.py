@@ -92,7 +92,7 @@ def action_space(actions: Any) -> ActionSpace:
 
     Raises:
         TypeError: If it is neither.
-        ValueError: As :class:`DiscreteActions` raises.
+        ValueError: If :class:`DiscreteActions` refuses the list.
     """
     if isinstance(actions, ActionSpace):
         return actions

@@ -36,12 +36,13 @@ class SignalActions(BoxActions):
             gives {name: (n, m)}, or (n, m) for one called "input". Ready ones are
             :func:`.chirp`, :func:`.step`, :func:`.multisine` and :func:`.recorded` of
             ``sbi_active.actions.waveforms``.
-        low: Of the parameters, a number or shape (action_dim,).
-        high: As ``low``. Neither is needed where the generator lists its actions.
+        low: Lower limits of the parameters, a number or shape (action_dim,).
+        high: Upper limits, as ``low``. Neither is needed where the generator lists its
+            actions.
         input_times: Uniform grid of the signal in s, shape (m,); None takes that of the
             generator.
-        names: One an entry of the action; None takes those of the generator.
-        units: As ``names``.
+        names: Names of the entries of the action; None takes those of the generator.
+        units: Units of the entries, as ``names``.
         amplitude: Limits of each value, a number for its size or (lowest, highest), for
             all inputs or by name; None for none.
         rate: Largest change of an input in a second, between points of the grid, a

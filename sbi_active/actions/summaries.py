@@ -31,12 +31,12 @@ class SummaryAction(DiscreteActions):
         use: Which summary a belief rests on: at each trial the "best", that of which
             the outcome is expected to tell most at the executed action, since all of
             them are at hand; or the "chosen" one, as in Kim & Matsubara (2025).
-        name: Of the entry.
+        name: Name of the entry.
 
     Attributes:
-        summaries: As given.
+        summaries: Summaries by name, as given.
         labels: Their names, in the order of :math:`\delta`.
-        use: As given.
+        use: Which summary a belief rests on, "best" or "chosen".
 
     Raises:
         ValueError: If there is no summary, or ``use`` is another word.

@@ -23,11 +23,11 @@ class Waveform:
     """A signal whose parameters are the action, but for those that are fixed.
 
     Attributes:
-        shape: Of "chirp", "step" or "multisine".
+        shape: Shape of the signal, "chirp", "step" or "multisine".
         input: Name of the input.
         every: Names of all parameters, each with its unit.
         fixed: Values of some.
-        frequencies: Of a multisine, Hz.
+        frequencies: Frequencies of a multisine, Hz.
     """
 
     shape: str

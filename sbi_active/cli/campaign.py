@@ -159,10 +159,10 @@ def open_campaign(
     """Return the campaign of a folder.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
         simulates: Whether its simulator is needed; else nothing of the folder is
             imported without --trust.
-        simulator: Where that is; None where the folder says.
+        simulator: Place of the simulator; None where the folder says it.
         trust: Whether to import what the folder names.
         simulator_changed: Take another simulator than before.
         repair: Give up what is damaged.

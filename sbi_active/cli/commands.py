@@ -210,10 +210,10 @@ def _add(
     """Add a command; one without a place is on a campaign, and answers programs too.
 
     Args:
-        name: What is written.
+        name: Name of the command.
         help: What it does.
-        *params: Its arguments and options.
-        place: Of its function, as ``module.name``.
+        *params: Arguments and options of the command.
+        place: Place of its function, as ``module.name``.
         to: The commands that it belongs to.
     """
     call = partial(_call, place) if place else partial(_call_on_campaign, name)

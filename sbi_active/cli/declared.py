@@ -65,8 +65,8 @@ def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
     """Return the same for a campaign on a task.
 
     Args:
-        name: Of the task.
-        options: Of the task, each NAME=VALUE.
+        name: Name of the task.
+        options: Options of the task, each NAME=VALUE.
     """
     return {"task": name, "options": [*options], "noise": None, "folder": os.getcwd()}
 
@@ -108,12 +108,12 @@ class Declared:
     """What the folder of a campaign names, where that may be imported.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
         trusts: Whether the command line says to import it, whoever wrote it.
 
     Attributes:
         task: Its name, for a campaign on a task.
-        noise: As --noise had it.
+        noise: Noise as --noise had it.
         place: Where names of files begin.
     """
 
@@ -139,10 +139,10 @@ class Declared:
 
     @property
     def options(self) -> list[str]:
-        """Those of the task, of which some name files.
+        """Return the options of the task, of which some name files.
 
         Raises:
-            ValueError: As :meth:`names` raises.
+            ValueError: If one names something that may be anybody's program.
         """
         options = self._content["options"]
         if options:

@@ -39,7 +39,7 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
     """Leave a summary for the commands to come; call it while nobody else writes.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
         known: What :class:`Record` needs.
     """
     with _stored(folder) as store:
@@ -52,10 +52,10 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
 
 
 def digest(folder: Path) -> str:
-    """Return what changes whenever anybody writes to a campaign.
+    """Return a text that changes whenever anybody writes to a campaign.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
     """
     with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
         return str(_mark(store, store.length(EVENTS, LOG)))
@@ -81,12 +81,12 @@ class Record:
     """What is known of a campaign without computing: a part of its interface.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
 
     Attributes:
-        directory: As given.
-        x_shape: Of an outcome.
-        state: Has the trials.
+        directory: Folder of the campaign.
+        x_shape: Shape of an outcome.
+        state: State of the campaign, with its trials.
 
     Raises:
         Unsure: If there is no summary, or more was done since than told.

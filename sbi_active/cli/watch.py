@@ -44,7 +44,7 @@ class Watched:
     """The page of a campaign, drawn again where the folder's store has changed.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
     """
 
     def __init__(self, folder: Path) -> None:

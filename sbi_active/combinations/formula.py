@@ -20,8 +20,8 @@ class Term:
     """One parameter in a combination: weight times theta, or log(theta + shift).
 
     Attributes:
-        index: Of the parameter.
-        weight: Of the term, or exponent of the factor.
+        index: Index of the parameter.
+        weight: Weight of the term, or exponent of the factor.
         log: Whether it is a factor of a product.
         shift: Added to the parameter before the logarithm.
     """

@@ -50,7 +50,7 @@ def search(
     Of the formulas that are about as narrow as the best the simplest is taken.
 
     Args:
-        moments: Of any terms.
+        moments: Function that returns the covariance C and the prior's S of any terms.
         open_parameters: Indices of those that are not known by themselves.
         low: Smallest value of each parameter under the prior, shape (d,).
         span: Range of each under the prior, shape (d,).

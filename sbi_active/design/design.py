@@ -33,9 +33,10 @@ class Design:
             the others: what it tells beyond them.
         expected_information_gain: Estimates on simulations that had no part in the
             choice, nats, shape (a,); NaN for a random choice.
-        standard_error: Of each estimate, shape (a,).
-        difference_standard_error: Of each estimate's difference to the chosen
-            candidate's, on common random numbers, shape (a,); zero at the chosen one.
+        standard_error: Standard error of each estimate, shape (a,).
+        difference_standard_error: Standard error of each estimate's difference to the
+            chosen candidate's, on common random numbers, shape (a,); zero at the chosen
+            one.
         probability_best: Probability that a candidate has the largest expectation of
             the estimate, by its cost if there is one, given the simulations, shape
             (a,); zero where a candidate is excluded.
@@ -56,7 +57,7 @@ class Design:
         num_missing: Simulations of them all that were lost to faults of the simulator.
         notes: What to know: estimators that failed a check or disagree, where an
             estimate is a bound, candidates that were excluded.
-        cost: Of each candidate, shape (a,); None where there is none.
+        cost: Cost of each candidate, shape (a,); None where there is none.
         steps: Designs of the actions of a batch in turn, each given the former and the
             pending ones; empty for a single action.
     """

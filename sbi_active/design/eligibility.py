@@ -22,8 +22,8 @@ class DesignLimits:
 
     Attributes:
         actions: The space.
-        constraint: Of actions (n, action_dim), which are permitted, shape (n,), bool;
-            None permits all.
+        constraint: Function of actions (n, action_dim) that says which are permitted,
+            shape (n,), bool; None permits all.
         exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
             nor others within a hundredth of its width in every entry.
         price: Cost of actions (n, action_dim), shape (n,); None for none.

@@ -31,7 +31,7 @@ class GainEvaluator:
         sampler: Draws outcomes.
         estimator: None chooses one by what the first simulations show.
         model: What the estimator needs.
-        belief: Of the parameters.
+        belief: Belief over the parameters.
 
     Attributes:
         notes: What speaks against the estimator, or why others were not taken.

@@ -28,7 +28,7 @@ class Target:
 
     Attributes:
         name: "theta", names of parameters, or "model".
-        estimator: As the designer was given it.
+        estimator: Estimator of the information, as the designer was given it.
         model: What the estimator needs.
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters; None for the target "model".

@@ -60,12 +60,12 @@ class BeliefCheck:
         parameter_names: One a parameter; the last of the figures is the joint density.
         beyond: Nats by which refits, at their own draws, exceed the belief; one a
             refit, the belief is too narrow or elsewhere.
-        within: The same at the belief's draws: it is too wide, or elsewhere.
+        within: Nats at the belief's draws, likewise: it is too wide, or elsewhere.
         spread: Standard deviation of the normal scores of the ranks, one a parameter
             and one for the density: 1 where right, more for too narrow.
-        spread_interval: Of that, 95 %.
-        shift: Mean of the scores, alike.
-        p_value: Of spread and shift together, alike.
+        spread_interval: Interval of each spread, 95 %.
+        shift: Mean of the scores, one as for ``spread``.
+        p_value: p-value of spread and shift together, one as for ``spread``.
         num_repeats: Repeats of posterior SBC.
         num_simulations: Rows of new outcomes.
     """
@@ -133,10 +133,10 @@ def check_belief(
         num_refits: Inferences of the same trials with other seeds.
         num_posterior_samples: Draws that a repeat's parameters are ranked among.
         refinement: None takes the campaign's settings, or the defaults.
-        belief: To be judged; None takes the current one.
+        belief: Belief to be judged; None takes the current one.
         infer: ``infer(action, x, seed)`` gives a belief; None refines.
         level: Probability that ranks alone flag a right belief, at most.
-        seed: Of everything random here.
+        seed: Seed of all draws.
 
     Raises:
         ValueError: If there is no trial, no simulator, or sizes are too small.

@@ -22,21 +22,21 @@ class Stratum:
     Every interval holds at the same time as all others with the check's level.
 
     Attributes:
-        name: Of the action or group; "all".
-        round: Of the network, from 1; 0 for all.
+        name: Name of the action or group; "all".
+        round: Round of the network, from 1; 0 for all.
         num_rows: Simulations behind it.
         coverage: Share of truths in the network's smallest regions, by their level.
-        coverage_interval: Of these shares (Clopper & Pearson).
+        coverage_interval: Interval of each of these shares (Clopper & Pearson).
         rank_distance: Largest distance of the ranks' distribution from uniform, one a
             parameter (Kolmogorov & Smirnov).
-        rank_interval: Of that distance, one a parameter.
+        rank_interval: Interval of that distance, one a parameter.
         p_value: That ranks of uniform ones are as far, one a parameter, as sbi gives.
         gap: Log-score gap, a lower bound in nats.
-        gap_interval: Of that bound.
+        gap_interval: Interval of that bound.
         information: What outcomes tell beyond the belief, nats: gap and what the
             network has of it.
         lost: Share of the information that the network loses.
-        verdict: As in :class:`Calibration`.
+        verdict: Verdict on the stratum, as in :class:`Calibration`.
         reasons: For it, a clause each.
     """
 
@@ -74,8 +74,8 @@ class Calibration:
         gap_method: "likelihood" or "classifier", see :mod:`.log_score`.
         num_invalid: Rows without a measurement that the network cannot take.
         num_simulations: Rows simulated.
-        ranks: Of the truths among ``num_posterior_samples``, shape (n, d + 1); the last
-            by the network's density.
+        ranks: Ranks of the truths among ``num_posterior_samples``, shape (n, d + 1);
+            the last by the network's density.
         num_posterior_samples: Draws of the network a row.
         label: Index of each row's stratum, shape (n,).
         tarp: Expected coverage and credibility by distances to random points (Lemos et

@@ -99,7 +99,7 @@ def check_calibration(
         tolerance: None is ``Tolerance()``.
         level: Probability that a perfect network is flagged anywhere, at most.
         parameter_names: None takes the simulator's.
-        seed: Of everything random here.
+        seed: Seed of all draws.
 
     Returns:
         Figures and the verdict.

@@ -23,9 +23,9 @@ class Tolerance:
     """What a verdict lets pass.
 
     Attributes:
-        coverage: Of the 90 % regions, by which it may be off.
-        excluded: By which that may be too small before it is a "stop".
-        rank_distance: Of ranks from uniform.
+        coverage: Error of the coverage of the 90 % regions.
+        excluded: Shortfall of that coverage beyond which the verdict is "stop".
+        rank_distance: Distance of the ranks' distribution from uniform.
         lost: Share of what outcomes tell.
         gap: Nats below which no share counts.
     """
@@ -52,13 +52,13 @@ def judge(
     r"""Return the figures of a stratum.
 
     Args:
-        name: Of the stratum.
-        round_: Of the network.
+        name: Name of the stratum.
+        round_: Round of the network.
         ranks: Shape (n, d + 1), the last by density.
         gap: Terms of the log-score gap, shape (n,), nats.
         gained: log q - log b at the truths, shape (n,), nats.
         num_posterior_samples: L.
-        level: Of error of one stratum, shared among its figures.
+        level: Level of error of one stratum, shared among its figures.
         tolerance: What may pass.
         names: One a parameter.
     """

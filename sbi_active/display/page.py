@@ -22,7 +22,7 @@ class Picture:
     """The place of a figure.
 
     Attributes:
-        name: Of the figure.
+        name: Name of the figure.
         words: What it shows, for who does not see it.
         caption: Below it.
     """

@@ -51,7 +51,7 @@ class Table:
 
         Args:
             names: One a parameter.
-            draws: Of a belief, shape (n, theta_dim).
+            draws: Draws of a belief, shape (n, theta_dim).
         """
         values = draws.double().numpy()
         low, high = np.quantile(values, [0.05, 0.95], axis=0)

@@ -37,8 +37,8 @@ class CandidateSampler:
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters.
         action: Candidates, shape (a, action_dim).
-        seed: Of everything drawn.
-        workers: Of the simulations.
+        seed: Seed of all draws.
+        workers: Workers that run the simulations.
         others: Actions whose outcomes will be known as well, shape (p, action_dim);
             every draw then holds joint outcomes
             (:func:`.join_outcomes`). None for none.

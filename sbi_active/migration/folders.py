@@ -38,7 +38,7 @@ def migrate(folder: Path) -> dict[str, int]:
     cut short is done again.
 
     Args:
-        folder: Of the campaign or bank, or that of ``CampaignOptions(bank=)``.
+        folder: Folder of the campaign or bank, or that of ``CampaignOptions(bank=)``.
 
     Returns:
         Number of rows by bank; of a campaign also the number of its events, as "log".

@@ -39,10 +39,10 @@ class Coordinates:
     """Log deviations as functions of coordinates that are about standard normal.
 
     Args:
-        fit: Of the channels that were seen.
+        fit: Predictive of the channels that were seen.
         target: Their outcome, shape (q,).
-        error_model: Of the deviations.
-        rng: Of the Gibbs sweeps.
+        error_model: Error model of the deviations.
+        rng: Random generator of the Gibbs sweeps.
     """
 
     def __init__(

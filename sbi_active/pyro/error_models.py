@@ -44,7 +44,7 @@ class SpikeAndSlab:
         x_o - x \sim (1 - \rho)\, N(0, s^2) + \rho\, t_3(0, S^2)
 
     Attributes:
-        probability: Of misspecification of a channel, :math:`\rho`.
+        probability: Probability of misspecification of a channel, :math:`\rho`.
         spike: s; small beside the noise, which the predictive has already.
         slab: S.
     """

@@ -68,9 +68,9 @@ class PyroProblem:
     """What a Pyro model gives a campaign.
 
     Attributes:
-        simulator: With a noise where the outcome is a known likelihood.
-        prior: Over all latent sites.
-        parameter_names: Of its entries.
+        simulator: Simulator, with a noise where the outcome has a known likelihood.
+        prior: Prior of all latent sites.
+        parameter_names: Names of the prior's entries.
     """
 
     simulator: SimulatorModel

@@ -99,11 +99,12 @@ class RobustASBI(ASBI):
     refined: the result is a chained approximation as that of :class:`ASBI` without one.
 
     Args:
-        prior: As of :class:`ASBI`, with all that follows.
+        prior: Prior of the parameters; it and all that follows are those of
+            :class:`ASBI`.
         error_model: p(x_o | x); None is :class:`SpikeAndSlab`.
 
     Attributes:
-        denoised: Of each update.
+        denoised: Denoised outcome of each update.
     """
 
     def __init__(
@@ -129,9 +130,9 @@ class RobustASBI(ASBI):
                 those numbers too; else their sensor failed, and they are drawn from
                 what the predictive says given the others.
             action: The executed action.
-            simulator: For the predictive; required.
+            simulator: Simulator of the predictive; required.
             refinement: Not used; anything but None is an error.
-            seed: Of everything random; None draws one from torch's global generator.
+            seed: Seed of all draws; None draws one from torch's global generator.
 
         Raises:
             ValueError: If there is no simulator, a refinement is asked for, or fewer

@@ -53,7 +53,7 @@ class Objective:
         evaluate: Simulate actions (k, action_dim), all at the same parameters, also
             from call to call.
         num_evaluations: Actions that may be evaluated.
-        seed: Of what is random in the search.
+        seed: Seed of the search's draws.
         min_probability_valid: Share of measurements that a choice needs.
         known: Evaluations to begin with; None for none.
     """

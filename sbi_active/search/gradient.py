@@ -53,7 +53,7 @@ class GradientSearch(SequentialSearch):
     Args:
         num_rounds: Rounds after the first.
         num_finalists: Actions to compare in the end.
-        num_starts: Of an ascent.
+        num_starts: Number of starts of an ascent.
 
     References:
         Klein et al., arXiv 2602.06900 (design by gradients of neural estimates);
@@ -124,10 +124,12 @@ def ascend(
     """Return points that rose from permitted starts (s, dim), shape (s, dim).
 
     Args:
-        score: Of points (s, dim), differentiable in the first entries, shape (s,).
+        score: Score of points (s, dim), differentiable in the first entries, shape
+            (s,).
         start: Shape (s, dim).
         num_continuous: Entries that move, in a unit cube.
-        permitted: Of points (s, dim), shape (s,), bool.
+        permitted: Function of points (s, dim) that says which are permitted, shape
+            (s,), bool.
         repulsion: The penalty on two points that coincide, in units of the score.
     """
     c = num_continuous

@@ -26,7 +26,7 @@ class Progress(NamedTuple):
 
     Attributes:
         objective: What it maximizes.
-        coordinates: Of the actions.
+        coordinates: Coordinates of the actions.
         found: Evaluations that are numbers.
     """
 

@@ -57,13 +57,14 @@ def check_simulator(
     Args:
         simulator: ``simulator(theta, action)``, see
             :class:`.Simulator`.
-        prior: Over the parameters.
+        prior: Prior of the parameters.
         actions: What the robot may do; the values of a discrete space are all run.
         num_rows: Rows a check, at least 16.
-        max_seconds: Of simulation time; a slow simulator gets fewer rows, 16 at least.
+        max_seconds: Seconds of simulation time; a slow simulator gets fewer rows, 16 at
+            least.
         num_simulations: That the campaign needs, for :attr:`SimulatorReport.minutes`.
         workers: Where they will run, or the number of calls at a time.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Example:
         >>> from sbi.utils import BoxUniform

@@ -76,9 +76,9 @@ def played(
     """Return the signals of actions as inputs and input_times.
 
     Args:
-        space: Of the actions.
+        space: Space of the actions.
         action: Shape (n, action_dim); equal ones are generated once.
-        dtype: Of the series.
+        dtype: Type of the series.
     """
     each, place = torch.unique(action, dim=0, return_inverse=True)
     return {
@@ -134,7 +134,7 @@ def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
 
     Args:
         arrays: From :func:`as_arrays`.
-        i: Of the row.
+        i: Index of the row.
     """
     return {
         name: value.copy() if name == "input_times" else _row(value, i)

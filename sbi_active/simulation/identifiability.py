@@ -93,15 +93,15 @@ def find_undetermined(
 
     Args:
         simulate: The simulator.
-        prior: Over its parameters.
-        actions: To try, shape (a, action_dim); the first 16 are.
+        prior: Prior of its parameters.
+        actions: Actions to try, shape (a, action_dim); the first 16 are.
         names: One a parameter.
         skip: Parameters that are left alone, since they change nothing anyhow.
         num_rows: Rows a call of the simulator; it is called 2 d + 2 times, and twice
             for what is found.
-        num_numbers: Of an outcome; many of them get fewer rows.
+        num_numbers: Number of an outcome's numbers; many of them get fewer rows.
         num_permitted: Actions that are permitted; None is endless.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Returns:
         One a group of parameters; empty where all are told apart.

@@ -37,7 +37,7 @@ class Simulations:
         x: Outcomes, shape (n, *x_shape), float32; NaN where there is no measurement.
         status: An :class:`Outcome` a row, shape (n,), int8; None reads it from x, NaN
             throughout being invalid.
-        tracebacks: Of the rows that failed, by index.
+        tracebacks: Tracebacks of the rows that failed, by index.
     """
 
     theta: Tensor

@@ -12,11 +12,11 @@ LINES = 10  # of actions without a measurement
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatorReport:
-    """What was seen of a simulator; print it.
+    """Findings about a simulator; ``print`` shows them.
 
     Attributes:
         num_rows: Rows that each check simulated.
-        x_shape: Of one outcome; None where there was none.
+        x_shape: Shape of one outcome; None where there was none.
         output: Type of the simulator's output, "torch.float32".
         takes_seeds: Whether it is given one seed a row.
         is_deterministic: Whether two seeds gave identical x.
@@ -33,9 +33,9 @@ class SimulatorReport:
         seconds_batch: Time of ``num_rows`` rows at once.
         seconds_row: Time of a call with one row.
         seconds_round: Measured wall time of a campaign's round; None where it was not.
-        num_rounds: Of that campaign.
-        num_simulations: That a campaign needs.
-        num_workers: That share them.
+        num_rounds: Rounds of that campaign.
+        num_simulations: Simulations that a campaign needs.
+        num_workers: Workers that share them.
         noiseless: Numbers of x, flattened, that two seeds leave as they are while
             others change.
         defects: What keeps a campaign from working.

@@ -29,7 +29,7 @@ class ContrastiveGain(Contrast):
 
     Args:
         num_contrastive: L.
-        seed: Of the draws.
+        seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 
     References:

@@ -30,7 +30,7 @@ class LikelihoodGain(Contrast):
 
     Args:
         num_contrastive: L.
-        seed: Of the draws.
+        seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 
     References:

@@ -19,7 +19,7 @@ class Completeness:
     """How probable a complete outcome of one candidate is.
 
     Attributes:
-        share: Of a row's outcomes that are complete, shape (n,).
+        share: Share of a row's outcomes that are complete, shape (n,).
         counted: Rows that are not missing, shape (n,).
         smooth: Its log probability as a function of the parameters, where it is random.
     """

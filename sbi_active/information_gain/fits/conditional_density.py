@@ -71,8 +71,8 @@ class _Residual:
     Attributes:
         location: m, shape (s,).
         factor: L, shape (s, s).
-        slope: Of log s in features of x; None where s is 1.
-        offset: Of log s.
+        slope: Slope of log s in features of x; None where s is 1.
+        offset: Offset of log s.
     """
 
     location: Tensor

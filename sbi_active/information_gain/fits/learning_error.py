@@ -33,8 +33,9 @@ def learning_error(
         slope: J, shape (n, q, d).
         z: Coordinates of the parameters, shape (n, d).
         difference: d, shape (n, q); zero for incomplete pairs.
-        residual: Of the pairs' averages, shape (n, q); zero where there is none.
-        share: Of a pair that is complete, shape (n,).
+        residual: Residual of the pairs' averages, shape (n, q); zero where there is
+            none.
+        share: Share of a pair that is complete, shape (n,).
 
     Returns:
         Shape (n,), nats, of mean zero; it adds to errors and leaves the estimate.

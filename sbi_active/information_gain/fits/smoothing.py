@@ -28,10 +28,10 @@ class Learned:
         simulations: In whitened coordinates with mean and noise, x of shape (a, n, q).
         score: Leave-one-out mean squares over their expectation under the noise, near 1
             where smoothing misses nothing, shape (a, q).
-        difference: Of the pairs, of unit mean square; zero for incomplete ones,
-            (a, n, q).
-        residual: Of the pairs' averages to the smoothed mean; zero where there is
-            none, shape (a, n, q).
+        difference: Difference of each pair, of unit mean square; zero for incomplete
+            ones, (a, n, q).
+        residual: Residual of each pair's average to the smoothed mean; zero where there
+            is none, shape (a, n, q).
     """
 
     simulations: CandidateSimulations

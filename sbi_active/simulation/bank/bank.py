@@ -42,12 +42,13 @@ class Bank:
     Args:
         path: Folder, in which the bank is the file ``store.db``; made where there is
             none and ``simulator`` is given. Or the store of a campaign.
-        simulator: Whose rows these are. Its name, settings and source are compared
+        simulator: Simulator of these rows. Its name, settings and source are compared
             with those in the bank.
-        version: Of the simulator, yours; given, it stands for the source code.
+        version: Version of the simulator, yours; given, it stands for the source code.
         parameter_names: One a parameter; None takes those of the simulator.
         created: Date to note in a new bank.
-        name: Of the bank in its file, which may hold several, as a campaign's does.
+        name: Name of the bank in its file, which may hold several, as a campaign's
+            does.
 
     Attributes:
         path: The folder.
@@ -162,11 +163,11 @@ class Bank:
         """Store simulations; they are on the disk when this returns.
 
         Args:
-            simulations: Of this bank's simulator.
-            seed: That they were simulated with.
-            proposal: That theta was drawn from; None where it is not known, and then
-                the rows cannot be reweighted.
-            label: Of the proposal, "prior" or "round 3"; given with it.
+            simulations: Simulations of this bank's simulator.
+            seed: Seed that they were simulated with.
+            proposal: Proposal that theta was drawn from; None where it is not known,
+                and then the rows cannot be reweighted.
+            label: Label of the proposal, "prior" or "round 3"; given with it.
             log_action: Log density, or log mass, of the actions, a number or (n,).
 
         Returns:
@@ -195,9 +196,10 @@ class Bank:
         """Return this bank as a store for simulations whose theta has one proposal.
 
         Args:
-            proposal: As in :meth:`append`.
-            label: As in :meth:`append`.
-            log_action: As in :meth:`append`; a tensor is indexed as the run's rows are.
+            proposal: Proposal that theta was drawn from, as in :meth:`append`.
+            label: Label of the proposal, as in :meth:`append`.
+            log_action: Log density of the actions, as in :meth:`append`; a tensor is
+                indexed as the run's rows are.
 
         Example:
             ``simulate(..., store=bank.drawn_from(prior, label="prior"))``

@@ -32,7 +32,7 @@ class ReusedRows:
         rows: Their positions, shape (k,), int64.
         weights: Sum to one, shape (k,), float64.
         denominator: "mixture" of all proposals, or each row's "own" proposal.
-        share: Of the weight, by label of the proposal.
+        share: Share of the weight, by label of the proposal.
     """
 
     bank: Bank
@@ -61,7 +61,7 @@ class ReusedRows:
 
         Args:
             num_rows: Rows to return.
-            seed: Of the draw and the order.
+            seed: Seed of the draw and the order.
 
         References:
             Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.

@@ -26,12 +26,12 @@ class Rows:
 
     Args:
         store: The file.
-        name: Of the bank.
+        name: Name of the bank.
 
     Attributes:
-        store: As given.
-        name: As given.
-        key: Of the bank's header.
+        store: File with the segments.
+        name: Name of the bank.
+        key: Key of the bank's header.
     """
 
     def __init__(self, store: Store, name: str) -> None:

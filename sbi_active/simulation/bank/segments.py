@@ -42,10 +42,10 @@ class Segment:
     Attributes:
         number: Its place among those of the bank, from 1.
         num_rows: Rows in it.
-        counts: Of rows by outcome.
+        counts: Counts of rows by outcome.
         run: Name of the run that its rows belong to.
-        seed: Of the run.
-        label: Of the run's proposal; "" where it is not known.
+        seed: Seed of the run.
+        label: Label of the run's proposal; "" where it is not known.
     """
 
     number: int
@@ -63,7 +63,7 @@ def write_segment(
 
     Args:
         store: The file.
-        name: Of the bank.
+        name: Name of the bank.
         run: Its ``run``, ``seed`` and ``label``.
         columns: Arrays of the same length, by name.
     """
@@ -106,10 +106,10 @@ def read_columns(
 
     Args:
         store: The file.
-        name: Of the bank.
+        name: Name of the bank.
         segment: Which one.
-        names: Of the columns.
-        shapes: Of theta, action and x, of a row.
+        names: Names of the columns.
+        shapes: Shapes of theta, action and x, of a row.
 
     Raises:
         CorruptSegmentError: If one is not what was written.

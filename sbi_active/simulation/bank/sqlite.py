@@ -56,7 +56,7 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
 
     Args:
         path: The file.
-        mode: As SQLite names it, "rw" or "rwc".
+        mode: Mode as SQLite names it, "rw" or "rwc".
         timeout: Seconds to wait for others.
 
     Raises:
@@ -140,7 +140,7 @@ def is_locked(folder: Path) -> bool:
     """Return whether somebody has the right to write, without taking it.
 
     Args:
-        folder: Of a store.
+        folder: Folder of a store.
     """
     if not (folder / LOCK).exists():
         return False

@@ -49,12 +49,12 @@ class Store:
     """A file of records in a folder. Any number of processes read, and one writes.
 
     Args:
-        folder: That has or gets the file.
-        what: It is said to be in errors, "bank" or "campaign".
+        folder: Folder that has or gets the file.
+        what: Name of the store in errors, "bank" or "campaign".
         make: Make the file where there is none.
 
     Attributes:
-        folder: As given.
+        folder: Folder of the file.
         path: The file.
 
     Raises:
@@ -183,8 +183,8 @@ class Store:
 
         Args:
             table: One of the tables.
-            kind: Of the record.
-            number: Of the record.
+            kind: Kind of the record.
+            number: Number of the record.
             content: Bytes, or JSON data of an object.
         """
         if isinstance(content, dict):

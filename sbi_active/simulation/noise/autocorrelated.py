@@ -92,11 +92,12 @@ class AutocorrelatedNoise(ScaleNoise):
                 channel, whose sizes are then unknown one by one.
             correlation_time: Bounds, s; well below the distance of samples, errors are
                 independent.
-            measurement_sd: Of the sensor alone, where it is known, a number or one a
-                channel. Errors beyond it are the simulator's, and a verdict then says
-                what helps to predict and what is probably the cause (:mod:`.misfit`).
+            measurement_sd: Standard deviation of the sensor alone, where it is known, a
+                number or one a channel. Errors beyond it are the simulator's, and a
+                verdict then says what helps to predict and what is probably the cause
+                (:mod:`.misfit`).
             num_sds: Nodes of the grid over standard deviations.
-            num_times: The same over correlation times.
+            num_times: Nodes of the grid over correlation times.
 
         Raises:
             ValueError: If bounds are not positive and in order.

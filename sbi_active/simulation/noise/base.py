@@ -73,8 +73,8 @@ class NoiseModel(ABC):
             mean: Noise-free outputs, shape (n, *x_shape).
             seeds: One a row, shape (n,), and row i depends on ``seeds[i]`` alone; None
                 draws from torch's global generator.
-            times: Of x's first axis in seconds, shape (T,) or one set a row (n, T);
-                None takes those of the model.
+            times: Times of x's first axis in seconds, shape (T,) or one set a row (n,
+                T); None takes those of the model.
             parameters: Shape (p,), or one set a row (n, p); None takes the model's own,
                 or for each row a draw from the posterior.
 
@@ -96,8 +96,9 @@ class NoiseModel(ABC):
         Args:
             x: Observations, shape (n, *x_shape); NaN where a number was not observed.
             mean: Noise-free outputs, broadcastable to x.
-            times: As in :meth:`sample`.
-            parameters: As in :meth:`sample`; None with a posterior gives the marginal.
+            times: Times of x's first axis, as in :meth:`sample`.
+            parameters: Parameters of the noise, as in :meth:`sample`; None with a
+                posterior gives the marginal.
 
         Returns:
             Shape (n,), float64, nats.

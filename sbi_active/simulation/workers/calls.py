@@ -43,7 +43,7 @@ class Call:
         theta: Parameters, shape (k, theta_dim).
         action: Actions, shape (k, action_dim).
         seeds: One a row, shape (k,), int64.
-        seed: Of the whole set.
+        seed: Seed of the whole set.
         draws: Where the random numbers come from: "seeds" passes those to the
             simulator; "blocks" forks the global generators for each block of 256 rows,
             and the rows are whole blocks; "alone" forks them for the single row.

@@ -44,7 +44,7 @@ class IdleWorkers:
         """Let workers wait that have answered all their calls.
 
         Args:
-            key: As for :meth:`take`.
+            key: Digest of the simulator and its surroundings, as for :meth:`take`.
             workers: Loaded with that simulator.
             at_most: How many of them may wait; the others end.
         """

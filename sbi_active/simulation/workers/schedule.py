@@ -37,7 +37,7 @@ class Schedule:
     Args:
         theta: Shape (n, theta_dim).
         action: Shape (n, action_dim).
-        seed: Of the whole set.
+        seed: Seed of the whole set.
         has_seeds: Whether the simulator takes them.
         batch_size: Rows a call; None measures how many take ``BATCH_SECONDS``.
         pace: Sizes the calls where no batch size is given, as one worker needs it:
@@ -49,7 +49,7 @@ class Schedule:
     Attributes:
         x: Shape (n, *x_shape), NaN where there is none; None until a call succeeds.
         status: Shape (n,), int8, -1 for rows that are not finished.
-        tracebacks: Of the missing rows.
+        tracebacks: Tracebacks of the missing rows.
         faults: How many rows are missing for which fault.
     """
 

@@ -25,7 +25,7 @@ class StoredRows(TypedDict):
         action: Actions, shape (k, action_dim).
         x: Outcomes, shape (k, *x_shape), float32.
         status: An :class:`.Outcome` a row, shape (k,), int8.
-        seed: Of the whole set.
+        seed: Seed of the whole set.
     """
 
     index: Tensor
