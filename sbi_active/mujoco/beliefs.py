@@ -35,15 +35,15 @@ def belief_to_parameters(
     reads the file, in the order of the parameters, which ``save_to_disk`` would sort.
 
     Args:
-        belief: Over the free parameters in the order of ``params.as_vector()``, with
-            ``sample``.
+        belief: Belief over the free parameters in the order of
+            ``params.as_vector()``, with ``sample``.
         params: The ``ParameterDict`` that the belief began with, whose shapes, frozen
             parameters and modifiers are kept; None makes one of single numbers.
         names: One a parameter where there are no ``params``; None takes those of the
             belief.
-        level: Of the intervals.
-        seed: Of the draws.
-        path: Of a YAML file to write.
+        level: Probability of the intervals.
+        seed: Seed of the draws.
+        path: Path of a YAML file to write.
 
     Raises:
         ValueError: If their number of parameters differs, or there are no names.
@@ -113,11 +113,11 @@ def randomization(
     """Return what to randomize a simulation by, as wide as a belief is.
 
     Args:
-        belief: With ``sample``; a prior's box will do.
+        belief: Belief with ``sample``; a prior's box will do.
         levels: Probabilities of the ranges, each in (0, 1).
         names: One a parameter; None takes those of the belief.
         num_samples: Joint draws to return.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If a level is no probability, or there are no names.

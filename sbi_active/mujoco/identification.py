@@ -27,11 +27,11 @@ def identify_robot(
     lack beside the parameters.
 
     Args:
-        robot: Of :func:`.from_mjcf` or :func:`.from_sysid`.
-        trials: In place of the robot's recordings.
+        robot: Robot of :func:`.from_mjcf` or :func:`.from_sysid`.
+        trials: Trials in place of the robot's recordings.
         beside: Effects that may be there; None takes friction loss, quadratic damping
             and stiffness of each joint, and a lag of each drive.
-        seed: Of all draws.
+        seed: Seed of all draws.
 
     Raises:
         ValueError: If there are no recordings.

@@ -29,10 +29,10 @@ def warn_of_idle(
     actions where there are none; where neither says how a trial is run, nothing is.
 
     Args:
-        simulator: Of :class:`.MujocoFunction`.
-        prior: A box.
-        actions: Permitted ones.
-        trials: Recorded ones.
+        simulator: Simulator of a :class:`.MujocoFunction`.
+        prior: Prior, a box.
+        actions: Permitted actions.
+        trials: Recorded trials.
     """
     run: dict[str, Any] = {}
     if trials is not None:

@@ -42,15 +42,15 @@ class MotionLimits:
     robot: leave a margin, and keep the robot's own guards.
 
     Args:
-        robot: Of :func:`.from_mjcf` or :func:`.from_sysid`.
+        robot: Robot of :func:`.from_mjcf` or :func:`.from_sysid`.
         position: Limits (low, high) by joint, rad or m; None takes the ranges of those
             joints that are limited in the MJCF. ``{}`` for none.
         velocity: Largest speed by joint, rad/s or m/s.
         torque: Largest force by actuator, N m or N, of the actuator's own; None takes
             the ``forcerange`` of the MJCF where it has one.
-        belief: Of the parameters; None takes the prior.
-        num_draws: Of the parameters. The first alone refuses most.
-        seed: Of the draws.
+        belief: Belief over the parameters; None takes the prior.
+        num_draws: Draws of the parameters. The first alone refuses most.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If a name does not exist, a limit is not positive or empty, or there

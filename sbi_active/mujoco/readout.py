@@ -25,10 +25,10 @@ def held(series: Array, own: Array, num: int, step: float) -> Array:
     """Return a series (n, m), held between the points of its grid, at every step.
 
     Args:
-        series: Shape (n, m).
-        own: Its grid, shape (m,).
-        num: Of steps from the grid's first point.
-        step: Of the simulation.
+        series: Series, shape (n, m).
+        own: Grid of the series, shape (m,).
+        num: Number of steps from the grid's first point.
+        step: Time step of the simulation.
     """
     times = own[0] + step * np.arange(num)
     slack = ON_TIME * min(step, own[1] - own[0])

@@ -107,9 +107,9 @@ def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
 
     Args:
         model: Compiled.
-        name: Of the actuator.
-        values: Of any shape.
-        what: Where they come from.
+        name: Name of the actuator.
+        values: Values of the control, of any shape.
+        what: Source of the values, for the error.
     """
     i = names_of(model, "actuator").index(name)
     if not model.actuator_ctrllimited[i]:

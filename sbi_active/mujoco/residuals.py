@@ -52,7 +52,7 @@ def from_residuals(residual_fn: Any, params: Any, *, noise: Any) -> Robot:
     Args:
         residual_fn: ``residual_fn(x, params)`` of ``build_residual_fn``.
         params: A ``ParameterDict``.
-        noise: Of the residuals.
+        noise: Noise of the residuals.
 
     Raises:
         ValueError: If there is no noise.

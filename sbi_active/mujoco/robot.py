@@ -107,10 +107,11 @@ def from_mjcf(
             joints (start positions), joints with ``" velocity"`` behind, actuators
             (a control that is held), or "model". A name that a joint and an actuator
             share is the actuator's; the joint's start is then "hinge position".
-        times: At which sensors are read, s from the start of a trial, shape (k,); None
+        times: Times of the readings, s from the start of a trial, shape (k,); None
             takes those of the inputs, of the recordings, or they come with the trials.
-        noise: Of the sensors, as ``SimulatorModel`` takes it, or standard deviations by
-            sensor; None takes ``noise`` of the sensors in the MJCF, where it is given.
+        noise: Noise of the sensors, as ``SimulatorModel`` takes it, or standard
+            deviations by sensor; None takes ``noise`` of the sensors in the MJCF, where
+            it is given.
         start: Start of every trial whose action or recording does not say: positions,
             velocities, controls that are held ("motor control") and poses of mocap
             bodies ("target mocap[0]") by name, or the name of a keyframe, which gives

@@ -59,7 +59,7 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
     """Return a source with sensors of those joints that are named in their place.
 
     Args:
-        source: Of the model.
+        source: Source of the model.
         model: Compiled.
         sensors: Names; None for those that the model has.
 

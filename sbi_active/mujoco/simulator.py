@@ -69,9 +69,9 @@ class MujocoFunction:
 
     Args:
         machines: Models of one set of parameters.
-        channels: What is returned.
+        channels: Channels that are returned.
         roles: Meaning of each entry of an action; "" for one that only names a trial.
-        times: At which it is returned where trials do not say, shape (k,).
+        times: Times of the readings where trials do not say, shape (k,).
         start: Start states of all trials that do not say, by name: positions,
             velocities, controls that are held ("motor control"), poses of mocap bodies
             ("target mocap[0]" to "target mocap[6]").
@@ -83,8 +83,8 @@ class MujocoFunction:
             of an action is its number.
 
     Attributes:
-        machines: As given.
-        channels: As given.
+        machines: Models of one set of parameters.
+        channels: Channels that are returned.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class MujocoFunction:
             action: Shape (n, action_dim).
             inputs: Controls by actuator, shape (n, m), held between their times.
             input_times: Shape (m,); the simulation starts at the first.
-            times: Of the readings, shape (n, k).
+            times: Times of the readings, shape (n, k).
             start: By name of a joint, or with " velocity", shape (n,).
             model: Changes of the model, {:class:`.ModelChange`: (n, k)}.
             force: Generalized forces, {:class:`.Force`: (n, k)}.
@@ -294,7 +294,7 @@ def _alike(
 
     Args:
         which: Model of each row, (n,).
-        times: Of its readings since the start, (n, k).
+        times: Times of its readings since the start, (n, k).
         fewest: Rows of one length, on average, from which lengths run apart.
     """
     last = np.nanmax(times, 1, initial=0.0)

@@ -71,10 +71,10 @@ def from_sysid(
         actions: What the robot may do; None takes the recorded sequences, of which the
             action is the number. Entries are those of :class:`.MujocoFunction`; "model"
             is the number of a ``ModelSequences``.
-        noise: Of the signals, one or one a signal; None takes autocorrelated errors of
-            unknown size, one a signal, and unknown correlation time. Of a
-            ``residual_fn`` it is needed.
-        threads: Of MuJoCo's rollout.
+        noise: Noise of the signals, one or one a signal; None takes autocorrelated
+            errors of unknown size, one a signal, and unknown correlation time. A
+            ``residual_fn`` needs it.
+        threads: Threads of MuJoCo's rollout.
 
     Raises:
         ValueError: If signals differ between sequences, a signal is not one of the

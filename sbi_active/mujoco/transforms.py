@@ -29,8 +29,8 @@ class SignalReadout:
     """What a transform does to predicted signals, by channel.
 
     Attributes:
-        names: Of the channels' signals.
-        stamp: By how much a reading is stamped late, (c,), s.
+        names: Names of the channels' signals.
+        stamp: Time by which a reading is stamped late, (c,), s.
         delays: Place in (theta, fixed values) of each channel's delay, -1 for none.
         scales: Pairs of a place and whether it divides, a list a channel.
         shifts: Pairs of a place and a sign, those that are divided too, a list each.

@@ -80,7 +80,7 @@ class Belief(Distribution, ABC):
 
         Args:
             num_samples: Number of draws n.
-            seed: Of the draws.
+            seed: Seed of the draws.
 
         Returns:
             Shape (n, theta_dim), float32.
@@ -285,7 +285,7 @@ def names_of(belief: Distribution, num: int) -> list[str]:
 
     Args:
         belief: The belief, or a prior.
-        num: Of its parameters.
+        num: Number of its parameters.
 
     Example:
         >>> names_of(torch.distributions.Normal(0.0, 1.0), 2)

@@ -43,16 +43,17 @@ class Diagnostics:
         trustworthy: Whether nothing that was checked speaks against the belief; None
             where nothing was.
         warnings: What speaks against it and what to do, a sentence each.
-        network_warnings: Of the amortized network beside a refined belief.
+        network_warnings: Warnings of the amortized network beside a refined belief.
         assumptions: By name, each with the figure that it was judged by.
         num_simulations: Rows that the belief cost.
         num_missing: Those of them lost to faults of the simulator.
-        effective_sample_size: Of the weighted draws behind it.
+        effective_sample_size: Effective number of the weighted draws behind it.
         error_nats: Expected divergence from the belief of endless simulations.
-        error_nats_if_explained: The same, were the observations as simulations are.
+        error_nats_if_explained: Expected divergence if the observations were as
+            simulations are.
         tail_probability: How often a simulation from the belief lies as far out as all
             trials together do.
-        tail_probability_of_trial: The same of each trial.
+        tail_probability_of_trial: Tail probability of each trial alone.
         combinations: What is known of parameters that are not known one by one, and
             what is not; says nothing where each is.
         figures: Further ones, by the method; each is an attribute as well.

@@ -75,7 +75,8 @@ class UnknownCombination:
 
     Attributes:
         text: The formula, or names.
-        width: As of :class:`KnownCombination`; the smallest of several parameters.
+        width: Width as in :class:`KnownCombination`; the smallest of several
+            parameters.
         several: Whether these are parameters, each by itself.
     """
 
@@ -144,10 +145,10 @@ def combinations_of(
     what this says is open; :func:`.check_simulator` tells whether any action could.
 
     Args:
-        belief: After some trials.
-        prior: Before any.
-        names: One a parameter; None is theta_1, theta_2, ...
-        seed: Of the draws.
+        belief: Belief after some trials.
+        prior: Prior before any trial.
+        names: Names of the parameters; None is theta_1, theta_2, ...
+        seed: Seed of the draws.
 
     References:
         Gutenkunst et al., Universally sloppy parameter sensitivities in systems biology
@@ -202,8 +203,8 @@ def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) ->
 
     Args:
         belief: A :class:`.Belief`.
-        names: One a parameter, or None.
-        seed: Of the draws.
+        names: Names of the parameters, or None.
+        seed: Seed of the draws.
     """
     try:
         found = combinations_of(belief, belief.prior, names, seed=seed)

@@ -128,9 +128,9 @@ def require_width(
     """Raise where a prior is empty, or has no width that float32 can hold.
 
     Args:
-        prior: Of the parameters.
-        names: Of the parameters, for the error.
-        seed: Of some draws.
+        prior: Prior of the parameters.
+        names: Names of the parameters, for the error.
+        seed: Seed of some draws.
     """
     enumeration = Enumeration.of(prior)
     if enumeration is not None:

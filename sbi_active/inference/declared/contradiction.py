@@ -55,7 +55,7 @@ class Contradiction:
     Attributes:
         inflation: Factor s of the noise's standard deviation.
         probability: Tail probability of all residuals under the declared noise.
-        probability_of_trial: The same of each trial.
+        probability_of_trial: Tail probability of each trial's residuals.
         trials: The trials that contradict, in a clause.
     """
 

@@ -74,7 +74,8 @@ def refine_declared(
         action: Executed actions, shape (t, action_dim).
         x: Their outcomes, shape (t, *x_shape).
         hints: Where else to look first.
-        past: Of an earlier call: draws to go on from, and what needs no simulation.
+        past: State of an earlier call: draws to go on from, and what needs no
+            simulation.
         settings: Budget.
         seed: Seed of everything random.
 

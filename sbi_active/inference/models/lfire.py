@@ -51,7 +51,7 @@ class LFIRE:
         powers: Exponents.
         num_marginal: Rows of the marginal in one regression, at most.
         num_penalties: Strengths to choose from, 0.1 to 10,000 inverse.
-        num_folds: Of the cross-validation.
+        num_folds: Number of folds of the cross-validation.
 
     References:
         Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022, who take a
@@ -95,7 +95,7 @@ class LFIRE:
         Args:
             own: Summaries of its outcomes, shape (n, q).
             marginal: Summaries of outcomes of the belief, shape (m, q).
-            seed: Of the folds.
+            seed: Seed of the folds.
         """
         fewest = FEWEST * self.num_folds
         if min(len(own), len(marginal)) < fewest:

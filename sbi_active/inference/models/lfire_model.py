@@ -20,11 +20,11 @@ class LFIREModel:
     r"""Log ratios of particles at the actions that were simulated.
 
     Attributes:
-        settings: Of the regressions.
+        settings: Settings of the regressions.
         particles: Parameter sets, shape (p, theta_dim).
         action: Shape (a, action_dim).
-        center: Of the outcomes of each action, shape (a, x_dim).
-        scale: Alike.
+        center: Center of the outcomes of each action, shape (a, x_dim).
+        scale: Scale of the outcomes of each action, shape (a, x_dim).
         log_ratios: A row an action, an entry a particle.
     """
 

@@ -40,7 +40,8 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
     given the action, or over all rows.
 
     Args:
-        settings: Of the mixture; ``baseline`` and ``scaling`` are those of the outcome.
+        settings: Settings of the mixture; ``baseline`` and ``scaling`` are those of the
+            outcome.
         x: Training outcomes, shape (n, x_dim); NaN throughout a row where there was no
             measurement.
         condition: Packed (theta, action), shape (n, theta_dim + action_dim).

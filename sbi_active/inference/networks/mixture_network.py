@@ -55,14 +55,15 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         condition: Training conditions, shape (n, condition_dim).
         action_dim: Numbers of the action at the end of a condition; None leaves them
             unknown, and the next three arguments without effect.
-        scaling: As in :class:`.MixtureDensity`, with all that follow.
-        whiten: Of theta.
+        scaling: Scaling of the condition, as in :class:`.MixtureDensity`; so are all
+            that follow.
+        whiten: Whether theta is whitened.
         baseline: Gaussian posterior that the network corrects.
         activation: Name of the function between layers.
         hidden_features: Width of each hidden layer.
         num_components: Gaussian components K.
-        embedding_net: Of the condition, which is then scaled over all rows, without a
-            baseline.
+        embedding_net: Embedding network of the condition, which is then scaled over all
+            rows, without a baseline.
     """
 
     condition_mean: Tensor

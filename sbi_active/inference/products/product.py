@@ -93,7 +93,7 @@ class Product:
     the posterior. The factors are exact products; only q is learned.
 
     Args:
-        coordinates: Of the prior.
+        coordinates: Coordinates of the prior.
         model: q, up to factors without theta.
         trials: The history.
         region: R; None is the whole support.

@@ -58,7 +58,7 @@ def round_rows(
         action: Shape (n, action_dim), or (action_dim,) for all rows.
         prior: Gives theta_dim and the support.
         x_shape: Shape of earlier outcomes; None takes that of these.
-        action_dim: Of earlier actions; None takes that of these.
+        action_dim: Dimension of earlier actions; None takes that of these.
         exclude_invalid: Drop rows in which a number is missing.
         may_be_invalid: Whether it is plausible that no row has a measurement, as under
             a belief from trials that had none.

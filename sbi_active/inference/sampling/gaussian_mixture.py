@@ -22,7 +22,7 @@ class GaussianMixture:
         log_weight: Shape (k,).
         mean: Shape (k, d).
         factor: Lower Cholesky factors, shape (k, d, d).
-        log_likelihood: Of the points it was fitted to, a point.
+        log_likelihood: Log likelihood of the points it was fitted to, a point.
     """
 
     log_weight: Array

@@ -80,10 +80,10 @@ def descend(
     Args:
         problem: The model.
         u: Starts, shape (n, dim).
-        whiten: Of the residuals.
-        step: Of finite differences.
+        whiten: Whitener of the residuals.
+        step: Step of finite differences.
         iterations: At most; a start that is expected to gain nothing stops.
-        center: Of the penalty, shape (n, dim); None has that of the prior.
+        center: Center of the penalty, shape (n, dim); None has that of the prior.
         secant: Derivatives are updated from the steps made, by Broyden's rule, and not
             computed again.
         known: Whitened residuals at the starts and their derivatives, shapes (n, N) and

@@ -32,13 +32,13 @@ class NormalCoordinates:
     is whitened together would be oblique, and a smooth density would be cut.
 
     Args:
-        coordinates: Of the prior.
+        coordinates: Coordinates of the prior.
         rng: Source of the draws behind its moments.
         keeps_edges: Whether axes keep two bounds.
 
     Attributes:
-        low: Bounds of a search, shape (d,).
-        high: As low.
+        low: Lower bounds of a search, shape (d,).
+        high: Upper bounds of a search, shape (d,).
         center: Mean of the normal that stands for the prior, shape (d,).
         precision: Its inverse variance, shape (d,): 0 of a uniform number, which has
             its bounds, and up to 1 of one that is narrow between them.

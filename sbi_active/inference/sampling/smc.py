@@ -33,15 +33,16 @@ class Bridged:
     """Particles of a density.
 
     Attributes:
-        u: Equally weighted, shape (n, d).
-        log_likelihood: Of each, shape (n,).
+        u: Particles of equal weight, shape (n, d).
+        log_likelihood: Log likelihood of each particle, shape (n,).
         log_evidence: Log of the integral of the density, nats.
-        standard_error: Of log_evidence.
-        effective_sample_size: Of the particles, by families and what moves forgot.
-        acceptance: Of the last moves.
+        standard_error: Standard error of log_evidence.
+        effective_sample_size: Effective number of the particles, by families and what
+            moves forgot.
+        acceptance: Acceptance rate of the last moves.
         memory: Largest correlation with where the moves of a step began; those of the
             last may end sooner, where its particles share little.
-        num_steps: Between the two densities.
+        num_steps: Number of steps between the two densities.
     """
 
     u: Array
@@ -171,7 +172,7 @@ class Moves(Protocol):
         Args:
             u: Particles, shape (n, d).
             weight: Their weights at this step, which sum to 1, shape (n,).
-            power: Of the target at this step.
+            power: Power of the target at this step.
         """
         ...
 

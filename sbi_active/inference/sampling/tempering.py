@@ -21,11 +21,11 @@ def largest_power(
     Args:
         suffices: Whether a power of a likelihood, or of a ratio of densities, leaves
             draws enough effective; true up to the answer and false beyond.
-        start: Taken to suffice.
-        end: Returned where it suffices.
+        start: Power that is taken to suffice.
+        end: Power that is returned where it suffices.
         least: Gone beyond the start even where that does not suffice, so that a
             sequence of steps moves on.
-        num_steps: Of the bisection.
+        num_steps: Number of steps of the bisection.
     """
     if suffices(end):
         return end

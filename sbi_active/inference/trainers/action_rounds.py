@@ -33,11 +33,11 @@ class ActionRounds(ActiveInference):
     round's rows, a network built anew, plain maximum likelihood.
 
     Args:
-        args: Of sbi's trainer. Rounds with actions need a prior with a support. What
-            is trained is a name or a builder of sbi's, or this library's settings; None
-            is sbi's default without actions and the default settings with them. Without
-            a tracker nothing is tracked, so that no folder appears.
-        kwargs: Alike, by name.
+        args: Arguments of sbi's trainer. Rounds with actions need a prior with a
+            support. What is trained is a name or a builder of sbi's, or this library's
+            settings; None is sbi's default without actions and the default settings
+            with them. Without a tracker nothing is tracked, so that no folder appears.
+        kwargs: Arguments of sbi's trainer by name.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331.

@@ -74,8 +74,8 @@ class ASBI(MixtureRounds, NPE_C):
         prior: The prior over parameters. Rounds with actions need one with a support.
         density_estimator: An sbi string or builder, or :class:`MixtureDensity`. None is
             sbi's default ("maf") without actions and ``MixtureDensity()`` with them.
-        args: Further ones of sbi's; without a tracker nothing is tracked.
-        kwargs: Alike, by name.
+        args: Further arguments of sbi's; without a tracker nothing is tracked.
+        kwargs: Further arguments of sbi's by name.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331; Greenberg et al.,

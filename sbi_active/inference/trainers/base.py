@@ -117,10 +117,10 @@ class ActiveInference(ABC):
                 was no measurement.
             action: The executed action, shape (action_dim,) or (1, action_dim); it need
                 not be one of the actions that were asked for.
-            simulator: ``simulator(theta, action)`` to refine the belief with; None
-                takes the word of this round's network.
+            simulator: If given, ``simulator(theta, action)`` to refine the belief
+                with; otherwise use this round's network.
             refinement: Budget of the refinement; None is ``RefinementOptions()``.
-            seed: Of everything random in the refinement; None draws one from torch's
+            seed: Seed of all draws in the refinement; None draws one from torch's
                 global generator.
 
         Returns:
@@ -147,9 +147,9 @@ class ActiveInference(ABC):
 
         Args:
             trials: They replace the history.
-            simulator: As in :meth:`update`, with what follows.
+            simulator: Simulator to refine the belief with, as in :meth:`update`.
             refinement: Budget of the refinement.
-            seed: Of everything random here.
+            seed: Seed of all draws; None draws one from torch's global generator.
 
         Raises:
             ValueError: If there is no trial.

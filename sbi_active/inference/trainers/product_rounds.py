@@ -60,11 +60,11 @@ class ProductRounds(ActionRounds):
     two stages or, from the prior, four; the options' ``num_histories`` is their sum.
 
     Args:
-        args: Of :class:`.ActionRounds`.
+        args: Arguments of :class:`.ActionRounds`.
         posterior: How the belief is sampled: "importance", tempered importance
             sampling; or "kde", the paper's: draws of the belief before times the last
             trial's factor, as a kernel density estimate.
-        kwargs: Of :class:`.ActionRounds`.
+        kwargs: Arguments of :class:`.ActionRounds` by name.
 
     References:
         Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
@@ -108,8 +108,9 @@ class ProductRounds(ActionRounds):
             exclude_invalid_x: With actions, None keeps rows without a measurement for
                 this library's networks, which learn their probability, and drops them
                 for sbi's, with a warning.
-            from_round: As in sbi; without meaning where there are actions.
-            algorithm: As in sbi; None is sbi's.
+            from_round: Round number, as in sbi; without meaning where there are
+                actions.
+            algorithm: Algorithm name, as in sbi; None is sbi's.
             data_device: Where to keep the rows.
             action: Shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.

@@ -45,8 +45,8 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
         prior: The prior over parameters. Rounds with actions need one with a support.
         classifier: An sbi string or builder, or :class:`RatioClassifier`. None is sbi's
             default ("resnet") without actions and ``RatioClassifier()`` with them.
-        args: Further ones of sbi's; without a tracker nothing is tracked.
-        kwargs: Alike, by name.
+        args: Further arguments of sbi's; without a tracker nothing is tracked.
+        kwargs: Further arguments of sbi's by name.
         posterior: How beliefs are sampled, see :class:`.ProductRounds`.
     """
 

@@ -57,8 +57,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
 
     Args:
         prior: The prior over parameters, with a support.
-        settings: Of the logistic regressions; None is ``LFIRE()``.
-        num_particles: In a round; None makes as many as each has simulations.
+        settings: Settings of the logistic regressions; None is ``LFIRE()``.
+        num_particles: Particles of a round; None makes as many as each has simulations.
         tracker: Not used: no network is trained.
         show_progress_bars: Not used.
 
@@ -176,8 +176,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         """Fit the log ratio of every particle at every action.
 
         Args:
-            seed: Of the cross-validation's folds and the choice of marginal rows; None
-                draws one from torch's global generator.
+            seed: Seed of the cross-validation's folds and the choice of marginal rows;
+                None draws one from torch's global generator.
 
         Raises:
             RuntimeError: If there are no simulations.

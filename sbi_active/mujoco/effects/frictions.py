@@ -48,10 +48,10 @@ class FrictionChange(StateChange):
     them dissipate. Writes ``dof_frictionloss`` before every step.
 
     Attributes:
-        names: Of the joints.
-        what: What it follows.
+        names: Names of the joints.
+        what: Quantity that the friction follows.
         low: Lower end of each joint's range, rad or m.
-        high: Upper end.
+        high: Upper end of each joint's range, rad or m.
         speed: :math:`v_s`, rad/s or m/s.
     """
 
@@ -86,10 +86,10 @@ def of_friction(
     """Yield dry friction that follows the state of joints that share each phi.
 
     Args:
-        group: Of joints.
-        sizes: Of the model.
+        group: Group of joints.
+        sizes: Sizes of the model.
         force: One prior deviation.
-        unit: Of a force.
+        unit: Unit of a force.
     """
     model = sizes.model
     dofs = [

@@ -39,8 +39,8 @@ def of_joints(group: Group, sizes: Nominal) -> Iterator[Effect]:
     """Yield the effects of joints that share each phi, or of one.
 
     Args:
-        group: Of joints.
-        sizes: Of the model.
+        group: Group of joints.
+        sizes: Sizes of the model.
     """
     model = sizes.model
     dofs = [

@@ -24,7 +24,7 @@ class Group:
     """Elements that share a phi, or a single one.
 
     Attributes:
-        names: Of the elements.
+        names: Names of the elements.
         label: What effects are called by.
     """
 

@@ -69,14 +69,14 @@ class Model:
     """A compiled model, copies of it, and what writes parameters.
 
     Attributes:
-        base: As compiled; nothing is written into it.
-        writer: Of the parameters.
-        data: To work in.
+        base: Compiled model; nothing is written into it.
+        writer: Writer of the parameters.
+        data: Data to work in.
         positions: Places of the machine's ``qpos`` in that of this model.
-        velocities: The same of its ``qvel``.
+        velocities: Places of the machine's ``qvel`` in that of this model.
         inserted: What it has beyond the machine's model.
         pool: Copies of the base that are written into.
-        datas: To step rows together.
+        datas: Data to step rows together.
         originals: Fields as compiled, of those that are ever written.
     """
 
@@ -96,7 +96,7 @@ class Model:
         """Return a model with its parameters and changes.
 
         Args:
-            number: Of the copy to write into.
+            number: Number of the copy to write into.
             theta: Shape (d,).
             changes: By change, shape (k,).
         """
@@ -119,12 +119,12 @@ class Machine:
     """A model with parameters.
 
     Args:
-        source: Of the model.
-        parameters: In the order of theta.
+        source: Source of the model.
+        parameters: Parameters in the order of theta.
         edit: ``edit(spec, theta)`` of all of them at once, in place of theirs.
 
     Attributes:
-        model: As compiled.
+        model: Compiled model.
     """
 
     def __init__(

@@ -65,8 +65,8 @@ class Bounded:
         name: What reports call it.
         low: Lowest value.
         high: Highest value.
-        unit: Of it.
-        quantity: Whose value it is; None where it edits the spec.
+        unit: Unit of the values.
+        quantity: Quantity whose value it is; None where it edits the spec.
         edit: ``edit(spec, value)`` before the model is compiled; None for a quantity.
     """
 
@@ -164,8 +164,8 @@ def writer_of(
 
     Args:
         spec: Returns a spec that compiles to the model.
-        model: As compiled.
-        parameters: In the order of theta.
+        model: Compiled model.
+        parameters: Parameters in the order of theta.
         edit: ``edit(spec, theta)`` of all parameters at once, in place of theirs.
         text: Returns a spec as another process has it, for parameters that are
             compiled there; None takes ``spec``.
@@ -203,8 +203,8 @@ def renew(model: Any, data: Any) -> None:
     MuJoCo does not renew the mean inertia, by which its solver knows when to stop.
 
     Args:
-        model: Written.
-        data: Of such a model, to work in.
+        model: Model that was written into.
+        data: Data of such a model, to work in.
     """
     mean = float(model.dof_M0.mean()) if model.nv else 0.0
     is_own = abs(model.stat.meaninertia - mean) <= AFFINE * mean

@@ -62,9 +62,10 @@ class Quantity:
     """One number of a model.
 
     Attributes:
-        kind: Of the element: "joint", "body", "actuator", "geom", "tendon", "option".
-        name: Of the element; "option" for those of the whole model.
-        attribute: As in the table above.
+        kind: Kind of the element: "joint", "body", "actuator", "geom", "tendon",
+            "option".
+        name: Name of the element; "option" for those of the whole model.
+        attribute: Attribute of the element, as in the table above.
     """
 
     kind: str

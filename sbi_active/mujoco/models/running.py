@@ -29,10 +29,10 @@ def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -
     """Return what the sensors read, NaN throughout for a row that diverged.
 
     Args:
-        model: Of all rows.
+        model: Model of all rows.
         models: One a row.
         rows: Rows whose controls have shape (n, steps, nu + 7 nmocap).
-        threads: Of MuJoCo's rollout.
+        threads: Threads of MuJoCo's rollout.
 
     Returns:
         Shape (n, steps, sensordata).
