@@ -18,7 +18,8 @@ class MissedTrial:
         position: Place among the held-out trials.
         name: What the trial is called.
         size: Root mean square error; inf where the model is sure of no measurement.
-        unit: Of ``size``: sensor deviations, or the simulator's where it is the draw.
+        unit: Unit of ``size``: sensor deviations, or the simulator's where it is the
+            draw.
         p_value: Probability of an error as large, if the model holds.
         by_both: Whether it is as far outside what the bare model predicts.
     """
@@ -38,8 +39,8 @@ class OutlyingTrial:
     Attributes:
         position: Place among the fitted trials.
         name: What the trial is called.
-        times: Its error on the fit to the others, in medians of theirs.
-        size: The same, root mean square in sensor deviations.
+        times: Error on the fit to the others, in medians of theirs.
+        size: Root mean square of that error, in sensor deviations.
     """
 
     position: int

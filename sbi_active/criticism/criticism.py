@@ -70,7 +70,7 @@ class Criticism:
         model: The simulator, with its measurement noise. A random one without noise is
             the draw itself, and has a synthetic likelihood; the noise of a
             deterministic one without is estimated from repeated trials.
-        prior: Of its parameters.
+        prior: Prior of its parameters.
         trials: Measured trials.
         effects: What the simulator may lack; those of the order of the trials are left
             out where that is unknown.
@@ -85,7 +85,7 @@ class Criticism:
         thin: Leave out samples of trajectories that say again what others say, as the
             bare model's fit shows, where the sensor's error is declared by
             ``measurement_sd``. What the simulator is given stays as it is.
-        seed: Of all draws.
+        seed: Seed of all draws.
         show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
             of all that takes 2 s anyway.
 

@@ -72,9 +72,9 @@ def report_of(
         loop: The steps.
         evaluation: Error before and after; None leaves it out.
         held_out: Trials that had no part in them.
-        plan: As in :meth:`.Criticism.report`.
-        designed: The same.
-        exploratory: The same.
+        plan: Whether to plan the next action, as in :meth:`.Criticism.report`.
+        designed: Whether actions were chosen for their information.
+        exploratory: Whether what was frozen was changed after the data were seen.
     """
     tracing = loop.judged(evaluation)
     is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)

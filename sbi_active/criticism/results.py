@@ -73,10 +73,10 @@ class Residuals:
         mean: Posterior predictive mean of the model refitted to all trials, shape of x.
         sd: Its standard deviation, noise included, shape of x.
         refitted: (x - mean) / sd, shape of x.
-        prequential: The same with trial t predicted from the trials before it, the
-            first from the prior, shape of x.
-        correlation: Of neighboring noise errors along the time axis, posterior mean; 0
-            without a time axis.
+        prequential: Residuals of trial t predicted from the trials before it, the first
+            from the prior, shape of x.
+        correlation: Correlation of neighboring noise errors along the time axis,
+            posterior mean; 0 without a time axis.
         noise: "declared", "estimated" (from repeats or the trajectories themselves), or
             "stochastic" (the simulator is the draw).
         probability_valid: That each trial has a measurement, shape (t,); None where it
@@ -107,17 +107,17 @@ class Evidence:
     r"""Marginal likelihood of one model, :math:`\log Z = \log \int p(x|z) p(z) dz`.
 
     Attributes:
-        key: Of the model.
+        key: Key of the model.
         log_evidence: log Z, nats.
-        standard_error: Of log Z, Monte Carlo, nats.
+        standard_error: Standard error of log Z, Monte Carlo, nats.
         effective_sample_size: Number of draws that count.
         engine: What gave the evidence: "importance" sampling around least squares,
             "smc" (sequential Monte Carlo), or of a model far behind "laplace" or
             "linear".
         num_simulations: Trials simulated.
-        names: Of the coordinates (theta, phi).
+        names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
-        narrow: Likewise by this model alone, where ``draws`` were widened; or None.
+        narrow: Draws by this model alone, where ``draws`` were widened; or None.
         best_chi_square: Smallest whitened residual sum of squares among the draws.
         best: Theta and phi, (dim,), that predict other trials; None for the draws.
     """
@@ -145,18 +145,18 @@ class Detection:
     r"""Whether the bare model, refitted, still misses the data.
 
     Attributes:
-        log_bayes_factor: Of the mixture of effects and catch-alls
+        log_bayes_factor: Log Bayes factor of the mixture of effects and catch-alls
             against the bare model, nats.
         standard_error: Monte Carlo, nats.
         lower: log_bayes_factor minus twice its standard error.
         threshold: log 20.
         chi_square: Smallest whitened residual sum of squares of the bare model.
         degrees_of_freedom: Measurements less the parameters that they determine.
-        p_value: Of that chi-square; anti-conservative where noise is estimated.
+        p_value: p-value of that chi-square; anti-conservative where noise is estimated.
         level: Below which it is an alarm; 0 where something is unknown of the noise.
         null_log_evidence: By least squares, nats.
-        null_cross_check: The same from other starts; None where no alarm was near or
-            these ended in the same place.
+        null_cross_check: Log evidence from other starts; None where no alarm was near
+            or these ended in the same place.
         least_chi_square: The smallest of any parameters that were tried; NaN where the
             size of the noise is not declared.
         lower_p_value: Probability of one as small, all parameters taken as determined;
@@ -197,7 +197,7 @@ class Detection:
         Degrees of freedom are those of the bare model, a few too many.
 
         Args:
-            evidence: Of the model.
+            evidence: Evidence of the model.
             level: Tail probability below which there is none.
         """
         left = chi2.sf(evidence.best_chi_square, self.degrees_of_freedom)
@@ -209,16 +209,16 @@ class Estimate:
     """One effect as the data leave it.
 
     Attributes:
-        name: Of the effect.
-        family: Of the effect.
-        units: Of phi.
+        name: Name of the effect.
+        family: Family of the effect.
+        units: Units of phi.
         describe: Its sentence, or "".
-        probability: Of the effect being the one that is missing, alone or with others.
-        log_bayes_factor: Of the effect alone against the bare model, nats.
-        mean: Of phi given the effect alone, shape (phi_dim,).
-        sd: Of phi given the effect alone, shape (phi_dim,).
-        effective_sample_size: Of its evidence.
-        engine: Of its evidence.
+        probability: Probability that the effect is missing, alone or with others.
+        log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
+        mean: Mean of phi given the effect alone, shape (phi_dim,).
+        sd: Standard deviation of phi given the effect alone, shape (phi_dim,).
+        effective_sample_size: Effective number of draws behind its evidence.
+        engine: Engine that gave its evidence.
     """
 
     name: str
@@ -249,12 +249,13 @@ class Tracing:
             probable first.
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
-        near: The same for the trials at hand alone; another action may separate them.
+        near: Groups for the trials at hand alone; another action may separate them.
         aliases: After an alarm, pairs of effects that explain the data about as well
             (log evidence within log 20 of the best) with predictions closer than the
             noise over the permitted actions; repeated trials may separate them.
         estimates: One an effect, most probable first.
-        evidences: Of every model tried, by name, effects with priors of unknown scale.
+        evidences: Evidence of every model tried, by name; effects have priors of
+            unknown scale.
         robust: Whether effect priors a third and three times as wide agree.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
@@ -337,7 +338,7 @@ class Evaluation:
         trials: Positions of the scored trials, shape (s,).
         before: By metric, one value a scored trial, shape (s,): "rmse", "energy score",
             "log predictive density", "coverage" (share of entries in the central 90 %).
-        after: The same with the effects added.
+        after: Values with the effects added, likewise.
         table: Columns metric, before, after, ratio, low, high: RMSE over all scored
             trials, means of the others, ratio after / before (difference for the log
             density and the coverage), and its 90 % bootstrap interval, paired over
@@ -378,8 +379,8 @@ class NextAction:
         within: Where several forms of a force are left, the action within the range of
             the trials that tells most about which, shape (action_dim,).
         within_gain: Lower bound on that information, nats.
-        beyond: The same beyond that range, permitted or not.
-        beyond_gain: Likewise.
+        beyond: Action that tells most beyond that range, permitted or not.
+        beyond_gain: Lower bound on that information, nats.
     """
 
     action: Array | None

@@ -31,10 +31,10 @@ def thinned_to_need(
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: All of them; those that may be fitted are.
-        effects: Of which those of scope "trial" belong to the bare model.
-        seed: Of the fit.
+        prior: Prior of its parameters.
+        trials: All trials; those that may be fitted are.
+        effects: Effects, of which those of scope "trial" belong to the bare model.
+        seed: Seed of the fit.
 
     Returns:
         The trials, as they are where nothing is to be left out; and what was found of

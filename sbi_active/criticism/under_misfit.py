@@ -111,7 +111,7 @@ class ModelError:
         name: Effects joined by " + ", or "none".
         probability: Among the admitted models; 0 for one that was not admitted.
         left_out: Root mean square on left-out trials by channel, units of x, (c,).
-        held_out: The same on held-out trials; None without any.
+        held_out: Root mean square on held-out trials, likewise; None without any.
         remains: Share of the bare model's excess error on left-out trials.
         parts: Mean squared error of each left-out trial, or part of one, in sensor
             variances, (f,); empty where nobody asked.
@@ -139,13 +139,14 @@ class Misfit:
         odds: That each of them is no imitation.
         sensor: Its standard deviation by channel, units of x, (c,).
         passes: Whether the chi-square of the verdict passes against the sensor.
-        size: Of the residual process beside the verdict's model, in sensor deviations.
-        time_scale: Of that process, in the unit of the sample times; NaN where x has
-            no time axis, and each number an error of its own.
+        size: Size of the residual process beside the verdict's model, in sensor
+            deviations.
+        time_scale: Time scale of that process, in the unit of the sample times; NaN
+            where x has no time axis, and each number an error of its own.
         left_out: What was left out: "trials" or "parts of trials".
-        weights: Of models by their errors on left-out parts, where probabilities are
-            too sure; by name, largest first, without those that hardly count. A next
-            action is to tell these apart.
+        weights: Weights of models by their errors on left-out parts, where
+            probabilities are too sure; by name, largest first, without those that
+            hardly count. A next action is to tell these apart.
         instead: What may stand in the place of an effect that helps: left-out trials
             are not surely predicted worse with it there.
     """

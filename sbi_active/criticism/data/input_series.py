@@ -38,15 +38,15 @@ def inputs_of(
     """Return the inputs of trials by name, shape (t, m), and their grid, shape (m,).
 
     Args:
-        inputs: As in :func:`named_series`; None for none.
-        times: Of the values, shape (m,), (t, m), or a list of t, or a dict of such by
-            name; None takes those of x where there are as many.
+        inputs: Inputs, as :func:`named_series` takes them; None for none.
+        times: Times of the values, shape (m,), (t, m), or a list of t, or a dict of
+            such by name; None takes those of x where there are as many.
         x: What was measured, shape (t, k, ...).
         x_times: Its times, shape (k,) or (t, k).
-        hold: As in :func:`on_one_grid`.
+        hold: Value between two times, as in :func:`on_one_grid`.
 
     Raises:
-        ValueError: As those raise, and :func:`require_covered`.
+        ValueError: If those functions or :func:`require_covered` raise it.
     """
     if inputs is None:
         if times is not None:
@@ -166,7 +166,7 @@ def require_covered(x_times: Tensor, stamps: Mapping[str, Tensor]) -> None:
     """Raise where x was measured long before or after an input of its trial.
 
     Args:
-        x_times: Of what was measured, shape (t, k), NaN for none.
+        x_times: Times of what was measured, shape (t, k), NaN for none.
         stamps: Times of the inputs, by name, shape (t, m).
     """
     for name, times in stamps.items():

@@ -18,8 +18,9 @@ class Measurements:
     """The measured numbers of some trials, in the order trial, channel, time.
 
     Attributes:
-        x: Shape (N,).
-        position: Of each in the flattened x of shape (t, *x_shape), shape (N,).
+        x: Measured numbers, shape (N,).
+        position: Position of each number in the flattened x of shape (t, *x_shape),
+            shape (N,).
         trial: Row of its trial, shape (N,).
         channel: Its channel, shape (N,).
         time: Its sample time; its place along x's first axis where no times are
@@ -105,7 +106,7 @@ class Measurements:
         is the model that is elsewhere, and nothing is changed.
 
         Args:
-            center: Of what can be expected, shape (N,).
+            center: Center of what can be expected, shape (N,).
             reach: How far numbers may be from it, shape (N,).
         """
         x = np.clip(self.x, center - reach, center + reach)

@@ -34,13 +34,13 @@ def read_trials(
     have its name in front; where a row is a trial, rows go on from file to file.
 
     Args:
-        path: Of the file or folder.
-        columns: As in :func:`.find_columns`.
-        units: As there.
-        inputs: As :func:`.read_table` takes them.
+        path: Path of the file or folder.
+        columns: Columns, as in :func:`.find_columns`.
+        units: Units by column, as in :func:`.find_columns`.
+        inputs: Table of inputs, as :func:`.read_table` takes it.
 
     Raises:
-        ValueError: As :func:`.read_table` raises; if there is no file in the folder, or
+        ValueError: If :func:`.read_table` raises it, there is no file in the folder, or
             files have different columns.
     """
     path = Path(path)

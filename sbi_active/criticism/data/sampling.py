@@ -43,7 +43,8 @@ class Sampling:
         every: Which samples to keep: every 1st, 2nd, ...
         before: Largest correlation of neighboring innovations at the higher rates that
             were looked at, of all samples where they are all kept.
-        after: The same of those that are kept.
+        after: Largest correlation of neighboring innovations of the samples that are
+            kept.
     """
 
     step: float
@@ -133,7 +134,7 @@ def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
     Args:
         trials: With x of shape (n, k, ...).
         sampling: What was found of them.
-        times: As in :func:`suggested_sampling`.
+        times: Sample times, as in :func:`suggested_sampling`.
     """
     found = trials.select(slice(None))
     if sampling.every == 1:

@@ -36,7 +36,7 @@ class TrialTable:
     """A table of trials.
 
     Attributes:
-        arguments: Of :class:`.Trials`, by name.
+        arguments: Arguments of :class:`.Trials`, by name.
         columns: What its columns are.
     """
 
@@ -59,8 +59,8 @@ def read_table(
 
     Args:
         table: Path of a CSV file, or a data frame.
-        columns: As in :func:`.find_columns`.
-        units: As there.
+        columns: Names of columns, as in :func:`.find_columns`.
+        units: Units by column, as in :func:`.find_columns`.
         inputs: A table of their inputs at times of their own, with columns "time",
             "input_*", and "trial" unless all trials share them. What is said of
             columns and units holds for it too.

@@ -72,11 +72,11 @@ def find_columns(
     """Return what the columns are, by their names or as the user says.
 
     Args:
-        names: Of all columns.
+        names: Names of all columns.
         columns: Names of those that are "trial", "time", "action", "x", "input",
             "start", "role", "index" or "repeat_of"; others are then ignored. None goes
             by the names.
-        units: By column, with or without what stands in its brackets.
+        units: Units by column, with or without what stands in its brackets.
         source: What messages call the table.
         of_inputs: The table holds times and inputs alone, and those of all trials
             where no column names the trial.

@@ -21,9 +21,9 @@ class InputRows:
     """The rows of a table that hold inputs.
 
     Attributes:
-        names: Of the inputs, each with its label.
-        values: Shape (n, c), NaN where a cell is empty.
-        time: In s, shape (n,).
+        names: Names of the inputs, each with its label.
+        values: Values of the inputs, shape (n, c), NaN where a cell is empty.
+        time: Times in s, shape (n,).
         members: Rows of each trial.
         trials: Their names; one empty name where all share the series.
         place: Returns what a message calls a row.
@@ -99,7 +99,7 @@ class InputRows:
 
         Args:
             row: Number of the trial in each row of x, shape (k,).
-            time: Of x in s, shape (k,).
+            time: Times of x in s, shape (k,).
             place: Returns what a message calls a row of x.
             source: What it calls the table of x.
         """

@@ -37,7 +37,7 @@ class Rows:
 
     Attributes:
         code: Number of each row's trial, shape (n,).
-        names: Of the trials.
+        names: Names of the trials.
         members: Rows of each trial.
         first: The first row of each.
     """
@@ -79,7 +79,7 @@ class Rows:
         """Return the rows of inputs.
 
         Args:
-            time: Of each row.
+            time: Time of each row.
         """
         columns = self.columns
         return InputRows(

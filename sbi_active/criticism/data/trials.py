@@ -40,8 +40,8 @@ class Trials:
     What is given is copied, and may change afterwards.
 
     Args:
-        action: As commanded, shape (n, action_dim), or (n,) for scalar actions. None
-            where the inputs say what was commanded: the action is then the trial's
+        action: Actions as commanded, shape (n, action_dim), or (n,) for scalar ones.
+            None where the inputs say what was commanded: the action is then the trial's
             number, a label that no effect changes.
         x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
         role: "fit", or "held out" of everything that is fitted or chosen; one a
@@ -58,13 +58,13 @@ class Trials:
             none; None takes trials of equal actions as repeats of the first. A repeat
             of a repeat is one of the first.
         action_labels: What reports call each entry of the action, with its unit.
-        channel_labels: The same of each entry of x's last axis.
+        channel_labels: Labels of the entries of x's last axis, likewise.
         inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
             all trials share it, or a list of n arrays. An array (n, m) or a list
             without a name is "input"; (n, m, c) is "input 1" to "input c".
-        input_times: Of the inputs, shape (m,), (n, m), or a list of n, or such by name,
-            from the same origin as ``sample_times``, which they are where there are as
-            many.
+        input_times: Times of the inputs, shape (m,), (n, m), a list of n, or such by
+            name, from the same origin as ``sample_times``, which they are where there
+            are as many.
         input_hold: Between two of its times an input has the "previous" value, as a
             command is held, or is "linear".
         input_labels: What reports call each input, with its unit.
@@ -226,17 +226,17 @@ class Trials:
         which then needs no action; rows may have an input and no x.
 
         Args:
-            path: Of the file; lines that begin with # are comments. Or of a folder with
-                ``trials.csv`` or such files: one with times and no "trial" is a trial.
+            path: Path of a file, whose lines with # in front are comments, or of a folder
+                with ``trials.csv`` or such files: one with times and no "trial" is one.
             columns: Which columns are "trial", "time", "action", "x", "input", "start",
                 "role", "index" and "repeat_of", where they have other names; those left
                 out are then ignored. Several columns may name a trial together.
             units: By column, where the header has none. Numbers are taken as they are,
                 but for the time, which is converted to seconds.
-            order: As in the constructor; "unknown" where rows are in any order.
+            order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
                 own: "time", "input_\*", and "trial" unless all trials share them.
-            input_hold: As in the constructor.
+            input_hold: Value of an input between two times, as in the constructor.
 
         Raises:
             ValueError: If the table is not understood; the text says where.

@@ -20,11 +20,11 @@ def applied(
     copied, so that it may be a view of what it keeps.
 
     Args:
-        effect: Of any hook.
-        value: As the hook says; a dict for "dynamics" and "input".
-        phi: Shape (n, phi_dim).
-        action: As commanded, shape (n, action_dim).
-        context: Of the rows.
+        effect: Effect of any hook.
+        value: Value that the hook changes; a dict for "dynamics" and "input".
+        phi: Parameters of the effect, shape (n, phi_dim).
+        action: Actions as commanded, shape (n, action_dim).
+        context: Context of the rows.
 
     Raises:
         ValueError: If ``apply`` gives back another type, shape or kind of number, or a

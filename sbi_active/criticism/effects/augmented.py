@@ -127,8 +127,8 @@ class AugmentedSimulator(SimulatorModel):
 
         Args:
             theta: Parameters of the base simulator, shape (n, theta_dim).
-            phi: By effect, shape (n, phi_dim); effects that are left out vanish.
-            action: As commanded, shape (n, action_dim).
+            phi: Parameters by effect, (n, phi_dim); effects that are left out vanish.
+            action: Actions as commanded, shape (n, action_dim).
             index: Place of each row's trial, shape (n,); None is ``next_index``.
             times: Sample times, shape (k,) or (n, k); None takes the model's.
             context: All that is known of how each row's trial was run, in place of
@@ -159,12 +159,12 @@ class AugmentedSimulator(SimulatorModel):
         """Return the noise's standard deviation with effects, of the shape of ``sd``.
 
         Args:
-            phi: As in :meth:`evaluate`.
+            phi: Parameters by effect, as in :meth:`evaluate`.
             action: Shape (n, action_dim).
-            sd: Without effects, shape (n, *x_shape).
-            index: As in :meth:`evaluate`.
-            times: As in :meth:`evaluate`.
-            context: As in :meth:`evaluate`.
+            sd: Standard deviation without effects, shape (n, *x_shape).
+            index: Place of each row's trial, as in :meth:`evaluate`.
+            times: Sample times, as in :meth:`evaluate`.
+            context: Context of the rows, as in :meth:`evaluate`.
         """
         context = self._row_context(action, index, times, context)
         for effect in self._active("noise", phi):

@@ -30,7 +30,7 @@ class Context:
     Attributes:
         index: Place of each row's trial in the order of the trials, shape (n,).
         times: Sample times, shape (k,) or (n, k); None for x without a time axis.
-        inputs: As commanded, {name: (n, m)}; None for trials without.
+        inputs: Inputs as commanded, {name: (n, m)}; None for trials without.
         input_times: Their uniform grid, shape (m,).
         start: Measured start states, shape (n, d) or {name: (n,)}; None for none.
     """
@@ -70,7 +70,7 @@ class Effect:
             :class:`Context`. For "input", value is {name: (n, m)}, on the grid
             ``context.input_times``. For "dynamics", it is a dict of keyword arguments.
             For "noise", it is the standard deviation, of the shape of x.
-        units: Of phi.
+        units: Units of phi.
         family: Effects of one family share a prior probability, so that variants of an
             idea dilute nobody; None takes the hook.
         scope: "campaign" for one phi in all trials; "trial" for a nuisance that every
@@ -127,11 +127,11 @@ class Effect:
         """Return an effect that the simulator's function already has.
 
         Args:
-            name: Of the effect.
+            name: Name of the effect.
             *keywords: Arguments of the simulator's function, one an entry of phi, each
                 of shape (n,); without any the name, its spaces underscored.
-            prior: Of phi.
-            **options: As in the constructor; the null is 0 unless given.
+            prior: Prior of phi.
+            **options: Options of the constructor; the null is 0 unless given.
 
         Raises:
             ValueError: If there is not one keyword for each entry of phi.
@@ -283,7 +283,7 @@ class UnderKey:
     """Adds phi to a dictionary that the simulator takes as a keyword, under a key.
 
     Attributes:
-        keyword: Of the simulator's function.
+        keyword: Keyword of the simulator's function.
         key: What phi belongs to, such as a force.
         order: Center and half span of the trials' order; with it the place of the
             trial, from -1 to 1, is the last column of phi.

@@ -76,8 +76,8 @@ def generic_effects(
     Args:
         model: The simulator.
         actions: The permitted actions, or the measured trials.
-        prior: Of the simulator's parameters, for the spread of its predictions; needed
-            where the simulator declares no noise.
+        prior: Prior of the simulator's parameters, for the spread of its predictions;
+            needed where the simulator declares no noise.
 
     Raises:
         ValueError: If neither noise nor prior says how large x and its errors are.

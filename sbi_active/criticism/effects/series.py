@@ -34,7 +34,7 @@ def lagged_input(u: Tensor, tau: Tensor, step: Tensor) -> Tensor:
     Args:
         u: Shape (n, m), at rest before.
         tau: Time constant, 0 for none, shape (n, 1).
-        step: Of the grid.
+        step: Step of the grid.
     """
     tau = tau.clamp(min=0)
     keep = torch.exp(-step / tau)
@@ -48,7 +48,7 @@ def delayed_input(u: Tensor, tau: Tensor, step: Tensor) -> Tensor:
     Args:
         u: Shape (n, m); its first value held before.
         tau: Delay, shape (n, 1).
-        step: Of the grid.
+        step: Step of the grid.
     """
     place = torch.arange(u.shape[1], dtype=u.dtype) - tau / step
     place = place.clamp(0, u.shape[1] - 1)
@@ -112,9 +112,9 @@ def delayed_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
     """Return samples of what was there tau before, the first value before it.
 
     Args:
-        x: As in :func:`lagged_samples`.
+        x: Samples, as in :func:`lagged_samples`.
         tau: Delay, shape (n, 1).
-        times: As there.
+        times: Sample times, as in :func:`lagged_samples`.
     """
     if x.shape[1] < 2:
         return x
@@ -137,7 +137,7 @@ def rounded(x: Tensor, quantum: Tensor) -> Tensor:
 
     Args:
         x: Shape (n, ...).
-        quantum: Of the shape of x, or of one that it broadcasts to.
+        quantum: Quantum, of the shape of x or of one that broadcasts to it.
     """
     quantum = quantum.expand_as(x)
     safe = quantum.where(quantum > 0, torch.ones_like(quantum))
@@ -149,7 +149,7 @@ def _affine(factor: Tensor, shift: Tensor, start: Tensor) -> Tensor:
 
     Args:
         factor: Shape (n, k - 1, ...).
-        shift: Of that shape.
+        shift: Shift of each step, of the same shape.
         start: Shape (n, 1, ...).
     """
     reach = 1

@@ -44,8 +44,8 @@ class Summarized:
 
     Attributes:
         model: Simulates the summaries, with noise of unit size.
-        trials: Their summaries.
-        effects: As declared, acting on x before it is summarized.
+        trials: Trials, with their summaries as x.
+        effects: Effects as declared, acting on x before it is summarized.
         weight: W / s, shape (k, numbers of x).
     """
 
@@ -75,11 +75,11 @@ def summarize(
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: With many numbers each, all or none of them measured.
+        prior: Prior of its parameters.
+        trials: Trials with many numbers each, all or none of them measured.
         effects: Declared effects.
         num: Summaries at most.
-        seed: Of the simulations that they are trained on.
+        seed: Seed of the simulations that they are trained on.
 
     Raises:
         ValueError: If the noise is not independent and Gaussian, numbers are masked,

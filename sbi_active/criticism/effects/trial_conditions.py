@@ -20,7 +20,7 @@ def conditions_of_trials(
     """Return how the trial of each row was run.
 
     Args:
-        trials: Measured ones.
+        trials: Measured trials.
         rows: Position of each row's trial, shape (n,).
         model: Where it has sample times of its own and takes no others, x is simulated
             at its own.
@@ -44,9 +44,9 @@ def conditions_for(
 
     Args:
         model: The simulator.
-        trials: Measured ones.
+        trials: Measured trials.
         rows: Position of each row's trial, shape (n,).
-        dtype: Of the tensors.
+        dtype: Type of the tensors.
     """
     context = vars(conditions_of_trials(trials, rows, model))
     found = {k: context[k] for k in model.conditions if context[k] is not None}

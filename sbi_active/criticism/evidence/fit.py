@@ -22,7 +22,7 @@ class Fit:
 
     Attributes:
         rival: The model.
-        sample: Of its posterior, weighted.
+        sample: Sample of its posterior, weighted.
         evidence: What is recorded of it.
         best: Where other trials are predicted from, shape (dim,); None takes the draws.
         mode: Where it is linear, shape (dim,); None where it was sampled.

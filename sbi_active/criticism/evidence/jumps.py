@@ -43,7 +43,7 @@ def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
 
     Args:
         rival: The bare model, with the declared noise.
-        seed: Of all draws.
+        seed: Seed of all draws.
 
     Returns:
         The step, in prior deviations; whether the simulator is smooth; and the
@@ -118,8 +118,8 @@ def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Arr
 
     Args:
         rival: The bare model, with the declared noise.
-        step: Of finite differences.
-        seed: Of the draws.
+        step: Step of finite differences.
+        seed: Seed of the draws.
 
     References:
         Gramacy & Lee, Statistics and Computing 22 (2012), for the nugget of

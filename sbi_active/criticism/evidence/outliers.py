@@ -62,7 +62,8 @@ class OneOutlier(ErrorModel):
 
     Attributes:
         trials: Those with a measurement, shape (k,).
-        sizes: Of the gross error, in standard deviations of the noise, shape (s,).
+        sizes: Sizes of the gross error, in standard deviations of the noise, shape
+            (s,).
     """
 
     def __init__(

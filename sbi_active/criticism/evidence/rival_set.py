@@ -63,12 +63,12 @@ class RivalSet:
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: Those that may be fitted.
+        prior: Prior of its parameters.
+        trials: Trials that may be fitted.
         effects: Declared effects; of scope "trial" ones every rival has.
         actions: The permitted ones, for the length scales of the residual process; None
             takes the range of the trials.
-        seed: Of all draws.
+        seed: Seed of all draws.
 
     Attributes:
         effects: Effects of scope "campaign", by name.
@@ -77,7 +77,7 @@ class RivalSet:
         center: Mean of the prior predictive, shape (N,).
         spread: Its deviation, shape (N,).
         can_fail: Whether a trial, or one of the prior predictive, has no outcome.
-        step: Of finite differences.
+        step: Step of finite differences.
         is_smooth: Whether derivatives mean anything.
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
@@ -138,7 +138,7 @@ class RivalSet:
         """Let errors be larger than declared, by an unknown factor.
 
         Args:
-            largest: Of the factor, which is log-uniform from one.
+            largest: Largest value of the factor, which is log-uniform from one.
         """
         factors = np.geomspace(1.0, max(largest, 2.0), NUM_FACTORS)
         weights = np.full(NUM_FACTORS, -np.log(NUM_FACTORS))

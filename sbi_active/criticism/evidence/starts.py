@@ -28,8 +28,8 @@ def starts_near_parents(
 
     Args:
         fits: Rivals whose posterior is known.
-        rival: Whose search starts.
-        seed: Of the draws.
+        rival: Rival whose search starts.
+        seed: Seed of the draws.
 
     Returns:
         Shape (k, dim); None without a parent.

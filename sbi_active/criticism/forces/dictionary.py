@@ -72,13 +72,13 @@ class Joint:
 
     Attributes:
         name: What reports call it.
-        place: Among the positions.
-        dof: Among the velocities.
-        unit: Of a force on it, "N" or "N m".
+        place: Place among the positions.
+        dof: Place among the velocities.
+        unit: Unit of a force on it, "N" or "N m".
         position: Unit of q.
         velocity: Unit of v.
-        low: Of q and v in their units, along nominal trajectories.
-        high: The same.
+        low: Lowest q and v in their units, along nominal trajectories.
+        high: Highest q and v, likewise.
     """
 
     name: str

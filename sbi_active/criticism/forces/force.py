@@ -41,7 +41,7 @@ def total_force(
     on it.
 
     Args:
-        force: As the simulator was given it; None is no force.
+        force: Force as the simulator was given it; None is no force.
         q: Positions, shape (n, nq).
         v: Velocities, shape (n, nv).
         t: Time since the start of the trial, s.

@@ -72,10 +72,10 @@ def trajectories(
     """Return how joints move in some trials, at draws of the prior.
 
     Args:
-        model: Takes ``force=``.
-        prior: Of its parameters.
-        trials: Whose actions, inputs and starts are taken.
-        seed: Of the draws.
+        model: Simulator that takes ``force=``.
+        prior: Prior of its parameters.
+        trials: Trials whose actions, inputs and starts are taken.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If the simulator never asks what the force is.

@@ -40,11 +40,11 @@ class Linear:
     """A simulator with effects that may be there, linear near its best fit.
 
     Attributes:
-        rival: Of theta and the effects beside it.
+        rival: Rival of theta and the effects beside it.
         effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
         null: Where effects vanish, shape (d,); NaN for other coordinates.
         unit: Root mean square residual of each number's channel, shape (N,).
-        model: Linear, in units.
+        model: Linear model, in units.
     """
 
     rival: Rival
@@ -114,8 +114,8 @@ class Fitted(Linear):
     """A linear model with posterior draws.
 
     Attributes:
-        errors: Hypotheses of them.
-        draws: Of u - ``origin``.
+        errors: Hypotheses of the errors.
+        draws: Draws of u - ``origin``.
         aliases: Effects that are left out since parameters do the same.
     """
 
@@ -153,12 +153,12 @@ def fitted(
     """Return a simulator near its best fit to trajectories.
 
     Args:
-        model: With a noise of any kind, of which nothing is used.
-        prior: Of theta.
-        trials: That are fitted.
+        model: Simulator with a noise of any kind, of which nothing is used.
+        prior: Prior of theta.
+        trials: Trials that are fitted.
         beside: Effects that may be there; those of scope "trial" are.
         known_sd: Deviation of each channel's white errors, shape (c,); None estimates.
-        seed: Of all draws.
+        seed: Seed of all draws.
         settings: How much is spent.
     """
     own, rng = settings, np.random.default_rng(seed)

@@ -34,7 +34,7 @@ class IdentifiedBelief(KernelBelief):
     """A belief by draws of a linearized posterior.
 
     Attributes:
-        draws: Of theta, shape (n, theta_dim).
+        draws: Draws of theta, shape (n, theta_dim).
         sides: Bound of the prior at which each parameter lies, -1 for the lower one, 1
             for the upper one, 0 for none, shape (theta_dim,).
     """
@@ -91,14 +91,14 @@ def identify(
     linear model, draws are weighed by the simulator.
 
     Args:
-        model: Deterministic but for the noise. The white part of the errors has the
-            size that a ``GaussianNoise`` declares; any other noise, or none, leaves
-            sizes to the trials, one a channel.
-        prior: Of its parameters.
+        model: Simulator, deterministic but for the noise. The white part of the errors
+            has the size that a ``GaussianNoise`` declares; any other noise, or none,
+            leaves sizes to the trials, one a channel.
+        prior: Prior of its parameters.
         trials: Trajectories, with gaps where nothing was measured.
         beside: What the model may lack. Those of scope "trial" are there, with a
             nuisance in each trial.
-        seed: Of all draws.
+        seed: Seed of all draws.
         settings: How much is spent, and what decides.
 
     Returns:

@@ -40,10 +40,10 @@ class Unknowns:
     """What is known of u before the logs, d coordinates from where effects vanish.
 
     Attributes:
-        low: Shape (d,).
-        high: Shape (d,).
-        center: Of a Gaussian prior, shape (d,).
-        precision: Of it, 0 for uniform ones, shape (d,).
+        low: Lower bounds, shape (d,).
+        high: Upper bounds, shape (d,).
+        center: Center of a Gaussian prior, shape (d,).
+        precision: Precision of that prior, 0 for uniform ones, shape (d,).
         effect: Number of the effect that a coordinate belongs to, -1 for theta, (d,).
     """
 
@@ -99,12 +99,12 @@ def sample(
     """Return posterior draws of all chains.
 
     Args:
-        grams: Of (r_0, J), by channel.
+        grams: Gram matrices of (r_0, J), by channel.
         processes: Hypotheses of the errors, white noise first, of size one.
         unknowns: Priors.
         known_size: Deviation of the white part by channel; None where it is unknown.
         rng: Source of the draws.
-        sweeps: Of each chain, after those that are left out.
+        sweeps: Sweeps of each chain, after those that are left out.
         settings: Numbers of draws, and priors.
     """
     p, num, d = unknowns, settings.chains, len(unknowns.low)
@@ -170,7 +170,7 @@ class _Swept:
     Attributes:
         table: Minus the covariance of what is free, its mean in the last column, and
             in the corner :math:`-b^T P^{-1} b`; shape (n, d + 1, d + 1).
-        log_det: Of the precision of what is free, shape (n,).
+        log_det: Log determinant of the precision of what is free, shape (n,).
         free: Shape (n, d).
     """
 

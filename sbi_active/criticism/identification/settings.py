@@ -41,12 +41,13 @@ class IdentifySettings:
 
     Attributes:
         num_screened: Draws of the prior that are looked at, at least.
-        screened_each: The same for each parameter: the more there are, the more optima.
+        screened_each: Draws looked at for each parameter: the more there are, the more
+            optima.
         fit: Searches from these, at least, and how far they go.
         starts_each: Searches for each parameter.
         kept_each: Searches that go on, for each parameter.
         sampler: Draws of the linear model.
-        step: Of finite differences, in deviations of the prior.
+        step: Step of finite differences, in deviations of the prior.
         tried: Deviations of the prior by which an effect that is absent is tried: many
             are flat at their null.
         alias: Share of an effect's column that is no combination of the parameters'
@@ -57,7 +58,7 @@ class IdentifySettings:
         rounds: Times at most that channels are weighed by their residuals.
         worth: Mean fall of the logarithm of these sizes that is worth another time.
         smallest: Residual that a channel is taken to have at least, in its deviations.
-        shares: Of the variance that are white, of errors of unknown size.
+        shares: Shares of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
             their digits.
         num_compared: Draws at which the linear model is compared with the simulator:
@@ -67,8 +68,8 @@ class IdentifySettings:
         num_weighed: Draws that are weighed where it will not.
         fewest: Effective draws below which a belief whose draws are weighed is not to
             be trusted.
-        fewest_each: The same as a multiple of d (d + 3) for d parameters, as for other
-            beliefs.
+        fewest_each: Effective draws as a multiple of d (d + 3) for d parameters, below
+            which such a belief is not to be trusted, as for other beliefs.
         largest_shape: Shape of the tail of weights above which it is not either, as for
             other beliefs: the linear model lacks places that the simulator explains.
         fewest_kept: Those that weights leave at least: few would make for a narrow

@@ -29,10 +29,12 @@ class Spread:
     """How parts of the trials disagree.
 
     Attributes:
-        p_value: Of each parameter being the same in all parts, shape (d,).
-        deviation: Of the parts from their mean, as far as it is none of their errors,
-            shape (f, d), such that normal multiples of them add up to the spread.
-        sd: Of each parameter by all trials if it had no bounds, shape (d,).
+        p_value: p-value of each parameter being the same in all parts, shape (d,).
+        deviation: Deviation of the parts from their mean, as far as it is none of their
+            errors, shape (f, d), such that normal multiples of them add up to the
+            spread.
+        sd: Standard deviation of each parameter by all trials if it had no bounds,
+            shape (d,).
     """
 
     p_value: Array

@@ -15,7 +15,7 @@ class Candidate:
 
     Attributes:
         model: Linearized at its best fit.
-        grams: Of its rows.
+        grams: Gram matrices of its rows.
         posterior: Under the shared errors.
         left: Its errors on left-out parts of the trials.
         log_prior: Probability of its set of effects, nats.

@@ -55,11 +55,11 @@ class Posterior:
     """The evidence of a linear model, and its posterior.
 
     Attributes:
-        log_sensor: With the sensor's error alone, nats.
-        log_process: With a residual process beside it, or a parameter that differs from
-            trial to trial, nats.
-        mean: Of u given the process, shape (d,).
-        cov: Of u given the process, shape (d, d).
+        log_sensor: Log evidence with the sensor's error alone, nats.
+        log_process: Log evidence with a residual process beside it, or a parameter
+            that differs from trial to trial, nats.
+        mean: Mean of u given the process, shape (d,).
+        cov: Covariance of u given the process, shape (d, d).
         size: s of the process, posterior mean.
         time_scale: tau of it, posterior median.
         variances: Mean square of the process, and of what each parameter does that may
@@ -199,7 +199,7 @@ class Errors:
 
         Args:
             model: Linear, with its prior.
-            grams: Of its rows.
+            grams: Gram matrices of its rows.
             folds: Parts that count, bool, shape (f,); None takes all.
             factor: On the scales of the effects' priors.
             process: Whether u is given the process; else the sensor's error alone.
@@ -256,7 +256,7 @@ class Errors:
         trial, a trial that depends on it more tells less of everything else.
 
         Args:
-            posterior: Of a model.
+            posterior: Posterior of a model.
         """
         process, *differ = posterior.variances
         variance = 1 + process + self.varying**2 @ np.array(differ)

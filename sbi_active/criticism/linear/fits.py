@@ -77,7 +77,7 @@ def along_secants(
     Args:
         rival: The model.
         u: Starts, shape (n, d).
-        unit: Of residuals, shape (N,).
+        unit: Units of residuals, shape (N,).
         steps: At most.
         known: Residuals in units and derivatives at the starts, (n, N) and (n, N, d).
     """

@@ -31,12 +31,12 @@ class LeftOut:
     Attributes:
         square: Mean squared error of each part, in sensor variances, shape (f,); NaN
             for parts that do not count.
-        standard: The same in units of what the refit without the part expects of it:
-            a part that it can only extrapolate to counts for less, shape (f,).
-        error: Of each number by the fit without its part, sensor deviations, (N,); NaN
-            where it told of the part's nuisances.
+        standard: Mean squared error in units of what the refit without the part expects
+            of it: a part that it can only extrapolate to counts for less, shape (f,).
+        error: Error of each number by the fit without its part, sensor deviations,
+            (N,); NaN where it told of the part's nuisances.
         refits: Coordinates without each part, shape (f, d).
-        fit: With all of them, shape (d,).
+        fit: Coordinates with all parts, shape (d,).
     """
 
     square: Array
@@ -75,7 +75,7 @@ def leave_out(
         model: Linear.
         errors: Which says what the parts are.
         folds: Parts that count, shape (f,); None takes all.
-        weight: Of each squared error, in refits and in what is returned, (N,).
+        weight: Weight of each squared error, in refits and in what is returned, (N,).
     """
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
@@ -170,7 +170,7 @@ def _expected(
         rows: In units of the model's own error, shape (N, 1 + d).
         error: On left-out parts, shape (N,).
         errors: Which says what the parts are.
-        precision: Of the fit to all, the inverse of P, shape (d, d).
+        precision: Precision of the fit to all, the inverse of P, shape (d, d).
         is_free: Coordinates within their bounds without each part, shape (f, d); at a
             bound a coordinate is as good as known.
     """

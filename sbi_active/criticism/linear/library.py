@@ -59,8 +59,8 @@ class Library:
 
     Args:
         search: Has fitted the model.
-        base: Of the model; the bare one unless given.
-        names: Of the effects; all unless given.
+        base: Key of the model; the bare one unless given.
+        names: Names of the effects; all unless given.
     """
 
     def __init__(

@@ -27,15 +27,15 @@ class LinearModel:
     r"""A rival near its best fit, :math:`r(u) = r(\hat u) + J (u - \hat u)`.
 
     Attributes:
-        key: Of the rival.
+        key: Key of the rival.
         u: Where it is linearized, shape (d,).
         residual: There, in standard deviations of the sensor, shape (N,).
         jacobian: Its derivatives, shape (N, d).
-        center: Of the prior, shape (d,).
-        sd: Of the prior, shape (d,).
+        center: Center of the prior, shape (d,).
+        sd: Standard deviation of the prior, shape (d,).
         scaled: Coordinates of effects whose prior has an unknown scale, bool, (d,).
-        low: Bounds, shape (d,).
-        high: Bounds, shape (d,).
+        low: Lower bounds, shape (d,).
+        high: Upper bounds, shape (d,).
         own: Coordinates of theta and phi; those of the trials' nuisances follow.
         trial_of: The trial that each coordinate belongs to, -1 for all, shape (d,).
     """
@@ -103,10 +103,10 @@ def linearize(rival: Rival, u: Array, unit: Array, step: float | Array) -> Linea
     """Return a rival linearized at one point.
 
     Args:
-        rival: Of effects that change the prediction.
+        rival: Rival with effects that change the prediction.
         u: Where, shape (d,).
         unit: Standard deviation of the sensor, shape (N,).
-        step: Of finite differences, one or one a coordinate, shape (d,).
+        step: Step of finite differences, one or one a coordinate, shape (d,).
     """
     r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
     return with_prior(rival, u, r[0], jacobian[0])
@@ -149,10 +149,10 @@ def enlarged(
     """Return a model with further coordinates.
 
     Args:
-        model: Linear, without them.
-        rival: With them.
+        model: Linear model without them.
+        rival: Rival with them.
         new: Which of the rival's coordinates they are, bool, shape (d,).
-        values: Of the new ones, shape (k,).
+        values: Values of the new ones, shape (k,).
         columns: Derivatives of the residual by them, shape (N, k).
     """
     u, jacobian = np.empty(rival.dim), np.empty((len(model.residual), rival.dim))

@@ -69,7 +69,7 @@ class Processes:
         """Return all combinations: kernel, then time scale, then variances.
 
         Args:
-            variances: Of the white part and the process, shape (v, 2).
+            variances: Variances of the white part and the process, shape (v, 2).
             times: Shape (t,).
             kernels: Whether each kernel is the smooth one, the rough one first.
         """
@@ -106,8 +106,8 @@ class Grams:
     """Gram matrices of whitened rows, hypothesis by hypothesis and group by group.
 
     Attributes:
-        gram: Shape (h, g, k, k).
-        log_det: Of the covariance, shape (h, g).
+        gram: Gram matrices, shape (h, g, k, k).
+        log_det: Log determinant of the covariance, shape (h, g).
         count: Numbers of each group, shape (g,).
     """
 
@@ -238,7 +238,7 @@ class Filter:
         most: Whitened numbers in memory at once, 16 MB.
 
     Attributes:
-        log_det: Of the covariance, shape (h,), or (h, s).
+        log_det: Log determinant of the covariance, shape (h,), or (h, s).
     """
 
     def __init__(

@@ -130,7 +130,7 @@ def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
     Args:
         search: Has fitted the models; x has no time axis.
         key: The set with the effect.
-        name: Of the effect.
+        name: Name of the effect.
     """
     without = search.found[key.without(name)].model
     m = search.rivals.measurements

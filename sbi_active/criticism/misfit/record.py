@@ -128,8 +128,8 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
     """Return a verdict of other evidence with the intervals that hold under misfit.
 
     Args:
-        tracing: Of numbers without a time axis, of which no declared effect predicts
-            left-out trials better: larger noise or something undeclared.
+        tracing: Tracing of numbers without a time axis, of which no declared effect
+            predicts left-out trials better: larger noise or something undeclared.
         misfit: The models.
     """
     found = dict(tracing.evidences)
@@ -167,9 +167,9 @@ def keep_draws(
     Args:
         rivals: That keep them.
         model: Fitted.
-        center: Of its posterior, shape (d,).
-        cov: Of its posterior, shape (d, d).
-        log_z: Its evidence, nats.
+        center: Center of its posterior, shape (d,).
+        cov: Covariance of its posterior, shape (d, d).
+        log_z: Log evidence of the model, nats.
         best: Where other trials are predicted from, shape (d,); None takes the draws.
     """
     key = model.key

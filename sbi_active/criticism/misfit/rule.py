@@ -94,11 +94,11 @@ class Choice:
 
     Attributes:
         key: The model whose effects all help; the bare one where none does.
-        probabilities: Of the admitted models, most probable first.
+        probabilities: Probabilities of the admitted models, most probable first.
         inclusion: Probability of each effect among them.
         cause: Probability of each effect that helps of being the cause.
         better: Probability that a left-out trial is predicted better with it.
-        odds: Of being a cause and no imitation, by effect that helps.
+        odds: Odds of being a cause and no imitation, by effect that helps.
         instead: What may stand in the place of an effect that helps, where anything
             may (:func:`stand_ins`).
     """
@@ -124,7 +124,7 @@ def choose(
 
     Args:
         models: Fitted ones; with a set of effects, the sets with one effect less.
-        names: Of all effects.
+        names: Names of all effects.
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
         guessed: Returns the nats that guesses in the place of an effect of a set gain
@@ -178,7 +178,7 @@ def starts(
 
     Args:
         models: Fitted ones.
-        names: Of all effects.
+        names: Names of all effects.
         timed: Whether x has a time axis.
 
     Returns:
@@ -226,7 +226,7 @@ def stand_ins(
     Args:
         models: Fitted ones; sets that were not fitted do not count.
         key: The set.
-        names: Of all effects, in the order of the sets.
+        names: Names of all effects, in the order of the sets.
     """
     square = models[key].square
     found: dict[str, tuple[str, ...]] = {}

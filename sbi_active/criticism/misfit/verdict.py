@@ -62,8 +62,8 @@ class Misfit:
         choice: What helps.
         standard: Returns a model's squared errors on left-out parts, as the rule takes
             them.
-        log_bayes_factor: Of anything with a residual process against the bare model
-            with the sensor's error alone, nats.
+        log_bayes_factor: Log Bayes factor of anything with a residual process against
+            the bare model with the sensor's error alone, nats.
     """
 
     search: Search

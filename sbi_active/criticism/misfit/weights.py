@@ -40,8 +40,8 @@ def weights_by_error(
     Args:
         square: Mean squared errors on left-out parts of the trials, shape (f,); NaN for
             parts that do not count.
-        log_prior: Of each model, nats.
-        seed: Of the bootstrap.
+        log_prior: Log prior probability of each model, nats.
+        seed: Seed of the bootstrap.
 
     Example:
         >>> one, two = ModelKey(("one",)), ModelKey(("two",))

@@ -49,8 +49,8 @@ class PredictedRival:
 
     Args:
         rivals: The models.
-        key: Of this one.
-        probability: Of this one, those of all rivals adding up to one.
+        key: Key of this rival.
+        probability: Probability of this rival, those of all rivals adding up to one.
         candidates: All actions that will be asked for, shape (a, action_dim). They are
             predicted together, each as the next trial.
     """
@@ -69,7 +69,7 @@ class PredictedRival:
         Args:
             action: One of the candidates, shape (action_dim,).
             num_samples: n.
-            seed: Of the draws.
+            seed: Seed of the draws.
         """
         return self._at(action, num_samples, seed)[0]
 
@@ -79,9 +79,9 @@ class PredictedRival:
         """Return these draws without noise, and its standard deviations, (n, q).
 
         Args:
-            action: As in :meth:`predict`.
-            num_samples: As there.
-            seed: As there.
+            action: One of the candidates, as in :meth:`predict`.
+            num_samples: Number of draws n, as in :meth:`predict`.
+            seed: Seed of the draws, as in :meth:`predict`.
         """
         _, mean, sd = self._at(action, num_samples, seed)
         return mean, sd

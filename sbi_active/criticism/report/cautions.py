@@ -69,12 +69,12 @@ def find_warnings(
 
     Args:
         trials: The measured trials.
-        residuals: Of the bare model.
+        residuals: Residuals of the bare model.
         tracing: Which effect the data point to.
         detection: Whether the bare model misses the data.
-        residuals_after: With the effects of the verdict.
+        residuals_after: Residuals with the effects of the verdict.
         evaluation: Error before and after.
-        effects: Those that were added.
+        effects: Effects that were added.
         exploratory: What was frozen was changed after the data were seen.
         designed: Actions were chosen for their information.
     """

@@ -36,23 +36,23 @@ class Contents:
     """What the closed loop found.
 
     Attributes:
-        residuals: Of the bare model.
-        residuals_after: Of the augmented one; None where nothing was added.
+        residuals: Residuals of the bare model.
+        residuals_after: Residuals of the augmented one; None where nothing was added.
         detection: Whether the bare model misses the data.
         tracing: Which effect the data point to.
         evaluation: Error before and after; None where no trial was scored.
         next_action: What to do next; its ``action`` is None where nothing is to be
             gained. None without permitted actions.
         simulator: The augmented simulator, or the bare one where nothing was added.
-        prior: Of its parameters (never a posterior).
+        prior: Prior of its parameters (never a posterior).
         warnings: One sentence each.
         digest: Hash of noise, library and priors as they were before the data.
         exploratory: Library or priors were changed after the data were seen.
         num_trials: Trials that could be fitted.
         action_labels: One an entry of the action, with its unit.
         channel_names: One an entry of x's last axis, where known.
-        leave_one_out: Of the bare model and of the one that was chosen, where trials
-            are independent given their parameters.
+        leave_one_out: Leave-one-out scores of the bare model and of the one that was
+            chosen, where trials are independent given their parameters.
         severe_tests: Where a verdict that names effects would be put to the test most:
             a permitted action, and one beyond.
         action_is_label: Whether the action is only the trial's number.

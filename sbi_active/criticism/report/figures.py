@@ -39,8 +39,9 @@ def plot_residuals(
     deviations of the predictive.
 
     Args:
-        before: Of the bare model, the upper row.
-        after: Of the augmented one, the lower row; None where nothing was added.
+        before: Residuals of the bare model, the upper row.
+        after: Residuals of the augmented one, the lower row; None where nothing was
+            added.
         action_labels: One an entry of the action, with its unit; none where the action
             is only the trial's number.
         channel_names: One an entry of x without a time axis.

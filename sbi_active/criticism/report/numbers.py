@@ -36,9 +36,9 @@ def estimated(mean: float, sd: float, draws: float) -> str:
     Nothing for NaN.
 
     Args:
-        mean: Of the draws.
-        sd: Of the draws.
-        draws: Their effective number.
+        mean: Mean of the draws.
+        sd: Standard deviation of the draws.
+        draws: Effective number of the draws.
 
     Example:
         >>> estimated(0.35992, 0.00071, 400), estimated(0.35992, 0.00071, 3)

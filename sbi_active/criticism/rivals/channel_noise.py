@@ -40,8 +40,8 @@ class ChannelNoise(NoiseGrid):
     """Gaussian noise with an unknown size in each channel.
 
     Args:
-        cells: Of the correlation time; their sd is each channel's middle size.
-        channel: Of each number, shape (N,).
+        cells: Cells of the correlation time; their sd is each channel's middle size.
+        channel: Channel of each number, shape (N,).
         factors: Sizes of each channel in units of its middle one, shape (c, j).
         log_factor_prior: Their log prior probabilities, shape (c, j).
         scales: Further factors, of all channels alike, shape (k,).

@@ -129,7 +129,7 @@ class NoiseGrid(ErrorModel):
     """Noise whose correlation and size are known up to a grid.
 
     Args:
-        cells: Of the correlation time and the noise model's own parameters.
+        cells: Cells of the correlation time and the noise model's own parameters.
         scales: Factors on the standard deviation, shape (j,).
         log_weights: Their log prior probabilities, shape (j,).
     """

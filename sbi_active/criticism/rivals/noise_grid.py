@@ -37,10 +37,10 @@ def declared_noise(
     represented by draws, or summed if it is a grid of a size and a correlation time.
 
     Args:
-        noise: The simulator's; None where the simulator is the draw, and its own
+        noise: Noise of the simulator; None where the simulator is the draw, and its own
             deviation is the unit.
         measurements: What is measured.
-        seed: Of the draws of the posterior.
+        seed: Seed of the draws of the posterior.
 
     Raises:
         ValueError: If a declared standard deviation is zero.

@@ -71,9 +71,10 @@ class ResidualProcess(ErrorModel):
     Args:
         noise: The error without the process.
         measurements: What the residuals are of.
-        action: Of each trial, in ranges of the action space, shape (t, action_dim).
-        order: Of each trial, in the span of those at hand, shape (t,); None for no
-            process over it.
+        action: Action of each trial, in ranges of the action space, shape (t,
+            action_dim).
+        order: Order of each trial, in the span of those at hand, shape (t,); None for
+            no process over it.
         largest: Upper end of the amplitude, in standard deviations of the noise.
         lengths: Length scales, in ranges of the action space.
         spread: Deviation of the prior predictive, shape (N,); None has the noise as the
@@ -176,12 +177,14 @@ class ResidualProcess(ErrorModel):
             V[g_* | r] = K_{**} - K_* (K + R)^{-1} K_*^T
 
         Args:
-            residual: Of the measurements at hand, shape (n, N).
+            residual: Residuals of the measurements at hand, shape (n, N).
             new: Measurements to predict, M.
-            action: Of all trials, those at hand first, in ranges of the action space.
-            order: Of all trials, likewise, in the span of those at hand; needed where
-                there is a process over it.
-            spread: Of the new measurements, shape (M,), where there is one of the old.
+            action: Actions of all trials, those at hand first, in ranges of the action
+                space.
+            order: Order of all trials, likewise, in the span of those at hand; needed
+                where there is a process over it.
+            spread: Spread of the new measurements, shape (M,), where there is one of
+                the old.
 
         Returns:
             Means, shape (n, M), and standard deviations, shape (M,).

@@ -28,8 +28,8 @@ class Rival:
 
     Args:
         key: What the rival is.
-        simulator: Of the trials, shared by all rivals.
-        prior: Of theta.
+        simulator: Simulator of the trials, shared by all rivals.
+        prior: Prior of theta.
         effects: Effects that this rival has.
         nuisances: Effects of scope "trial", which every rival has.
         error: Distribution of the residual.
@@ -41,7 +41,7 @@ class Rival:
             the simulator has one, or vice versa.
 
     Attributes:
-        coordinates: Of z.
+        coordinates: Coordinates of z.
         num_trials: Number of trials.
         num_observed: Number of measured numbers of all trials.
     """

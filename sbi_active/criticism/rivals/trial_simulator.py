@@ -40,9 +40,9 @@ class TrialSimulator:
     parameters wherever the simulator is one of its parameters and seeds.
 
     Args:
-        model: With every effect that any rival has.
+        model: Simulator with every effect that any rival has.
         trials: The trials.
-        seed: Of the replicates.
+        seed: Seed of the replicates.
 
     Attributes:
         measurements: What is predicted.

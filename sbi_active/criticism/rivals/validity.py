@@ -35,7 +35,7 @@ def log_outcomes(
     0 or 1 from a deterministic simulator, the share of its draws from a random one.
 
     Args:
-        probability: Of an outcome by the simulator, shape (n, t).
+        probability: Probability of an outcome by the simulator, shape (n, t).
         valid: Which trials have one, shape (t,).
         rates: :math:`\epsilon`, the R probabilities of disagreement, equally likely.
 

@@ -215,7 +215,7 @@ def bayes_factor(
 
     Args:
         others: Log of weight times evidence and its error, of each part.
-        null: The same of the bare model.
+        null: Log evidence of the bare model and its error.
     """
     log_z, errors = np.array(others).T
     total = log_sum_exp(log_z)

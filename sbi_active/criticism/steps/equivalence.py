@@ -173,8 +173,8 @@ class _Neighborhood:
         """Return whether parameters make up for an effect away from its null, too.
 
         Args:
-            effect: Of which nothing is left near the null.
-            size: Of its change there, for a deviation of the prior.
+            effect: Effect of which nothing is left near the null.
+            size: Size of its change there, for a deviation of the prior.
         """
         if self.num_search == 1 and size > 0:  # its direction says enough
             return True
@@ -248,9 +248,9 @@ def _imitates(
     """Return whether an effect and parameters imitate another away from its null.
 
     Args:
-        one: That imitates.
-        other: That is imitated.
-        simulator: Of the permitted actions.
+        one: Effect that imitates.
+        other: Effect that is imitated.
+        simulator: Simulator of the permitted actions.
         rivals: The models.
         theta: Parameters beside the other, shape (1, theta_dim).
         unit: What counts as large in each number.

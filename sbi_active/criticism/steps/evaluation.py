@@ -77,7 +77,7 @@ def tail(prediction: Prediction, trials: Trials) -> float:
     errors are taken as independent.
 
     Args:
-        prediction: Of some trials.
+        prediction: Prediction of some trials.
         trials: What was measured in them.
     """
     x = trials.x.double().numpy().reshape(-1)[prediction.position]

@@ -55,7 +55,7 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
 
     Args:
         rivals: The models.
-        key: Of the effects alone.
+        key: Key of the effects alone.
 
     Returns:
         Indices of the trials.
@@ -184,7 +184,7 @@ def _change(
 
     Args:
         rivals: The models.
-        key: Of one.
+        key: Key of one model.
         enough: From here on it need not be precise, shape (k,).
     """
     change, effective = _reweighted(rivals, key)

@@ -36,10 +36,10 @@ class LeaveOneOut:
     """How well one model predicts each trial from the others.
 
     Attributes:
-        name: Of the model.
+        name: Name of the model.
         density: Log predictive density of each trial, shape (t,), nats.
         pareto_k: Shape of the largest weights, (t,).
-        num_draws: From the posterior.
+        num_draws: Number of posterior draws.
         names: What each trial is called; empty for its position.
 
     References:

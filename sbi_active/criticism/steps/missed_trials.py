@@ -66,8 +66,8 @@ def missed_trials(
         rivals: The models.
         tracing: Their verdict.
         trials: Trials that had no part in it.
-        before: Of the bare model, for these trials.
-        after: Of the model of the verdict.
+        before: Prediction of the bare model, for these trials.
+        after: Prediction of the model of the verdict.
         level: Probability that a right one has any trial called so; each has its share
             (Bonferroni).
 
@@ -143,7 +143,7 @@ def _tails(prediction: Prediction, errors: Array, x: Array) -> Array:
     """Return the tail probability of each trial's T, (t,); 1 where none is scored.
 
     Args:
-        prediction: Of the trials.
+        prediction: Prediction of the trials.
         errors: Draws of the errors beside it, shape (n, N).
         x: What was measured, shape (N,).
     """
@@ -174,9 +174,9 @@ def _beside_others(
     """Return the tail of each trial's error among those of left-out ones, (t,).
 
     Args:
-        error: Of each number, in sensor deviations, shape (N,).
-        trial: Of each number, shape (N,).
-        num: Trials.
+        error: Error of each number, in sensor deviations, shape (N,).
+        trial: Trial of each number, shape (N,).
+        num: Number of trials.
         others: Mean squared errors of left-out trials.
     """
     total = np.bincount(trial, error**2, num)

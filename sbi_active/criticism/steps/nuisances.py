@@ -38,9 +38,9 @@ def conditioned(
 
     Args:
         rivals: The models, which say how long the first part is.
-        key: Of the model.
+        key: Key of the model.
         u: Draws of its coordinates, shape (n, dim).
-        simulator: Of the trials that were not fitted.
+        simulator: Simulator of the trials that were not fitted.
         rng: Source of the draws.
     """
     fit, m = rivals.fit(key), simulator.measurements

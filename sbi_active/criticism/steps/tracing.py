@@ -107,8 +107,8 @@ class Evidences(Protocol):
         """Return whether the error leaves no room for what a model leaves over.
 
         Args:
-            key: Of the model.
-            detection: Of the bare model.
+            key: Key of the model.
+            detection: Detection of the bare model.
         """
         ...
 
@@ -329,9 +329,9 @@ def estimate_of(
 
     Args:
         effect: Whose phi is the end of the draws.
-        evidence: Of that model.
+        evidence: Evidence of that model.
         probability: That the effect is there.
-        log_bayes_factor: Of that model against the bare one.
+        log_bayes_factor: Log Bayes factor of that model against the bare one.
     """
     phi = evidence.draws[:, -effect.phi_dim :]
     return Estimate(
